@@ -1,0 +1,107 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The frozen block that travels along the chain, and what every operator promises.
+
+    v --> [input] --> [hysteresis] --> [hidden] --> [G, z^-d] --> [output] --> [acquisition] --> y
+
+Everything inside the chain is in normalised units: u = (v - v0)/V and (y - y0)/Y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["SLOTS", "Block", "Chain", "Operator", "Slot"]
+
+Slot = Literal["input", "hysteresis", "hidden", "output", "acquisition"]
+
+#: the places of a chain into which an effect goes, in the order of the signal
+SLOTS: tuple[Slot, ...] = ("input", "hysteresis", "hidden", "output", "acquisition")
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """
+    A stretch of the stream.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Time [s].
+    v : ndarray, shape (n,)
+        Command, normalised; every operator may look at it, wherever it sits.
+    x : ndarray, shape (n,)
+        The signal on its way through the chain, normalised.
+    channels : mapping of str to ndarray, shape (n,)
+        Further measured signals in their own units.
+    """
+
+    t: NDArray[np.float64]
+    v: NDArray[np.float64]
+    x: NDArray[np.float64]
+    channels: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def with_signal(self, x: NDArray[np.float64]) -> Block:
+        """Return the block with another signal."""
+        return replace(self, x=x)
+
+
+class Operator(Protocol):
+    """One link of a chain; it keeps its own state between blocks."""
+
+    def reset(self, v0: float, x0: float) -> float:
+        """
+        Come to rest under a constant command.
+
+        Parameters
+        ----------
+        v0, x0 : float
+            Command and incoming signal at rest, normalised.
+
+        Returns
+        -------
+        float
+            The outgoing signal at rest.
+        """
+        ...
+
+    def process(self, block: Block) -> Block:
+        """Return the block with this operator applied; the result never depends on the cutting."""
+        ...
+
+
+class Chain:
+    """Operators one after the other, themselves an operator."""
+
+    def __init__(self, operators: tuple[Operator, ...]) -> None:
+        self.operators = operators
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Bring every operator to rest, each under the rest value of the one before."""
+        for operator in self.operators:
+            x0 = operator.reset(v0, x0)
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Pass the block through all operators."""
+        for operator in self.operators:
+            block = operator.process(block)
+        return block

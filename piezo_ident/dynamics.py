@@ -1,0 +1,298 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+G and z^-d: the linear dynamics and the pure delay, each as parameters and as a streaming operator.
+
+    y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j w(k-d-j+1)                    (eqs. 4-5)
+
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from piezo_ident.block import Block
+from piezo_ident.errors import ModelError
+from piezo_ident.kernel import kernel
+from piezo_ident.record import frozen_array
+
+__all__ = ["Delay", "DelayOperator", "Dynamics", "DynamicsOperator", "filter_arx"]
+
+
+@kernel
+def _filter(
+    b: NDArray[np.float64],
+    a: NDArray[np.float64],
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    # transposed direct form II; b = (b1, b2, ...), a = (a1, a2, ...) padded to one length m,
+    # z holds m numbers of which the last is always zero
+    m = a.size
+    for k in range(x.size):
+        u = x[k]
+        y = z[0] + b[0] * u
+        for i in range(m - 1):
+            z[i] = z[i + 1] + b[i + 1] * u - a[i] * y
+        z[m - 1] = -a[m - 1] * y
+        out[k] = y
+
+
+def _padded(
+    b: NDArray[np.float64], a: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    # one more coefficient of b than of a keeps the kernel's inner loop free of cases
+    m = max(a.size, b.size - 1, 1)
+    b_long, a_long = np.zeros(m + 1), np.zeros(m)
+    b_long[: b.size] = b
+    a_long[: a.size] = a
+    return b_long, a_long
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """
+    The rational part of G.
+
+    Parameters
+    ----------
+    a : array_like, shape (na,)
+        Coefficients a_1 .. a_na of ``A(z) = 1 + a_1 z^-1 + ...``.
+    b : array_like, shape (nb,)
+        Coefficients b_1 .. b_nb of ``B(z) = b_1 + b_2 z^-1 + ...``.
+
+    Raises
+    ------
+    ModelError
+        When a coefficient is not finite, or b is empty.
+    """
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        a, b = frozen_array(self.a), frozen_array(self.b)
+        if a.ndim != 1 or b.ndim != 1 or b.size == 0:
+            raise ModelError(
+                "dynamics: a and b are lists, and b has at least one number"
+            )
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+            raise ModelError("dynamics: a and b must be finite numbers")
+        object.__setattr__(self, "a", a)
+        object.__setattr__(self, "b", b)
+
+    @classmethod
+    def unit(cls) -> Dynamics:
+        """Return G = 1."""
+        return cls(a=np.empty(0), b=np.ones(1))
+
+    @property
+    def gain(self) -> float:
+        """Static gain G(1)."""
+        return float(self.b.sum() / (1.0 + self.a.sum()))
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Poles of G in the z plane."""
+        return np.asarray(
+            np.roots(np.concatenate([[1.0], self.a])), dtype=np.complex128
+        )
+
+    @property
+    def radius(self) -> float:
+        """Largest magnitude of a pole, 0 without poles."""
+        return float(np.abs(self.poles).max(initial=0.0))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether every pole lies inside the unit circle."""
+        return self.radius < 1.0
+
+    def normalised(self) -> Dynamics:
+        """
+        Return the same dynamics with G(1) = 1.
+
+        Raises
+        ------
+        ModelError
+            When the static gain is zero or not finite.
+        """
+        gain = self.gain
+        if not np.isfinite(gain) or gain == 0.0:
+            raise ModelError(f"dynamics: static gain {gain} cannot be scaled to one")
+        return Dynamics(a=self.a, b=self.b / gain)
+
+    def response(
+        self, frequency: ArrayLike, sample_rate: float
+    ) -> NDArray[np.complex128]:
+        """
+        Return the frequency response.
+
+        Parameters
+        ----------
+        frequency : array_like, shape (n,)
+            Frequencies [Hz].
+        sample_rate : float
+            [Hz]
+
+        Returns
+        -------
+        ndarray of complex, shape (n,)
+        """
+        z = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) / sample_rate)
+        numerator = np.polyval(self.b[::-1], z)
+        denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
+        return np.asarray(numerator / denominator, dtype=np.complex128)
+
+    def modes(self, sample_rate: float) -> list[tuple[float, float]]:
+        """Return (natural frequency [Hz], damping ratio) of each oscillating pole pair."""
+        found = []
+        for pole in self.poles:
+            if pole.imag > 0.0 and abs(pole) > 0.0:
+                s = np.log(pole) * sample_rate
+                found.append((float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))))
+        return sorted(found)
+
+
+def filter_arx(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    x: NDArray[np.float64],
+    at_rest: bool = True,
+) -> NDArray[np.float64]:
+    """
+    Return B(z)/A(z) x.
+
+    Parameters
+    ----------
+    a, b : ndarray
+        As in `Dynamics`.
+    x : ndarray, shape (n,)
+    at_rest : bool, optional
+        Start in equilibrium with the first sample (default) instead of from zero.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    b_long, a_long = _padded(b, a)
+    z = _rest_state(b_long, a_long, float(x[0])) if at_rest else np.zeros(a_long.size)
+    out = np.empty(x.size)
+    _filter(b_long, a_long, np.ascontiguousarray(x), z, out)
+    return out
+
+
+def _rest_state(
+    b_long: NDArray[np.float64], a_long: NDArray[np.float64], x0: float
+) -> NDArray[np.float64]:
+    y0 = x0 * b_long.sum() / (1.0 + a_long.sum())
+    # z[i] = sum over the coefficients still to come, found by running the recursion backwards
+    terms = b_long[1:] * x0 - a_long * y0
+    return np.ascontiguousarray(np.cumsum(terms[::-1])[::-1])
+
+
+class DynamicsOperator:
+    """G as a link of the chain, with its state."""
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        self.dynamics = dynamics
+        self._b, self._a = _padded(dynamics.b, dynamics.a)
+        self._z = np.zeros(self._a.size)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to equilibrium with a constant signal."""
+        self._z = _rest_state(self._b, self._a, x0)
+        return x0 * self.dynamics.gain
+
+    def process(self, block: Block) -> Block:
+        """Return the block filtered."""
+        out = np.empty(block.x.size)
+        _filter(self._b, self._a, np.ascontiguousarray(block.x), self._z, out)
+        return block.with_signal(out)
+
+
+@dataclass(frozen=True)
+class Delay:
+    """
+    The pure delay.
+
+    Parameters
+    ----------
+    samples : int
+        Whole samples d >= 0.
+    fraction : float, optional
+        Further part of a sample, 0 <= fraction < 1, by linear interpolation.
+
+    Raises
+    ------
+    ModelError
+        When out of range.
+    """
+
+    samples: int
+    fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if int(self.samples) != self.samples or self.samples < 0:
+            raise ModelError(
+                f"delay: samples must be a whole number >= 0, got {self.samples}"
+            )
+        if not 0.0 <= self.fraction < 1.0:
+            raise ModelError(f"delay: fraction must be in [0, 1), got {self.fraction}")
+
+    @property
+    def total(self) -> float:
+        """Delay in samples, with its fraction."""
+        return self.samples + self.fraction
+
+    def apply(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a signal delayed, preceded by its own first value; shape (n,)."""
+        operator = DelayOperator(self)
+        operator.reset(0.0, float(x[0]))
+        return operator.shift(x)
+
+
+class DelayOperator:
+    """z^-d as a link of the chain, with its buffer."""
+
+    def __init__(self, delay: Delay) -> None:
+        self.delay = delay
+        self._past = np.zeros(delay.samples + 1)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Fill the buffer with a constant signal."""
+        self._past = np.full(self.delay.samples + 1, x0)
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block delayed."""
+        return block.with_signal(self.shift(block.x))
+
+    def shift(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signal delayed; shape (n,)."""
+        if self.delay.total == 0.0:
+            return x
+        line = np.concatenate([self._past, x])
+        # copied: a view would keep every past block alive
+        self._past = line[x.size :].copy()
+        f = self.delay.fraction
+        if f == 0.0:
+            return line[1 : 1 + x.size]
+        return np.asarray((1.0 - f) * line[1 : 1 + x.size] + f * line[: x.size])

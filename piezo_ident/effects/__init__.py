@@ -1,0 +1,79 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The catalogue of effects: those that come with the package, and a lab's own as entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import entry_points
+from types import MappingProxyType
+
+from piezo_ident.effects.base import Effect, Parameter
+from piezo_ident.effects.creep import Creep
+from piezo_ident.errors import ModelError
+
+__all__ = ["Effect", "Parameter", "catalogue", "find_effect"]
+
+_OWN: tuple[type[Effect], ...] = (Creep,)
+
+
+@cache
+def catalogue() -> Mapping[str, type[Effect]]:
+    """
+    Return every known effect by name.
+
+    Raises
+    ------
+    ModelError
+        When an entry point of the group ``piezo_ident.effects`` does not give an `Effect`, or
+        takes a name that is already there.
+    """
+    found: dict[str, type[Effect]] = {effect.name: effect for effect in _OWN}
+    for entry in entry_points(group="piezo_ident.effects"):
+        try:
+            effect = entry.load()
+        except Exception as error:
+            raise ModelError(
+                f"effect plug-in {entry.value!r} does not load: {error}"
+            ) from error
+        if not (isinstance(effect, type) and issubclass(effect, Effect)):
+            raise ModelError(
+                f"effect plug-in {entry.value!r} is not a subclass of Effect"
+            )
+        if effect.name in found:
+            raise ModelError(
+                f"effect plug-in {entry.value!r}: the name {effect.name!r} is taken"
+            )
+        found[effect.name] = effect
+    return MappingProxyType(found)
+
+
+def find_effect(name: str) -> type[Effect]:
+    """
+    Return one effect.
+
+    Raises
+    ------
+    ModelError
+        When the name is not in the catalogue.
+    """
+    try:
+        return catalogue()[name]
+    except KeyError:
+        known = ", ".join(sorted(catalogue()))
+        raise ModelError(
+            f"unknown effect {name!r}; the catalogue has {known}"
+        ) from None

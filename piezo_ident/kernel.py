@@ -1,0 +1,38 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How a numerical loop becomes a compiled kernel: cached on disk, without the interpreter lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from numba import njit
+
+__all__ = ["kernel"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """
+    Compile a function of arrays and numbers.
+
+    Sums may be reassociated, so that they run in vector lanes; nothing else of IEEE arithmetic is
+    given up.  The order of a sum is fixed when the kernel is compiled, so a stream gives the same
+    bits wherever it is cut.
+    """
+    compiled: F = njit(cache=True, nogil=True, fastmath={"reassoc"})(function)
+    return compiled
