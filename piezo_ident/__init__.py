@@ -14,4 +14,4 @@
 
 """Identification of piezo-actuated nanopositioning stages."""
 
-__version__ = "0.1.0"
+__version__ = '0.1.0'

@@ -29,12 +29,12 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SLOTS", "Block", "Chain", "Operator", "Slot"]
+__all__ = ['SLOTS', 'Block', 'Chain', 'Operator', 'Slot']
 
-Slot = Literal["input", "hysteresis", "hidden", "output", "acquisition"]
+Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 
 #: the places of a chain into which an effect goes, in the order of the signal
-SLOTS: tuple[Slot, ...] = ("input", "hysteresis", "hidden", "output", "acquisition")
+SLOTS: tuple[Slot, ...] = ('input', 'hysteresis', 'hidden', 'output', 'acquisition')
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,13 +26,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from piezo_ident.block import Block
 from piezo_ident.errors import ModelError
 from piezo_ident.kernel import kernel
 from piezo_ident.record import frozen_array
 
-__all__ = ["Delay", "DelayOperator", "Dynamics", "DynamicsOperator", "filter_arx"]
+__all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
 
 
 @kernel
@@ -55,9 +54,7 @@ def _filter(
         out[k] = y
 
 
-def _padded(
-    b: NDArray[np.float64], a: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], ...]:
+def _padded(b: NDArray[np.float64], a: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     # one more coefficient of b than of a keeps the kernel's inner loop free of cases
     m = max(a.size, b.size - 1, 1)
     b_long, a_long = np.zeros(m + 1), np.zeros(m)
@@ -90,13 +87,11 @@ class Dynamics:
     def __post_init__(self) -> None:
         a, b = frozen_array(self.a), frozen_array(self.b)
         if a.ndim != 1 or b.ndim != 1 or b.size == 0:
-            raise ModelError(
-                "dynamics: a and b are lists, and b has at least one number"
-            )
+            raise ModelError('dynamics: a and b are lists, and b has at least one number')
         if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-            raise ModelError("dynamics: a and b must be finite numbers")
-        object.__setattr__(self, "a", a)
-        object.__setattr__(self, "b", b)
+            raise ModelError('dynamics: a and b must be finite numbers')
+        object.__setattr__(self, 'a', a)
+        object.__setattr__(self, 'b', b)
 
     @classmethod
     def unit(cls) -> Dynamics:
@@ -111,9 +106,7 @@ class Dynamics:
     @property
     def poles(self) -> NDArray[np.complex128]:
         """Poles of G in the z plane."""
-        return np.asarray(
-            np.roots(np.concatenate([[1.0], self.a])), dtype=np.complex128
-        )
+        return np.asarray(np.roots(np.concatenate([[1.0], self.a])), dtype=np.complex128)
 
     @property
     def radius(self) -> float:
@@ -136,12 +129,10 @@ class Dynamics:
         """
         gain = self.gain
         if not np.isfinite(gain) or gain == 0.0:
-            raise ModelError(f"dynamics: static gain {gain} cannot be scaled to one")
+            raise ModelError(f'dynamics: static gain {gain} cannot be scaled to one')
         return Dynamics(a=self.a, b=self.b / gain)
 
-    def response(
-        self, frequency: ArrayLike, sample_rate: float
-    ) -> NDArray[np.complex128]:
+    def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
         """
         Return the frequency response.
 
@@ -251,11 +242,9 @@ class Delay:
 
     def __post_init__(self) -> None:
         if int(self.samples) != self.samples or self.samples < 0:
-            raise ModelError(
-                f"delay: samples must be a whole number >= 0, got {self.samples}"
-            )
+            raise ModelError(f'delay: samples must be a whole number >= 0, got {self.samples}')
         if not 0.0 <= self.fraction < 1.0:
-            raise ModelError(f"delay: fraction must be in [0, 1), got {self.fraction}")
+            raise ModelError(f'delay: fraction must be in [0, 1), got {self.fraction}')
 
     @property
     def total(self) -> float:

@@ -35,5 +35,5 @@ class IdentificationError(PiezoIdentError):
     """Data that are sound but do not carry what was asked of them."""
 
 
-class Cancelled(PiezoIdentError):  # noqa: N818 - the word users read
+class Cancelled(PiezoIdentError):
     """The work was stopped on request; nothing was written."""

@@ -26,9 +26,8 @@ from collections.abc import Sequence as Many
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-
 from piezo_ident.errors import ConfigError
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 __all__ = [
     'PAPER_PEAKS',
@@ -104,9 +103,7 @@ def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[
     return start + (stop - start) * (tau - np.sin(2 * np.pi * tau) / (2 * np.pi))
 
 
-def staircase(
-    levels: Many[float], hold: Many[float], sample_rate: float
-) -> NDArray[np.float64]:
+def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDArray[np.float64]:
     """
     Return levels that are jumped to and held.
 
@@ -253,6 +250,7 @@ def noise(
     sample_rate : float
         [Hz]
     rng : numpy.random.Generator
+        Draws the noise.
     crest : float, optional
         Crest factor that is aimed at; about 2 is the least that can be reached.
     fade : float, optional
@@ -277,7 +275,9 @@ def noise(
     x = x[:n]
     edge = np.minimum(np.arange(n), n - np.arange(n)) / max(1.0, fade * sample_rate)
     x = x * (0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, edge)))
-    return bias + amplitude * x / max(np.abs(x).max(), np.finfo(float).tiny)
+    peak = float(np.abs(x).max())
+    scaled: NDArray[np.float64] = bias + amplitude * x / max(peak, np.finfo(float).tiny)
+    return scaled
 
 
 def odd_lines(
@@ -317,6 +317,7 @@ def multisine(
     period : float
         [s], rounded to a sample.
     periods : int
+        How often the period is repeated.
     sample_rate : float
         [Hz]
     rng : numpy.random.Generator

@@ -15,7 +15,7 @@
 """
 H, the modified Prandtl-Ishlinskii operator.
 
-    w(t) = p1 v(t)^3 + p2 v(t) + sum_i q_i F_ri[v](t),      q_i >= 0                     (eqs. 3, 6)
+    w(t) = p1 v(t)^3 + p2 v(t) + sum_i q_i F_ri[v](t),      q_i >= 0                    (eqs. 3, 6)
 
 of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised units.
 """
@@ -26,13 +26,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from piezo_ident.block import Block
 from piezo_ident.errors import ModelError
 from piezo_ident.play import initial_memory, weighted_plays
 from piezo_ident.record import frozen_array
 
-__all__ = ["Hysteresis", "HysteresisOperator"]
+__all__ = ['Hysteresis', 'HysteresisOperator']
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,36 +64,30 @@ class Hysteresis:
         r, q = frozen_array(self.thresholds), frozen_array(self.weights)
         if r.ndim != 1 or r.shape != q.shape:
             raise ModelError(
-                f"hysteresis: {r.size} thresholds and {q.size} weights; give one weight each"
+                f'hysteresis: {r.size} thresholds and {q.size} weights; give one weight each'
             )
         if not (np.all(np.isfinite(r)) and np.all(np.isfinite(q))):
-            raise ModelError(
-                "hysteresis: thresholds and weights must be finite numbers"
-            )
+            raise ModelError('hysteresis: thresholds and weights must be finite numbers')
         if np.any(q < 0):
-            raise ModelError("hysteresis: weights q_i must not be negative")
+            raise ModelError('hysteresis: weights q_i must not be negative')
         if np.any(r < 0) or np.any(np.diff(r) <= 0):
-            raise ModelError(
-                "hysteresis: thresholds r_i must ascend and not be negative"
-            )
+            raise ModelError('hysteresis: thresholds r_i must ascend and not be negative')
         p2 = float(self.p2)
         if r.size and r[0] == 0.0:
             p2 += float(q[0])
             r, q = frozen_array(r[1:].copy()), frozen_array(q[1:].copy())
         if not (np.isfinite(self.p1) and np.isfinite(p2)):
-            raise ModelError("hysteresis: p1 and p2 must be finite numbers")
-        object.__setattr__(self, "thresholds", r)
-        object.__setattr__(self, "weights", q)
-        object.__setattr__(self, "p1", float(self.p1))
-        object.__setattr__(self, "p2", p2)
+            raise ModelError('hysteresis: p1 and p2 must be finite numbers')
+        object.__setattr__(self, 'thresholds', r)
+        object.__setattr__(self, 'weights', q)
+        object.__setattr__(self, 'p1', float(self.p1))
+        object.__setattr__(self, 'p2', p2)
 
     def initial_memory(self, v0: float) -> NDArray[np.float64]:
         """Return the play outputs at `v0` of a stage that last came down to zero."""
         return initial_memory(v0, self.thresholds)
 
-    def __call__(
-        self, v: ArrayLike, memory: ArrayLike | None = None
-    ) -> NDArray[np.float64]:
+    def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> NDArray[np.float64]:
         """
         Return w for an input v.
 
@@ -110,14 +103,8 @@ class Hysteresis:
         ndarray, shape (n,)
         """
         x = np.asarray(v, dtype=np.float64)
-        start = (
-            self.initial_memory(float(x[0]))
-            if memory is None
-            else np.asarray(memory, float)
-        )
-        return weighted_plays(
-            x, self.thresholds, self.weights, self.p1, self.p2, start
-        )[0]
+        start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
+        return weighted_plays(x, self.thresholds, self.weights, self.p1, self.p2, start)[0]
 
     def slope(self, v: float, excursion: float = 0.0) -> float:
         """
@@ -150,9 +137,7 @@ class HysteresisOperator:
 
     def reset(self, v0: float, x0: float) -> float:
         """Take the given memory, or the one of a stage that last came down to zero."""
-        start = (
-            self.hysteresis.initial_memory(x0) if self._given is None else self._given
-        )
+        start = self.hysteresis.initial_memory(x0) if self._given is None else self._given
         w, self.memory = self._evaluate(np.array([x0]), start)
         return float(w[0])
 

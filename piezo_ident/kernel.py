@@ -17,13 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, cast, TypeVar
 
 from numba import njit
 
-__all__ = ["kernel"]
+__all__ = ['kernel']
 
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar('F', bound=Callable[..., Any])
 
 
 def kernel(function: F) -> F:
@@ -34,5 +34,4 @@ def kernel(function: F) -> F:
     given up.  The order of a sum is fixed when the kernel is compiled, so a stream gives the same
     bits wherever it is cut.
     """
-    compiled: F = njit(cache=True, nogil=True, fastmath={"reassoc"})(function)
-    return compiled
+    return cast(F, njit(cache=True, nogil=True, fastmath={'reassoc'})(function))

@@ -31,7 +31,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from piezo_ident.block import Block, Chain, Operator
 from piezo_ident.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.effects import find_effect
@@ -39,7 +38,7 @@ from piezo_ident.errors import ModelError
 from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record import Piece, Record
 
-__all__ = ["EffectSetting", "Prediction", "Scaling", "StageModel", "Stream"]
+__all__ = ['EffectSetting', 'Prediction', 'Scaling', 'StageModel', 'Stream']
 
 #: samples that pass the chain at once; small enough for the signals to stay in the cache
 CHUNK = 8192
@@ -69,11 +68,11 @@ class Scaling:
     def __post_init__(self) -> None:
         numbers = (self.v0, self.V, self.y0, self.Y, *self.range)
         if not np.all(np.isfinite(numbers)):
-            raise ModelError("scaling: v0, V, y0, Y and range must be finite numbers")
+            raise ModelError('scaling: v0, V, y0, Y and range must be finite numbers')
         if self.V <= 0 or self.Y == 0:
-            raise ModelError("scaling: V must be positive and Y not zero")
+            raise ModelError('scaling: V must be positive and Y not zero')
         if self.range[0] >= self.range[1]:
-            raise ModelError("scaling: range must be [lowest, highest] voltage")
+            raise ModelError('scaling: range must be [lowest, highest] voltage')
 
     def u(self, v: ArrayLike) -> NDArray[np.float64]:
         """Return the normalised input."""
@@ -104,7 +103,7 @@ class EffectSetting:
 
     def __post_init__(self) -> None:
         values = find_effect(self.name).check(self.parameters)
-        object.__setattr__(self, "parameters", MappingProxyType(values))
+        object.__setattr__(self, 'parameters', MappingProxyType(values))
 
     @property
     def slot(self) -> str:
@@ -162,13 +161,11 @@ class StageModel:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.sample_rate) and self.sample_rate > 0):
-            raise ModelError(
-                f"model: sample_rate must be positive, got {self.sample_rate}"
-            )
+            raise ModelError(f'model: sample_rate must be positive, got {self.sample_rate}')
         if not self.dynamics.is_stable:
             raise ModelError(
-                f"model: G is unstable (pole at radius {self.dynamics.radius:.6g}); "
-                "identify again with another order"
+                f'model: G is unstable (pole at radius {self.dynamics.radius:.6g}); '
+                'identify again with another order'
             )
 
     @property
@@ -198,24 +195,21 @@ class StageModel:
 
         def make(slot: str) -> list[Operator]:
             return [
-                find_effect(s.name)(self.sample_rate, s.parameters)
-                for s in in_slot.get(slot, [])
+                find_effect(s.name)(self.sample_rate, s.parameters) for s in in_slot.get(slot, [])
             ]
 
         core: Operator = HysteresisOperator(self.hysteresis, memory)
-        for s in in_slot.get("hysteresis", []):
-            core = find_effect(s.name)(
-                self.sample_rate, s.parameters, self.hysteresis, core
-            )
+        for s in in_slot.get('hysteresis', []):
+            core = find_effect(s.name)(self.sample_rate, s.parameters, self.hysteresis, core)
         return Chain(
             (
-                *make("input"),
+                *make('input'),
                 core,
-                *make("hidden"),
+                *make('hidden'),
                 DynamicsOperator(self.dynamics),
                 DelayOperator(self.delay),
-                *make("output"),
-                *make("acquisition"),
+                *make('output'),
+                *make('acquisition'),
             )
         )
 
@@ -223,9 +217,7 @@ class StageModel:
         """Return a run of this model that takes the voltage block by block."""
         return Stream(self, memory)
 
-    def predict_piece(
-        self, piece: Piece, memory: ArrayLike | None = None
-    ) -> NDArray[np.float64]:
+    def predict_piece(self, piece: Piece, memory: ArrayLike | None = None) -> NDArray[np.float64]:
         """
         Return the predicted displacement of one piece [m], shape (n,).
 
@@ -263,9 +255,7 @@ class StageModel:
             When a piece has another sampling rate than the model.
         """
         starts = memories if memories is not None else (None,) * len(record.pieces)
-        pieces = tuple(
-            self.predict_piece(p, m) for p, m in zip(record, starts, strict=True)
-        )
+        pieces = tuple(self.predict_piece(p, m) for p, m in zip(record, starts, strict=True))
         return Prediction(pieces, self.extrapolation(record))
 
     def check_rate(self, piece: Piece) -> None:
@@ -279,24 +269,22 @@ class StageModel:
         if self.is_static or abs(piece.sample_rate / self.sample_rate - 1.0) < 1e-6:
             return
         raise ModelError(
-            f"the record is sampled at {piece.sample_rate:g} Hz, the model at "
-            f"{self.sample_rate:g} Hz; identify a model from data of that rate"
+            f'the record is sampled at {piece.sample_rate:g} Hz, the model at '
+            f'{self.sample_rate:g} Hz; identify a model from data of that rate'
         )
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
         """Return a warning when the voltage leaves the range in which the model was identified."""
         low, high = self.scaling.range
         slack = 1e-3 * (high - low)
-        outside = sum(
-            int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record
-        )
+        outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
         if not outside:
             return ()
         seen = record.voltage_range
         return (
-            f"{record.name}: {outside / record.n:.1%} of the samples lie outside the identified "
-            f"range {low:g} .. {high:g} V (they reach {seen[0]:g} .. {seen[1]:g} V); "
-            "the prediction is an extrapolation there",
+            f'{record.name}: {outside / record.n:.1%} of the samples lie outside the identified '
+            f'range {low:g} .. {high:g} V (they reach {seen[0]:g} .. {seen[1]:g} V); '
+            'the prediction is an extrapolation there',
         )
 
 

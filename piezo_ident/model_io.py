@@ -23,29 +23,28 @@ import tempfile
 from typing import Any
 
 import numpy as np
-import yaml
-
 from piezo_ident import __version__
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import ConfigError, DataError, ModelError
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.model import EffectSetting, Scaling, StageModel
+import yaml
 
 __all__ = [
-    "SCHEMA_VERSION",
-    "load_model",
-    "load_yaml",
-    "model_from_dict",
-    "model_to_dict",
-    "plain",
-    "save_model",
-    "write_text",
+    'SCHEMA_VERSION',
+    'load_model',
+    'load_yaml',
+    'model_from_dict',
+    'model_to_dict',
+    'plain',
+    'save_model',
+    'write_text',
 ]
 
 SCHEMA_VERSION = 1
 
-_REQUIRED = ("sample_rate", "input", "output", "delay", "hysteresis", "dynamics")
-_OPTIONAL = ("schema_version", "package_version", "effects", "identification")
+_REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
+_OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
 
 
 class _Dumper(yaml.SafeDumper):
@@ -54,7 +53,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _represent_list(dumper: yaml.SafeDumper, data: list[Any]) -> yaml.Node:
     flow = all(isinstance(x, (int, float, str)) for x in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flow)
+    return dumper.represent_sequence('tag:yaml.org,2002:seq', data, flow_style=flow)
 
 
 _Dumper.add_representer(list, _represent_list)
@@ -83,13 +82,11 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
         When the file cannot be read, is not YAML, or is not a mapping.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding='utf-8')
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError(f'{path}: no such file') from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{path}: cannot be read as text ({_reason(error)})"
-        ) from None
+        raise ConfigError(f'{path}: cannot be read as text ({_reason(error)})') from None
     return parse_yaml(text, str(path))
 
 
@@ -105,53 +102,47 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     try:
         data = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark is not None else ""
-        raise ConfigError(
-            f"{name}: not valid YAML{where}; correct it or write it again"
-        ) from None
+        mark = getattr(error, 'problem_mark', None)
+        where = f' at line {mark.line + 1}' if mark is not None else ''
+        raise ConfigError(f'{name}: not valid YAML{where}; correct it or write it again') from None
     if not isinstance(data, dict):
-        raise ConfigError(f"{name}: expected a YAML mapping, got {type(data).__name__}")
+        raise ConfigError(f'{name}: expected a YAML mapping, got {type(data).__name__}')
     return data
 
 
 def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or type(error).__name__
+    return getattr(error, 'strerror', None) or type(error).__name__
 
 
 def _mapping(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
     value = data.get(key)
     if not isinstance(value, Mapping):
-        raise ModelError(
-            f"{name}: {key} must be a mapping, see config/stage_paper.yaml"
-        )
+        raise ModelError(f'{name}: {key} must be a mapping, see config/stage_paper.yaml')
     return value
 
 
-def _number(
-    data: Mapping[str, Any], key: str, name: str, default: float | None = None
-) -> float:
+def _number(data: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
     value = data.get(key, default)
     # YAML 1.1 reads 2e-5 as text; people write it all the same
     if isinstance(value, bool) or value is None:
-        raise ModelError(f"{name}: {key} is missing or not a number")
+        raise ModelError(f'{name}: {key} is missing or not a number')
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise ModelError(f"{name}: {key} is not a number: {value!r}") from None
+        raise ModelError(f'{name}: {key} is not a number: {value!r}') from None
 
 
 def _numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
     value = data.get(key)
     if not isinstance(value, list):
-        raise ModelError(f"{name}: {key} must be a list of numbers")
+        raise ModelError(f'{name}: {key} must be a list of numbers')
     try:
         return np.array([float(x) for x in value], dtype=np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"{name}: {key} must be a list of numbers") from None
+        raise ModelError(f'{name}: {key} must be a list of numbers') from None
 
 
-def model_from_dict(data: Mapping[str, Any], name: str = "model") -> StageModel:
+def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     """
     Build a model from plain data.
 
@@ -167,92 +158,84 @@ def model_from_dict(data: Mapping[str, Any], name: str = "model") -> StageModel:
     ModelError
         When the schema is later than this package knows, or a part is missing or wrong.
     """
-    version = data.get("schema_version", SCHEMA_VERSION)
+    version = data.get('schema_version', SCHEMA_VERSION)
     if not isinstance(version, int) or version < 1:
-        raise ModelError(
-            f"{name}: schema_version must be a whole number, got {version!r}"
-        )
+        raise ModelError(f'{name}: schema_version must be a whole number, got {version!r}')
     if version > SCHEMA_VERSION:
         raise ModelError(
-            f"{name}: written with model schema {version}, this package reads up to "
-            f"{SCHEMA_VERSION}; update piezo_ident"
+            f'{name}: written with model schema {version}, this package reads up to '
+            f'{SCHEMA_VERSION}; update piezo_ident'
         )
     missing = [key for key in _REQUIRED if key not in data]
     if missing:
-        raise ModelError(f"{name}: missing {', '.join(missing)}; is this a model file?")
+        raise ModelError(f'{name}: missing {", ".join(missing)}; is this a model file?')
     unknown = sorted(set(map(str, data)) - set(_REQUIRED) - set(_OPTIONAL))
     if unknown:
-        raise ModelError(f"{name}: unknown keys {', '.join(unknown)}")
+        raise ModelError(f'{name}: unknown keys {", ".join(unknown)}')
 
-    source, target = _mapping(data, "input", name), _mapping(data, "output", name)
-    delay, h = _mapping(data, "delay", name), _mapping(data, "hysteresis", name)
-    g = _mapping(data, "dynamics", name)
-    limits = _numbers(source, "range", name)
+    source, target = _mapping(data, 'input', name), _mapping(data, 'output', name)
+    delay, h = _mapping(data, 'delay', name), _mapping(data, 'hysteresis', name)
+    g = _mapping(data, 'dynamics', name)
+    limits = _numbers(source, 'range', name)
     if limits.size != 2:
-        raise ModelError(f"{name}: input.range must be [lowest, highest] voltage")
-    effects = data.get("effects") or []
-    if not isinstance(effects, list) or not all(
-        isinstance(e, Mapping) for e in effects
-    ):
-        raise ModelError(f"{name}: effects must be a list of mappings")
-    identification = data.get("identification") or {}
+        raise ModelError(f'{name}: input.range must be [lowest, highest] voltage')
+    effects = data.get('effects') or []
+    if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
+        raise ModelError(f'{name}: effects must be a list of mappings')
+    identification = data.get('identification') or {}
     if not isinstance(identification, Mapping):
-        raise ModelError(f"{name}: identification must be a mapping")
-    samples = _number(delay, "samples", name)
+        raise ModelError(f'{name}: identification must be a mapping')
+    samples = _number(delay, 'samples', name)
     if samples != int(samples):
-        raise ModelError(f"{name}: delay.samples must be a whole number, got {samples}")
+        raise ModelError(f'{name}: delay.samples must be a whole number, got {samples}')
     try:
         return StageModel(
-            sample_rate=_number(data, "sample_rate", name),
+            sample_rate=_number(data, 'sample_rate', name),
             scaling=Scaling(
-                v0=_number(source, "v0", name),
-                V=_number(source, "V", name),
-                y0=_number(target, "y0", name),
-                Y=_number(target, "Y", name),
+                v0=_number(source, 'v0', name),
+                V=_number(source, 'V', name),
+                y0=_number(target, 'y0', name),
+                Y=_number(target, 'Y', name),
                 range=(float(limits[0]), float(limits[1])),
             ),
             hysteresis=Hysteresis(
-                thresholds=_numbers(h, "thresholds", name),
-                weights=_numbers(h, "weights", name),
-                p1=_number(h, "p1", name),
-                p2=_number(h, "p2", name),
+                thresholds=_numbers(h, 'thresholds', name),
+                weights=_numbers(h, 'weights', name),
+                p1=_number(h, 'p1', name),
+                p2=_number(h, 'p2', name),
             ),
-            dynamics=Dynamics(a=_numbers(g, "a", name), b=_numbers(g, "b", name)),
-            delay=Delay(int(samples), _number(delay, "fraction", name, 0.0)),
+            dynamics=Dynamics(a=_numbers(g, 'a', name), b=_numbers(g, 'b', name)),
+            delay=Delay(int(samples), _number(delay, 'fraction', name, 0.0)),
             effects=tuple(
-                EffectSetting(str(e.get("name")), _mapping(e, "parameters", name))
-                for e in effects
+                EffectSetting(str(e.get('name')), _mapping(e, 'parameters', name)) for e in effects
             ),
             identification=dict(identification),
         )
     except ModelError as error:
-        raise (
-            error if str(error).startswith(name) else ModelError(f"{name}: {error}")
-        ) from None
+        raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
 
 
 def model_to_dict(model: StageModel) -> dict[str, Any]:
     """Return a model as plain data, ready for YAML or JSON."""
     s, h = model.scaling, model.hysteresis
     data = {
-        "schema_version": SCHEMA_VERSION,
-        "package_version": __version__,
-        "sample_rate": model.sample_rate,
-        "input": {"v0": s.v0, "V": s.V, "range": list(s.range)},
-        "output": {"y0": s.y0, "Y": s.Y},
-        "delay": {"samples": model.delay.samples, "fraction": model.delay.fraction},
-        "hysteresis": {
-            "thresholds": h.thresholds,
-            "weights": h.weights,
-            "p1": h.p1,
-            "p2": h.p2,
+        'schema_version': SCHEMA_VERSION,
+        'package_version': __version__,
+        'sample_rate': model.sample_rate,
+        'input': {'v0': s.v0, 'V': s.V, 'range': list(s.range)},
+        'output': {'y0': s.y0, 'Y': s.Y},
+        'delay': {'samples': model.delay.samples, 'fraction': model.delay.fraction},
+        'hysteresis': {
+            'thresholds': h.thresholds,
+            'weights': h.weights,
+            'p1': h.p1,
+            'p2': h.p2,
         },
-        "dynamics": {"a": model.dynamics.a, "b": model.dynamics.b},
-        "effects": [
-            {"name": e.name, "slot": e.slot, "parameters": e.parameters}
-            for e in model.effects
+        'dynamics': {'a': model.dynamics.a, 'b': model.dynamics.b},
+        'effects': [
+            {'name': e.name, 'slot': e.slot, 'parameters': e.parameters} for e in model.effects
         ],
-        "identification": model.identification,
+        'identification': model.identification,
     }
     result: dict[str, Any] = plain(data)
     return result
@@ -307,11 +290,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """
     target = Path(path)
     try:
-        handle, temporary = tempfile.mkstemp(
-            dir=target.parent, prefix=f".{target.name}."
-        )
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f'.{target.name}.')
         try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
+            with os.fdopen(handle, 'w', encoding='utf-8') as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
@@ -322,5 +303,5 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
             raise
     except OSError as error:
         raise DataError(
-            f"{path}: cannot be written ({_reason(error)}); choose another place"
+            f'{path}: cannot be written ({_reason(error)}); choose another place'
         ) from None

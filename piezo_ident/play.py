@@ -25,10 +25,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from piezo_ident.kernel import kernel
 
-__all__ = ["initial_memory", "play", "play_columns", "weighted_plays"]
+__all__ = ['initial_memory', 'play', 'play_columns', 'weighted_plays']
 
 # Comparisons are written out: the NaN rules of max() and min() would keep the compiler from
 # vectorising over the thresholds.
@@ -120,11 +119,7 @@ def play_columns(
     """
     x = np.ascontiguousarray(v, dtype=np.float64)
     r = np.ascontiguousarray(thresholds, dtype=np.float64)
-    start = (
-        initial_memory(float(x[0]), r)
-        if memory is None
-        else np.array(memory, np.float64)
-    )
+    start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
     out = np.empty((r.size, x.size))
     _columns(x, r, start, out)
     return out

@@ -27,23 +27,22 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from piezo_ident.errors import DataError
 
-__all__ = ["KINDS", "Fault", "Piece", "Record", "Segment", "frozen_array"]
+__all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment', 'frozen_array']
 
 #: the segment kinds that the programmes use; other labels are kept and treated as unlabelled
 KINDS = (
-    "step",
-    "settle",
-    "noise",
-    "triangle",
-    "sine",
-    "hold",
-    "staircase",
-    "multisine",
-    "ramp",
-    "idle",
+    'step',
+    'settle',
+    'noise',
+    'triangle',
+    'sine',
+    'hold',
+    'staircase',
+    'multisine',
+    'ramp',
+    'idle',
 )
 
 
@@ -68,7 +67,7 @@ class Segment:
     @property
     def kind(self) -> str:
         """The part of the label before the colon: ``sine`` of ``sine:50Hz``."""
-        return self.label.partition(":")[0]
+        return self.label.partition(':')[0]
 
     @property
     def n(self) -> int:
@@ -87,7 +86,7 @@ class Fault:
 
     def __str__(self) -> str:
         """Return one line for people."""
-        return f"{self.name} ({self.count}) {self.where}: {self.action}"
+        return f'{self.name} ({self.count}) {self.where}: {self.action}'
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,27 +124,23 @@ class Piece:
         v, y = frozen_array(self.v), frozen_array(self.y)
         channels = {name: frozen_array(x) for name, x in self.channels.items()}
         if v.ndim != 1 or v.size == 0:
-            raise DataError(
-                "a piece needs at least one sample of voltage and displacement"
-            )
-        lengths = {"v": v.size, "y": y.size, **{k: x.size for k, x in channels.items()}}
+            raise DataError('a piece needs at least one sample of voltage and displacement')
+        lengths = {'v': v.size, 'y': y.size, **{k: x.size for k, x in channels.items()}}
         if len(set(lengths.values())) > 1:
-            raise DataError(
-                f"channels differ in length: {lengths}; give one value a sample"
-            )
+            raise DataError(f'channels differ in length: {lengths}; give one value a sample')
         if not (np.isfinite(self.sample_rate) and self.sample_rate > 0):
-            raise DataError(f"sample rate must be positive, got {self.sample_rate} Hz")
+            raise DataError(f'sample rate must be positive, got {self.sample_rate} Hz')
         end = 0
         for s in self.segments:
             if s.start < end or s.stop <= s.start or s.stop > v.size:
                 raise DataError(
-                    f"segment {s.label!r} ({s.start}..{s.stop}) is empty, overlaps its "
-                    f"neighbour or leaves the piece of {v.size} samples"
+                    f'segment {s.label!r} ({s.start}..{s.stop}) is empty, overlaps its '
+                    f'neighbour or leaves the piece of {v.size} samples'
                 )
             end = s.stop
-        object.__setattr__(self, "v", v)
-        object.__setattr__(self, "y", y)
-        object.__setattr__(self, "channels", MappingProxyType(channels))
+        object.__setattr__(self, 'v', v)
+        object.__setattr__(self, 'y', y)
+        object.__setattr__(self, 'channels', MappingProxyType(channels))
 
     @property
     def n(self) -> int:
@@ -190,9 +185,7 @@ class Piece:
             When the range is empty or leaves the piece.
         """
         if not 0 <= start < stop <= self.n:
-            raise DataError(
-                f"cannot cut samples {start}..{stop} out of a piece of {self.n}"
-            )
+            raise DataError(f'cannot cut samples {start}..{stop} out of a piece of {self.n}')
         segments = tuple(
             Segment(s.label, max(s.start, start) - start, min(s.stop, stop) - start)
             for s in self.segments
@@ -220,12 +213,12 @@ class Record:
     """
 
     pieces: tuple[Piece, ...]
-    name: str = "record"
+    name: str = 'record'
     faults: tuple[Fault, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.pieces:
-            raise DataError(f"{self.name}: no usable samples")
+            raise DataError(f'{self.name}: no usable samples')
 
     def __iter__(self) -> Iterator[Piece]:
         """Iterate over the pieces."""

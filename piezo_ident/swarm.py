@@ -33,11 +33,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import Bounds, OptimizeResult
-
 from piezo_ident.errors import ConfigError
 from piezo_ident.kernel import kernel
 from piezo_ident.record import frozen_array
+from scipy.optimize import Bounds, OptimizeResult
 
 __all__ = ['Quadratic', 'particle_swarm']
 

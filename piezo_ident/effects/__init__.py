@@ -23,11 +23,19 @@ from types import MappingProxyType
 
 from piezo_ident.effects.base import Effect, Parameter
 from piezo_ident.effects.creep import Creep
+from piezo_ident.effects.periodic_disturbance import PeriodicDisturbance
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.effects.thermal_drift import ThermalDrift
 from piezo_ident.errors import ModelError
 
-__all__ = ["Effect", "Parameter", "catalogue", "find_effect"]
+__all__ = ['Effect', 'Parameter', 'catalogue', 'find_effect']
 
-_OWN: tuple[type[Effect], ...] = (Creep,)
+_OWN: tuple[type[Effect], ...] = (
+    Creep,
+    PeriodicDisturbance,
+    RateDependentHysteresis,
+    ThermalDrift,
+)
 
 
 @cache
@@ -42,21 +50,15 @@ def catalogue() -> Mapping[str, type[Effect]]:
         takes a name that is already there.
     """
     found: dict[str, type[Effect]] = {effect.name: effect for effect in _OWN}
-    for entry in entry_points(group="piezo_ident.effects"):
+    for entry in entry_points(group='piezo_ident.effects'):
         try:
             effect = entry.load()
         except Exception as error:
-            raise ModelError(
-                f"effect plug-in {entry.value!r} does not load: {error}"
-            ) from error
+            raise ModelError(f'effect plug-in {entry.value!r} does not load: {error}') from error
         if not (isinstance(effect, type) and issubclass(effect, Effect)):
-            raise ModelError(
-                f"effect plug-in {entry.value!r} is not a subclass of Effect"
-            )
+            raise ModelError(f'effect plug-in {entry.value!r} is not a subclass of Effect')
         if effect.name in found:
-            raise ModelError(
-                f"effect plug-in {entry.value!r}: the name {effect.name!r} is taken"
-            )
+            raise ModelError(f'effect plug-in {entry.value!r}: the name {effect.name!r} is taken')
         found[effect.name] = effect
     return MappingProxyType(found)
 
@@ -73,7 +75,5 @@ def find_effect(name: str) -> type[Effect]:
     try:
         return catalogue()[name]
     except KeyError:
-        known = ", ".join(sorted(catalogue()))
-        raise ModelError(
-            f"unknown effect {name!r}; the catalogue has {known}"
-        ) from None
+        known = ', '.join(sorted(catalogue()))
+        raise ModelError(f'unknown effect {name!r}; the catalogue has {known}') from None

@@ -22,12 +22,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-
 from piezo_ident.block import Block, Operator, Slot
 from piezo_ident.errors import ModelError
 from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
 
-__all__ = ["Effect", "Parameter"]
+__all__ = ['Effect', 'Parameter']
 
 
 @dataclass(frozen=True)
@@ -111,23 +110,21 @@ class Effect:
         strange = sorted(set(values) - set(known))
         missing = sorted(set(known) - set(values))
         if strange or missing:
-            what = f"unknown {strange}" if strange else f"missing {missing}"
-            raise ModelError(
-                f"effect {cls.name}: {what}; its parameters are {sorted(known)}"
-            )
+            what = f'unknown {strange}' if strange else f'missing {missing}'
+            raise ModelError(f'effect {cls.name}: {what}; its parameters are {sorted(known)}')
         checked: dict[str, float | NDArray[np.float64]] = {}
         for name, p in known.items():
             try:
                 number = np.asarray(values[name], dtype=np.float64)
             except (TypeError, ValueError):
-                raise ModelError(f"effect {cls.name}: {name} is not a number") from None
+                raise ModelError(f'effect {cls.name}: {name} is not a number') from None
             if number.ndim != int(p.vector):
-                shape = "a list of numbers" if p.vector else "one number"
-                raise ModelError(f"effect {cls.name}: {name} must be {shape}")
+                shape = 'a list of numbers' if p.vector else 'one number'
+                raise ModelError(f'effect {cls.name}: {name} must be {shape}')
             if not np.all((number >= p.lower) & (number <= p.upper)):
                 raise ModelError(
-                    f"effect {cls.name}: {name} = {number.tolist()} leaves its bounds "
-                    f"{p.lower:g} .. {p.upper:g} {p.unit}"
+                    f'effect {cls.name}: {name} = {number.tolist()} leaves its bounds '
+                    f'{p.lower:g} .. {p.upper:g} {p.unit}'
                 )
             checked[name] = number if p.vector else float(number)
         return checked
@@ -136,7 +133,7 @@ class Effect:
         """Return a scalar parameter."""
         value = self.values[name]
         if not isinstance(value, float):
-            raise ModelError(f"effect {self.name}: {name} is a list")
+            raise ModelError(f'effect {self.name}: {name} is a list')
         return value
 
     def array(self, name: str) -> NDArray[np.float64]:

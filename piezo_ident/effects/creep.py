@@ -19,13 +19,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from scipy.signal import lfilter
-
 from piezo_ident.block import Block, Slot
 from piezo_ident.effects.base import Effect, Parameter
 from piezo_ident.errors import ModelError
+from scipy.signal import lfilter
 
-__all__ = ["Creep"]
+__all__ = ['Creep']
 
 
 class Creep(Effect):
@@ -45,17 +44,15 @@ class Creep(Effect):
     doi:10.1049/ip-cta:20010375.
     """
 
-    name: ClassVar[str] = "creep"
-    slot: ClassVar[Slot] = "hidden"
+    name: ClassVar[str] = 'creep'
+    slot: ClassVar[Slot] = 'hidden'
     parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('gain', '1', 'share c_i of each element', 0.0, -1.0, 1.0, vector=True),
         Parameter(
-            "gain", "1", "share c_i of each element", 0.0, -1.0, 1.0, vector=True
-        ),
-        Parameter(
-            "time_constant",
-            "s",
-            "time constant tau_i",
-            float("nan"),
+            'time_constant',
+            's',
+            'time constant tau_i',
+            float('nan'),
             1e-4,
             1e6,
             vector=True,
@@ -64,10 +61,10 @@ class Creep(Effect):
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._c, tau = self.array("gain"), self.array("time_constant")
+        self._c, tau = self.array('gain'), self.array('time_constant')
         if self._c.size != tau.size:
             raise ModelError(
-                f"effect creep: {self._c.size} gains and {tau.size} time constants; give one each"
+                f'effect creep: {self._c.size} gains and {tau.size} time constants; give one each'
             )
         self._pole = np.exp(-1.0 / (self.sample_rate * tau))
         self._state = np.zeros(tau.size)

@@ -1,0 +1,359 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
+
+A bag is read message by message into flat buffers, so its length is limited by the samples
+alone.  Topics are found by what their blocks say they carry, so remapped names are no obstacle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+import functools
+from pathlib import Path
+from typing import Any
+
+from piezo_ident.errors import DataError
+from piezo_ident.join import join, Stream
+from piezo_ident.output import temporary_output
+from piezo_ident.record import Record
+from piezo_ident.sampling import assemble
+from piezo_ident.wire_format import (
+    BLOCK_SIZE,
+    cut_blocks,
+    decode,
+    encode,
+    quantity_of,
+    Samples,
+)
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
+import yaml
+
+__all__ = ['MESSAGE_TYPE', 'SAMPLE_QOS', 'read_bag', 'typestore', 'write_bag']
+
+MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
+
+_FOREVER = QosTime(9223372036, 854775807)
+#: reliable, volatile, keep last 100: the contract of every topic that carries samples
+SAMPLE_QOS = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=100,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.VOLATILE,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return the message types of Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def read_bag(
+    path: str | Path,
+    *,
+    namespace: str | None = None,
+    voltage_topic: str | None = None,
+    displacement_topic: str | None = None,
+    displacement_unit: str = 'm',
+    voltage_limits: tuple[float, float] | None = None,
+) -> Record:
+    """
+    Read a rosbag2 folder, or a single .mcap or .db3 file.
+
+    Parameters
+    ----------
+    path : path
+        The folder or file.
+    namespace : str, optional
+        Take only topics below this namespace, for bags of several stages.
+    voltage_topic, displacement_topic : str, optional
+        Take these topics, whatever else the bag holds.
+    displacement_unit, voltage_limits
+        As for `piezo_ident.sampling.assemble`.
+
+    Raises
+    ------
+    DataError
+        For a damaged bag, for blocks whose layout does not fit, when no topic or more than one
+        carries the voltage or the displacement, and for all that `assemble` refuses.
+    """
+    path = Path(path)
+    asked = {'voltage': voltage_topic, 'displacement': displacement_topic}
+    with _opened(path) as reader:
+        carried = _carried(reader, path)
+        topics = _choose(carried, asked, namespace, path)
+        streams = _collect(reader, topics, path)
+    try:
+        joined = join(streams)
+    except DataError as error:
+        raise DataError(f'{path}: {error}') from None
+    return assemble(
+        joined.t,
+        joined.columns.pop('voltage'),
+        joined.columns.pop('displacement'),
+        joined.segments,
+        {quantity[2:]: x for quantity, x in joined.columns.items()},
+        name=str(path),
+        displacement_unit=displacement_unit,
+        voltage_limits=voltage_limits,
+        sample_rate=_sample_rate(path),
+        faults=joined.faults,
+    ).renamed(path.name)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Reader]:
+    if not path.exists():
+        raise DataError(f'{path}: does not exist; check the name')
+    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+        raise DataError(
+            f'{path}: no bag, metadata.yaml is missing; name a bag folder, or restore it with '
+            "'ros2 bag reindex'"
+        )
+    try:
+        with Reader(path) as reader:
+            yield reader
+    except DataError:
+        raise
+    # damage surfaces in a reader as anything from an assertion to a zstd error
+    except Exception as error:  # noqa: BLE001
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise DataError(
+            f'{path}: damaged or unfinished bag ({reason[:200]}); record it again, or try '
+            "'ros2 bag reindex' and 'mcap recover'"
+        ) from None
+
+
+def _messages(reader: Reader, connections: list[Connection]) -> Iterator[tuple[str, Any]]:
+    for connection, _, raw in reader.messages(connections=connections):
+        yield connection.topic, typestore().deserialize_cdr(raw, connection.msgtype)
+
+
+def _carried(reader: Reader, path: Path) -> dict[str, str]:
+    """Return what each topic carries, as its first message says."""
+    found = {}
+    for connection in reader.connections:
+        if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
+            continue
+        for topic, message in _messages(reader, [connection]):
+            base = topic.rpartition('/')[2]
+            # a damaged layout must not hide a topic that is ours by name
+            ours = base if base in ('voltage', 'displacement') else None
+            quantity = quantity_of(message.layout.dim) or ours
+            if quantity:
+                found[topic] = quantity
+            break
+    if not found:
+        topics = ', '.join(sorted({c.topic for c in reader.connections})) or 'none'
+        raise DataError(
+            f"{path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
+            f"(topics: {topics}); record the stage's voltage and displacement"
+        )
+    return found
+
+
+def _choose(
+    carried: Mapping[str, str],
+    asked: Mapping[str, str | None],
+    namespace: str | None,
+    path: Path,
+) -> dict[str, str]:
+    """Return the topic of each quantity."""
+    prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
+    chosen = {}
+    for quantity, wish in asked.items():
+        if wish is not None:
+            topic = f'/{wish.lstrip("/")}'
+            if topic not in carried:
+                raise DataError(
+                    f'{path}: no samples on topic {topic}; topics with samples: '
+                    + ', '.join(sorted(carried))
+                )
+            chosen[quantity] = topic
+            continue
+        there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
+        # applied_voltage and prediction carry the same quantity under another name
+        named = [t for t in there if t.rpartition('/')[2] == quantity]
+        fit = named if len(there) > 1 and named else there
+        if not fit:
+            raise DataError(
+                f"{path}: no topic carries 't,{quantity}'"
+                f'{"" if namespace is None else f" below {prefix}"}; topics with samples: '
+                + ', '.join(sorted(carried))
+            )
+        if len(fit) > 1:
+            raise DataError(
+                f'{path}: several topics carry {quantity}: {", ".join(sorted(fit))}; '
+                'name the stage with a namespace, or the topics'
+            )
+        chosen[quantity] = fit[0]
+    home = chosen['voltage'].rpartition('/')[0] + '/'
+    for topic, quantity in carried.items():
+        if quantity.startswith('x_') and topic.startswith(home):
+            if quantity in chosen:
+                raise DataError(
+                    f'{path}: {chosen[quantity]} and {topic} both carry {quantity}; '
+                    'record only one of them'
+                )
+            chosen[quantity] = topic
+    return chosen
+
+
+def _collect(reader: Reader, topics: Mapping[str, str], path: Path) -> dict[str, Stream]:
+    streams = {quantity: Stream() for quantity in topics}
+    by_topic = {topic: streams[quantity] for quantity, topic in topics.items()}
+    index = dict.fromkeys(by_topic, 0)
+    wanted = [c for c in reader.connections if c.topic in by_topic and c.msgtype == MESSAGE_TYPE]
+    for order, (topic, message) in enumerate(_messages(reader, wanted)):
+        layout = message.layout
+        try:
+            samples = decode(message.data, layout.dim, layout.data_offset)
+        except DataError as error:
+            raise DataError(
+                f'{path}: topic {topic}, message {index[topic]}: {error}; record it again with '
+                'a publisher that keeps to the layout'
+            ) from None
+        by_topic[topic].append(samples, order)
+        index[topic] += 1
+    return streams
+
+
+def _sample_rate(path: Path) -> float | None:
+    """Return the rate in the bag's custom data, if there is a sensible one."""
+    folder = path if path.is_dir() else path.parent
+    try:
+        meta = yaml.safe_load((folder / 'metadata.yaml').read_text('utf-8'))
+        info = meta['rosbag2_bagfile_information']
+        if path != folder and path.name not in info['relative_file_paths']:
+            return None
+        rate = float(info['custom_data']['sample_rate'])
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return None  # the stamps tell it as well
+    return rate if 0 < rate < float('inf') else None
+
+
+def write_bag(
+    record: Record,
+    path: str | Path,
+    *,
+    storage: str | None = None,
+    overwrite: bool = False,
+    custom_data: Mapping[str, str] | None = None,
+    block_size: int = BLOCK_SIZE,
+) -> None:
+    """
+    Write a record as a rosbag2 folder, or as a single file when `path` ends so.
+
+    A block's log time is the time of its first sample.  Where the record starts before zero, or
+    its clock restarts, log times are moved later by whole seconds, so that they stay positive
+    and in the order of the messages; the samples keep their own times.
+
+    Parameters
+    ----------
+    record : Record
+        What to write.
+    path : path
+        The folder, or a file name that ends in .mcap or .db3.
+    storage : {'mcap', 'sqlite3'}, optional
+        Storage of a folder; mcap unless told.
+    overwrite : bool
+        Replace an existing bag.
+    custom_data : mapping of str to str, optional
+        For the bag's metadata beside ``sample_rate``: seed, programme.
+    block_size : int
+        Samples a block.
+
+    Raises
+    ------
+    DataError
+        When the place is taken or cannot be written to.
+    """
+    path = Path(path)
+    plugins = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+    suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
+    if storage is not None and (storage not in plugins or (suffix or storage) != storage):
+        raise DataError(
+            f'{path}: storage {storage!r} is not possible; use mcap or sqlite3, and a file name '
+            'that agrees'
+        )
+    rates = {p.sample_rate for p in record}
+    custom = dict(custom_data or {})
+    if len(rates) == 1:
+        custom.setdefault('sample_rate', repr(float(next(iter(rates)))))
+    with temporary_output(path, overwrite=overwrite) as target:
+        folder = target.with_name('bag') if suffix else target
+        plugin = plugins[suffix or storage or 'mcap']
+        with Writer(folder, version=9, storage_plugin=plugin) as writer:
+            for key, value in custom.items():
+                writer.set_custom_data(key, value)
+            _write_pieces(writer, record, block_size)
+        if suffix:
+            next(f for f in folder.iterdir() if f.suffix == path.suffix.lower()).replace(target)
+
+
+def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
+    quantities = ['voltage', 'displacement']
+    quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
+    senders = {q: _sender(writer, q) for q in quantities}
+    shift, latest = 0, 0.0
+    for piece in record:
+        t = piece.t
+        # later by whole seconds, until nothing is before what was written already
+        while t[0] + shift < latest:
+            shift += 1 + int(latest - t[0] - shift)
+        latest = float(t[-1]) + shift
+        columns = {'voltage': piece.v, 'displacement': piece.y}
+        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
+        for start, stop, label in cut_blocks(piece.n, piece.segments, block_size):
+            stamp = round(t[start] * 1e9) + shift * 1_000_000_000
+            for quantity, x in columns.items():
+                samples = Samples(t[start:stop], x[start:stop], label, quantity)
+                senders[quantity](samples, stamp)
+
+
+def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
+    store = typestore()
+    types: Any = store.types
+    dimension = types['std_msgs/msg/MultiArrayDimension']
+    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
+    connection = writer.add_connection(
+        f'/{quantity}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
+    )
+
+    def send(samples: Samples, stamp: int) -> None:
+        data, dims = encode(samples)
+        filled = message(layout([dimension(*d) for d in dims], 0), data)
+        writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
+
+    return send

@@ -1,0 +1,303 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The sampling clock behind a column of time stamps.
+
+Stamps are rounded: to the decimals or digits that a file prints, to single precision, or to the
+last bit.  So a stamp is an interval, and a stretch of stamps is uniform when one rate passes
+through all its intervals.  Among the rates that do, the one with the fewest digits is taken: a
+sampling clock is 5000 Hz, not 4999.9999999997 Hz, and the choice stays the same when the record
+is written and read again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ['Clock', 'Resolution', 'fit_clock', 'split_uniform', 'time_stamps']
+
+Vector = NDArray[np.float64]
+
+#: rows looked at together, so that temporaries stay small beside a long record
+_CHUNK = 1 << 20
+#: fewer steps than this between two finer runs are gaps, not a slower sampling rate
+_SHORT = 8
+#: deviation from the uniform grid, in samples, that nobody needs to hear of
+_NEGLIGIBLE = 0.01
+
+
+@dataclass(frozen=True)
+class Clock:
+    """
+    Uniform time ``start_time + k / sample_rate``.
+
+    Attributes
+    ----------
+    sample_rate : float
+        [Hz].
+    start_time : float
+        Time of the first sample [s].
+    jitter : float
+        Largest deviation of a stamp from the grid beyond the stamps' own rounding, in samples.
+    """
+
+    sample_rate: float
+    start_time: float
+    jitter: float = 0.0
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """How finely a column of stamps was printed: None means as finely as a float64 can."""
+
+    decimals: int | None = None
+    digits: int | None = None
+    single: bool = False
+
+    @classmethod
+    def of(cls, t: Vector) -> Resolution:
+        """Return the coarsest rounding that all stamps obey."""
+        # whole stretches, because every fifth stamp of 5 kHz has a decimal fewer than the rest
+        blocks = np.linspace(0, max(t.size - 500, 0), 8).astype(int)
+        x = np.abs(t if t.size <= 4000 else np.concatenate([t[b : b + 500] for b in blocks]))
+        x = x[np.isfinite(x) & (x > 1e-9)]
+        if not x.size:
+            return cls()
+        top = int(np.floor(np.log10(x.max())))
+        place = np.floor(np.log10(x)).astype(int)
+        # 13 digits leave a float64 three to tell a rounded number from any other
+        decimals = (d for d in range(13 - top) if _rounded_to(x, np.full(x.shape, d)))
+        digits = (s for s in range(1, 13) if _rounded_to(x, s - 1 - place))
+        single = bool(np.all(x.astype(np.float32).astype(np.float64) == x))
+        return cls(next(decimals, None), next(digits, None), single)
+
+    def half(self, t: Vector) -> Vector:
+        """Return how far each stamp can lie from the true time by rounding alone [s]."""
+        half = np.zeros(t.shape)
+        if self.decimals is not None:
+            half += 0.5 * 10.0**-self.decimals
+        if self.digits is not None:
+            place = np.floor(np.log10(np.maximum(np.abs(t), 1e-12)))
+            half = np.maximum(half, 0.5 * 10.0 ** (place - self.digits + 1))
+        if self.single:
+            half = np.maximum(half, 0.5 * np.spacing(np.abs(t).astype(np.float32)))
+        return half
+
+
+def _rounded_to(x: Vector, decimals: NDArray[np.int_]) -> bool:
+    scale = 10.0 ** np.abs(decimals)
+    rounded = np.where(decimals >= 0, np.rint(x * scale) / scale, np.rint(x / scale) * scale)
+    return bool(np.all(np.abs(rounded - x) <= 2 * np.spacing(x)))
+
+
+def time_stamps(clock: Clock, start: int, stop: int) -> Vector:
+    """Return the times of samples `start` to ``stop - 1``, by the formula of `Piece.t`."""
+    first = round(clock.start_time * clock.sample_rate)
+    k = np.arange(start, stop, dtype=np.float64)
+    if first / clock.sample_rate == clock.start_time:
+        return (first + k) / clock.sample_rate
+    return clock.start_time + k / clock.sample_rate
+
+
+def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
+    """
+    Split increasing stamps where the sampling is interrupted or changes its rate.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Strictly increasing stamps [s].
+    resolution : Resolution
+        Of the whole file.
+
+    Returns
+    -------
+    list of (start, stop)
+        In order; stretches of a single sample are among them.
+    """
+    cuts = np.flatnonzero(_breaks(t)) + 1
+    bounds = [0, *cuts.tolist(), t.size]
+    todo = list(itertools.pairwise(bounds))[::-1]
+    if cuts.size > t.size // _SHORT + 10:
+        return todo[::-1]  # nothing is uniform here; no closer look will help
+    done: list[tuple[int, int]] = []
+    while todo:
+        start, stop = todo.pop()
+        inner = _inner_cuts(t[start:stop], resolution)
+        if inner:
+            marks = [start, *(start + c for c in inner), stop]
+            todo.extend(list(itertools.pairwise(marks))[::-1])
+        else:
+            done.append((start, stop))
+    return done
+
+
+def _breaks(t: Vector) -> NDArray[np.bool_]:
+    """
+    Tell for each step between neighbours whether it lies outside every uniform stretch.
+
+    Steps of like size form runs.  A short run of coarse steps beside a finer one is a gap; where
+    two proper runs meet the rate changes, and the sample between them goes to the later one.
+    """
+    step = np.diff(t)
+    if step.size < 2:
+        return np.zeros(step.size, dtype=np.bool_)
+    change = np.abs(np.diff(step)) > 0.6 * np.minimum(step[1:], step[:-1])
+    first = np.concatenate([[0], np.flatnonzero(change) + 1])
+    if first.size == 1:
+        return np.zeros(step.size, dtype=np.bool_)
+    length = np.diff(np.append(first, step.size))
+    level = (t[first + length] - t[first]) / length
+    before = np.concatenate([[np.inf], level[:-1]])
+    after = np.concatenate([level[1:], [np.inf]])
+    gap = (length < _SHORT) & (level > 1.5 * np.minimum(before, after))
+    breaks = np.repeat(gap, length)
+    meet = ~gap[1:] & ~gap[:-1]
+    breaks[first[1:][meet] - 1] = True
+    return breaks
+
+
+def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
+    """Return where a stretch without coarse breaks must still be cut; empty when uniform."""
+    n = t.size
+    if n < 3:
+        return []
+    step = np.diff(t)
+    dt = (t[-1] - t[0]) / (n - 1)
+    wide = np.flatnonzero(step > 1.5 * dt)
+    # rounding to a few decimals can hide a missing sample from a look at neighbours only
+    if wide.size:
+        return [int(i) + 1 for i in wide]
+    low, high = _rates(t, _rounding(resolution, dt))
+    if low <= high:
+        return []
+    residual = _residual(t)
+    if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT:
+        return []
+    # a change of rate is a kink, a jump of the clock a step: both peak where the cut belongs
+    k = int(np.argmax(np.abs(t - (t[0] + np.arange(n) * dt))))
+    if 0 < k < n - 1 and abs(step[k] - dt) > abs(step[k - 1] - dt) + 0.1 * dt:
+        k += 1
+    if not _SHORT <= k <= n - _SHORT:
+        return []
+    rms = max(float(np.std(_residual(part))) for part in (t[:k], t[k:]))
+    # jitter does not get smaller by cutting
+    return [k] if rms < 0.5 * float(np.std(residual)) else []
+
+
+def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
+    """
+    Fit a uniform clock to increasing stamps.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,), n >= 2
+        Stamps of one uniform stretch [s].
+    resolution : Resolution
+        Of the whole file.
+    known : iterable of float
+        Rates [Hz] to prefer, in this order, where the stamps allow them: a short stretch cannot
+        tell its rate as well as a longer one of the same file.
+
+    Returns
+    -------
+    Clock
+        With the rate of fewest digits that the stamps allow.
+    """
+    dt = float(t[-1] - t[0]) / (t.size - 1)
+    low, high = _rates(t, _rounding(resolution, dt))
+    jitter = 0.0
+    if low > high:
+        deviation = float(np.abs(_residual(t)).max())
+        jitter = deviation / dt
+        slack = 2 * deviation / float(t[-1] - t[0])
+        low, high = (1 - slack) / dt, (1 + slack) / dt
+    rate = next((r for r in known if low <= r <= high), None)
+    if rate is not None:
+        return Clock(rate, _start(float(t[0]), rate, resolution), jitter)
+    if not jitter:
+        # stamps may be far better than their last decimal: 0.0001 s steps at four decimals
+        for half in (_last_bit, lambda x: 8 * np.spacing(np.abs(x))):
+            tight = _rates(t, half)
+            if tight[0] <= tight[1]:
+                low, high = tight
+                break
+    clocks = [Clock(r, _start(float(t[0]), r, resolution), jitter) for r in _nice(low, high)]
+    return next((c for c in clocks if not jitter and _reproduces(c, t)), clocks[0])
+
+
+def _last_bit(t: Vector) -> Vector:
+    # half a bit for the stamp, a quarter for its difference from the first one
+    return 0.75 * np.spacing(np.abs(t))
+
+
+def _rounding(resolution: Resolution, dt: float) -> Callable[[Vector], Vector]:
+    # steps of one or two units of the last decimal are exact more often than rounded
+    return lambda t: np.minimum(resolution.half(t), 0.2 * dt) + 8 * np.spacing(np.abs(t))
+
+
+def _rates(t: Vector, half: Callable[[Vector], Vector]) -> tuple[float, float]:
+    """Return the smallest and largest rate through all stamps +- `half`, crossed when none is."""
+    low, high = 0.0, np.inf
+    first = float(half(t[:1])[0])
+    for i in range(1, t.size, _CHUNK):
+        part = t[i : i + _CHUNK]
+        k = np.arange(i, i + part.size, dtype=np.float64)
+        elapsed, error = part - t[0], half(part) + first
+        low = max(low, float(np.max(k / (elapsed + error))))
+        inside = elapsed > error
+        if inside.any():
+            high = min(high, float(np.min(k[inside] / (elapsed - error)[inside])))
+    return low, high
+
+
+def _residual(t: Vector) -> Vector:
+    """Return what a least-squares line leaves of the stamps [s]."""
+    k = np.arange(t.size) - 0.5 * (t.size - 1)
+    x = t - t[0]
+    x -= x.mean()
+    residual: Vector = x - k * (np.dot(k, x) / np.dot(k, k))
+    return residual
+
+
+def _nice(low: float, high: float) -> Iterator[float]:
+    """Yield rates between two bounds, those with few digits (or whose period has few) first."""
+    middle = 0.5 * (low + high)
+    for digits in range(15):
+        for rate in (float(f'{middle:.{digits}e}'), 1 / float(f'{1 / middle:.{digits}e}')):
+            if low <= rate <= high:
+                yield rate
+    yield float(f'{middle:.11e}')
+
+
+def _start(t0: float, rate: float, resolution: Resolution) -> float:
+    """Return the tick of the sample clock that a first stamp means, or the stamp itself."""
+    tick = round(t0 * rate) / rate
+    x = np.array([t0])
+    slack = float(_rounding(resolution, 1 / rate)(x)[0])
+    return tick if abs(tick - t0) <= slack else t0
+
+
+def _reproduces(clock: Clock, t: Vector) -> bool:
+    chunks = range(0, t.size, _CHUNK)
+    return all(
+        np.array_equal(time_stamps(clock, i, min(i + _CHUNK, t.size)), t[i : i + _CHUNK])
+        for i in chunks
+    )

@@ -1,0 +1,61 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Drift: the stage and its mount change length with temperature."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, Parameter
+
+__all__ = ['ThermalDrift']
+
+
+class ThermalDrift(Effect):
+    """
+    Displacement that grows with time, whatever the command does.
+
+    ``d(t) = b t + c (1 - exp(-t / tau))``: a steady drift, and a first-order approach to a new
+    temperature, as after switching on.  Time is that of the sample clock, which starts with the
+    record, and not the time since the last reset: a gap in a record does not stop the drift.
+    Before zero there is none.
+
+    Notes
+    -----
+    Size: c is ``alpha L dT / Y``; 0.1 K on 2 cm of aluminium, alpha = 23e-6 / K, make about 50 nm.
+    First-order exchange of heat with the surroundings is Newton's law of cooling.
+    """
+
+    name: ClassVar[str] = 'thermal_drift'
+    slot: ClassVar[Slot] = 'output'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0),
+        Parameter('amplitude', '1', 'final size c of the approach', 0.0, -1.0, 1.0),
+        Parameter('time_constant', 's', 'tau of the approach', float('nan'), 1e-3, 1e7),
+    )
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: nothing has drifted yet."""
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block with the drift added."""
+        t = np.maximum(block.t, 0.0)
+        approach = -np.expm1(-t / self.number('time_constant'))
+        return block.with_signal(
+            block.x + self.number('rate') * t + self.number('amplitude') * approach
+        )

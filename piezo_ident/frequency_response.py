@@ -1,0 +1,93 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The frequency response without a model: Welch's estimate, its coherence and its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+__all__ = ['FrequencyResponse', 'frequency_response']
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """
+    Response of an output to an input.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (n,)
+        [Hz]
+    response : ndarray of complex, shape (n,)
+        ``S_uy / S_uu``.
+    coherence : ndarray, shape (n,)
+        ``|S_uy|^2 / (S_uu S_yy)``.
+    std : ndarray, shape (n,)
+        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))``.
+    averages : int
+        Number L of segments.
+    """
+
+    frequency: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    coherence: NDArray[np.float64]
+    std: NDArray[np.float64]
+    averages: int
+
+
+def frequency_response(
+    u: NDArray[np.float64], y: NDArray[np.float64], sample_rate: float, band: float | None = None
+) -> FrequencyResponse:
+    """
+    Estimate a frequency response by Welch's method.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+        Input and output; linear trends are removed segment by segment.
+    sample_rate : float
+        [Hz]
+    band : float, optional
+        Highest frequency returned [Hz].
+
+    Notes
+    -----
+    Bendat and Piersol, Random Data, 4th ed. (2010), table 9.6, doi:10.1002/9781118032428.
+    """
+    segment = int(2 ** np.floor(np.log2(max(u.size // 16, 16))))
+    segment = min(segment, 8192)
+    how: dict[str, Any] = {'fs': sample_rate, 'nperseg': segment, 'detrend': 'linear'}
+    f, s_uy = signal.csd(u, y, **how)
+    _, s_uu = signal.welch(u, **how)
+    _, s_yy = signal.welch(y, **how)
+    averages = max(1, 2 * u.size // segment - 1)
+    tiny = np.finfo(float).tiny
+    coherence = np.clip(np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, tiny), 0.0, 1.0)
+    std = np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages))
+    keep = f > 0.0
+    if band is not None:
+        keep &= f <= band
+    return FrequencyResponse(
+        frequency=f[keep],
+        response=(s_uy / np.maximum(s_uu, tiny))[keep],
+        coherence=coherence[keep],
+        std=std[keep],
+        averages=averages,
+    )

@@ -1,0 +1,313 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Step 3: the weights of H, by particle swarm as in the paper, or by bounded least squares.
+
+With thresholds and dynamics fixed, the output is linear in what is sought,
+
+    y = offset + sum_i q_i (G F_ri[v]) + p1 (G v^3) + p2 (G v),        q_i >= 0,
+
+so the filtered plays are columns.  They are reduced once to the triangular factor R, with the
+offsets in front; the rows below the offsets then hold the problem without them, and their Gram
+matrix is all that the swarm needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.errors import IdentificationError
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.least_squares import bounded_least_squares, triangular_factor
+from piezo_ident.play import initial_memory, play_columns
+from piezo_ident.swarm import particle_swarm, Quadratic
+from scipy.optimize import Bounds, OptimizeResult
+
+__all__ = [
+    'Excerpt',
+    'HysteresisFit',
+    'even_thresholds',
+    'factorise',
+    'fine_thresholds',
+    'fit_hysteresis',
+    'merged',
+]
+
+Solver = Literal['swarm', 'least_squares']
+
+#: box in which the swarm starts and stays, in units of full stroke over full voltage range
+WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
+#: how far the voltage may move within one averaged row, as a share of its range
+ROW_SPAN = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """
+    Data for fitting H: one uniformly sampled run, and which of its samples count.
+
+    Attributes
+    ----------
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement of the whole run; the plays need all of it.
+    use : ndarray of bool, shape (n,)
+        Samples that are fitted.
+    memory : callable, optional
+        Play outputs before the first sample, as a function of the thresholds; that of a stage
+        which last came down to zero when absent.
+    """
+
+    u: NDArray[np.float64]
+    x: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def start(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the play outputs before the first sample."""
+        if self.memory is None:
+            return initial_memory(float(self.u[0]), thresholds)
+        return self.memory(thresholds)
+
+    @property
+    def row(self) -> int:
+        """Samples that one row of the fit may average."""
+        speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
+        span = ROW_SPAN * float(np.ptp(self.u[self.use]))
+        return max(
+            1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
+        )
+
+
+def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
+    """
+    Return `count` evenly spaced thresholds from 0 over the excited swing, without the 0.
+
+    The play at r = 0 is the linear term, so `count` operators have ``count - 1`` thresholds.
+    """
+    return swing * np.arange(1, count) / count
+
+
+def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
+    """
+    Return thresholds for an H that only serves to find G.
+
+    Forty over the swing, and a dozen within the excursion of the noise: what H does inside the
+    noise would otherwise be taken for slow dynamics.
+
+    Parameters
+    ----------
+    swing, excursion : float
+        Normalised peak-to-peak voltage of the whole record and of the noise.
+    """
+    fine = excursion * np.arange(1, 13) / 12.0
+    return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
+
+
+def _binned(x: NDArray[np.float64], use: NDArray[np.bool_], row: int) -> NDArray[np.float64]:
+    # averages never reach across a hole in the mask; the last incomplete row is left out
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
+    parts = []
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        n = (stop - start) // row
+        parts.append(x[start : start + n * row].reshape(n, row).mean(axis=1))
+    return np.concatenate(parts) * np.sqrt(row) if parts else np.empty(0)
+
+
+def factorise(
+    excerpts: Sequence[Excerpt],
+    thresholds: NDArray[np.float64],
+    dynamics: Dynamics,
+    delay: Delay,
+) -> NDArray[np.float64]:
+    """
+    Reduce the data to the factor R of ``[offsets | G F_r | G v^3 | G v | y]``.
+
+    Parameters
+    ----------
+    excerpts : sequence of Excerpt
+        Each gets an offset of its own.
+    thresholds : ndarray, shape (m,)
+    dynamics, delay
+        What the plays pass before they are seen.
+
+    Returns
+    -------
+    ndarray, shape (k + m + 3, k + m + 3)
+        k is the number of excerpts.
+    """
+    k, m = len(excerpts), thresholds.size
+
+    def rows() -> Iterator[NDArray[np.float64]]:
+        for i, excerpt in enumerate(excerpts):
+            row = excerpt.row
+            memory = excerpt.start(thresholds)
+            columns = []
+            for j in range(m + 2):
+                if j < m:
+                    raw = play_columns(excerpt.u, thresholds[j : j + 1], memory[j : j + 1])[0]
+                else:
+                    raw = excerpt.u ** (3 if j == m else 1)
+                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw))
+                columns.append(_binned(filtered, excerpt.use, row))
+            y = _binned(excerpt.x, excerpt.use, row)
+            offsets = np.zeros((k, y.size))
+            offsets[i] = np.sqrt(row)
+            yield np.vstack([offsets, *columns, y]).T
+
+    return triangular_factor(rows(), k + m + 3)
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisFit:
+    """
+    Result of step 3.
+
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+    offsets : ndarray
+        Displacement at u = 0 of each excerpt, normalised.
+    solver : str
+    loss : float
+        Sum of squares of the returned weights, over `n` samples.
+    swarm_loss : float or None
+        Sum of squares that the swarm reached before polishing.
+    optimum_loss : float
+        Sum of squares of bounded least squares.
+    n : int
+        Samples fitted.
+    std : ndarray, shape (m + 2,)
+        Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound.
+    swarm : scipy.optimize.OptimizeResult or None
+    """
+
+    hysteresis: Hysteresis
+    offsets: NDArray[np.float64]
+    solver: str
+    loss: float
+    swarm_loss: float | None
+    optimum_loss: float
+    n: int
+    std: NDArray[np.float64]
+    swarm: OptimizeResult | None
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual, normalised."""
+        return float(np.sqrt(self.loss / self.n))
+
+
+def fit_hysteresis(
+    R: NDArray[np.float64],
+    thresholds: NDArray[np.float64],
+    n: int,
+    *,
+    solver: Solver = 'least_squares',
+    rng: np.random.Generator | None = None,
+    swarm_size: int = 40,
+    maxiter: int = 20_000,
+    callback: Callable[[OptimizeResult], Any] | None = None,
+) -> HysteresisFit:
+    """
+    Find the weights of H from factorised data.
+
+    Parameters
+    ----------
+    R : ndarray
+        From `factorise`.
+    thresholds : ndarray, shape (m,)
+    n : int
+        Number of samples behind R.
+    solver : {'least_squares', 'swarm'}
+        The swarm is polished by bounded least squares; both losses are kept.
+    rng : numpy.random.Generator
+        Needed by the swarm.
+    swarm_size, maxiter, callback
+        As in `piezo_ident.swarm.particle_swarm`.
+
+    Raises
+    ------
+    IdentificationError
+        When the swarm is asked for without `rng`, or the data hold nothing.
+    """
+    m = thresholds.size
+    k = R.shape[0] - m - 3
+    inner = R[k:, k:]
+    if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
+        raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
+    lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
+    x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
+    swarm = None
+    swarm_loss = None
+    if solver == 'swarm':
+        if rng is None:
+            raise IdentificationError('hysteresis: the swarm needs a random generator')
+        box = np.array([WEIGHT_BOX] * m + [P1_BOX, P2_BOX])
+        A, y = inner[:, :-1], inner[:, -1]
+        swarm = particle_swarm(
+            Quadratic(A.T @ A, A.T @ y, float(y @ y)),
+            Bounds(box[:, 0], box[:, 1]),
+            rng=rng,
+            swarm_size=swarm_size,
+            maxiter=maxiter,
+            tol=1e-3,
+            callback=callback,
+        )
+        # from the factor, not from the Gram matrix: the difference of large squares loses digits
+        swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
+    offsets = np.linalg.solve(R[:k, :k], R[:k, -1] - R[:k, k:-1] @ x)
+    free = x > lower
+    std = np.zeros(m + 2)
+    gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
+    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum / max(n - m - 2, 1)
+    std[free] = np.sqrt(np.maximum(variance, 0.0))
+    h = Hysteresis(thresholds, x[:m], float(x[m]), float(x[m + 1]))
+    return HysteresisFit(
+        hysteresis=h,
+        offsets=np.asarray(offsets),
+        solver=solver,
+        loss=optimum,
+        swarm_loss=swarm_loss,
+        optimum_loss=optimum,
+        n=n,
+        std=std,
+        swarm=swarm,
+    )
+
+
+def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
+    """
+    Return fewer thresholds in better places, from a fit on a fine grid.
+
+    On a grid finer than the truth, least squares puts a weight on the two neighbours of each true
+    threshold and zero elsewhere; each such group becomes one threshold at its centre of weight.
+    """
+    r, q = hysteresis.thresholds, hysteresis.weights
+    alive = q > 1e-6 * max(float(q.max(initial=0.0)), 1e-12)
+    places = []
+    i = 0
+    while i < r.size:
+        if not alive[i]:
+            i += 1
+            continue
+        pair = slice(i, i + 2 if i + 1 < r.size and alive[i + 1] else i + 1)
+        places.append(float(r[pair] @ q[pair] / q[pair].sum()))
+        i = pair.stop
+    return np.array(places)

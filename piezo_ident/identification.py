@@ -1,0 +1,419 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+From records to a model: the three steps in order, or all at once where nothing is labelled.
+
+Gu, Li, Zhu and Su, "Modeling and Identification of Piezoelectric-Actuated Stages Cascading
+Hysteresis Nonlinearity With Linear Dynamics", IEEE/ASME Trans. Mechatronics 21(3), 2016,
+doi:10.1109/TMECH.2015.2465868.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import platform
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.dynamics import Delay, Dynamics
+from piezo_ident.errors import Cancelled, IdentificationError
+from piezo_ident.hysteresis_fit import (
+    even_thresholds,
+    Excerpt,
+    factorise,
+    fit_hysteresis,
+    HysteresisFit,
+)
+from piezo_ident.metrics import fit_percent, FORMULA, percent_of_stroke
+from piezo_ident.model import Scaling, StageModel
+from piezo_ident.record import Record
+from piezo_ident.results import (
+    DelayResult,
+    DynamicsResult,
+    ErrorRow,
+    Identification,
+    Progress,
+    Settings,
+    silent,
+)
+from piezo_ident.runs import (
+    common_rate,
+    noise_floor,
+    refuse_closed_loop,
+    Run,
+    runs_of,
+    scaling_of,
+)
+from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
+from piezo_ident.threshold_choice import choose_thresholds
+from piezo_ident.unlabelled import joint_fit
+import scipy
+from scipy.optimize import OptimizeResult
+
+__all__ = ['errors_of', 'identify']
+
+#: measured and modelled small-signal gain may differ by this share before it is said
+SLOPE_TOLERANCE = 0.05
+
+
+def identify(
+    records: Sequence[Record] | Record,
+    settings: Settings | None = None,
+    *,
+    progress: Progress = silent,
+) -> Identification:
+    """
+    Learn a stage from its records.
+
+    Parameters
+    ----------
+    records : sequence of Record, or Record
+        With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
+        of other kinds are then left for validation.  Without them the longest run is fitted as a
+        whole, but for its end.
+    settings : Settings, optional
+    progress : callable, optional
+        Called with the name of the step and its share done; may raise `Cancelled`.
+
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    IdentificationError
+        When the data do not carry a model; the message says what they lack.
+    """
+    settings = settings or Settings()
+    records = [records] if isinstance(records, Record) else list(records)
+    if not records:
+        raise IdentificationError('no record was given')
+    for record in records:
+        refuse_closed_loop(record)
+    rate, left = common_rate(records)
+    pieces = [p for record in records for p in record if p.sample_rate == rate]
+    scaling = scaling_of(pieces)
+    runs = runs_of(records, rate, scaling)
+    floor, source = noise_floor(pieces)
+    warnings = [f'{record.name}: {fault}' for record in records for fault in record.faults] + left
+    kinds = {s.kind for p in pieces for s in p.segments}
+    if {'noise', 'triangle'} <= kinds:
+        found = _labelled(runs, rate, scaling, settings, progress)
+    else:
+        found = _unlabelled(runs, rate, scaling, settings, progress)
+    model, delay, dynamics, fit, rows, said, missing = found
+    warnings += [*said, *_check(delay, dynamics, fit, floor, scaling)]
+    stroke = abs(scaling.Y)
+    result = Identification(
+        model=model,
+        delay=delay,
+        dynamics=dynamics,
+        hysteresis=fit,
+        errors=tuple(rows),
+        noise_floor=None if floor is None else 100.0 * floor / stroke,
+        noise_source=source,
+        stroke=stroke,
+        warnings=tuple(warnings),
+        not_identified=tuple(missing),
+        settings=settings,
+    )
+    story = _story(result, [record.name for record in records])
+    return replace(result, model=replace(model, identification=story))
+
+
+Found = tuple[
+    StageModel,
+    DelayResult,
+    DynamicsResult,
+    HysteresisFit,
+    list[ErrorRow],
+    list[str],
+    list[tuple[str, str]],
+]
+
+
+def _stop_on_request(
+    progress: Progress, total: int
+) -> tuple[Callable[[OptimizeResult], bool], list[Cancelled]]:
+    """Return a swarm callback that reports progress, and where it leaves a request to stop."""
+    request: list[Cancelled] = []
+
+    def callback(intermediate_result: OptimizeResult) -> bool:
+        try:
+            progress('hysteresis', 0.3 + 0.6 * intermediate_result.nit / total)
+        except Cancelled as stop:
+            request.append(stop)
+            return True
+        return False
+
+    return callback, request
+
+
+def _third_step(
+    fit: list[Excerpt],
+    held: list[Excerpt],
+    G: Dynamics,
+    delay: Delay,
+    settings: Settings,
+    progress: Progress,
+) -> HysteresisFit:
+    progress('hysteresis', 0.0)
+    swing = max(float(np.ptp(e.u[e.use])) for e in fit)
+    n = int(sum(e.use.sum() for e in fit))
+    if settings.refine:
+        # thresholds and weights are found together, by least squares alone
+        r = choose_thresholds(fit, held, swing, G, delay)
+        return fit_hysteresis(factorise(fit, r, G, delay), r, n)
+    r = even_thresholds(swing, settings.thresholds)
+    R = factorise(fit, r, G, delay)
+    progress('hysteresis', 0.3)
+    callback, request = _stop_on_request(progress, settings.swarm_iterations)
+    result = fit_hysteresis(
+        R,
+        r,
+        n,
+        solver=settings.solver,
+        rng=np.random.default_rng(settings.seed),
+        swarm_size=settings.swarm_size,
+        maxiter=settings.swarm_iterations,
+        callback=callback,
+    )
+    if request:
+        raise request[0]
+    progress('hysteresis', 1.0)
+    return result
+
+
+def _labelled(
+    runs: list[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
+) -> Found:
+    fit = triangle_excerpts(runs)
+    if not fit:
+        raise IdentificationError(
+            'no triangle starts from a known memory or sweeps its range twice; start it from the '
+            'lowest voltage'
+        )
+    delay_result = first_step(runs, settings, progress)
+    delay = Delay(delay_result.samples)
+    dynamics, G = second_step(runs, delay, settings, progress)
+    result = _third_step(fit, triangle_excerpts(runs, held=True), G, delay, settings, progress)
+    model = _model(rate, scaling, result, G, delay)
+    said = []
+    if delay_result.source == 'scan':
+        said.append('no step rises above the noise; the delay was read from the ARX loss alone')
+    lowest = min(float(e.u[e.use].min()) for e in fit)
+    highest = max(float(e.u[e.use].max()) for e in fit)
+    if lowest > 0.01 or highest < 0.99:
+        said.append(
+            'the triangle does not cover the voltages of the record: it reaches '
+            f'{scaling.v0 + scaling.V * lowest:.3g} .. {scaling.v0 + scaling.V * highest:.3g} V'
+        )
+        span = (scaling.v0 + scaling.V * lowest, scaling.v0 + scaling.V * highest)
+        model = replace(model, scaling=replace(model.scaling, range=span))
+    masks = []
+    for run in runs:
+        held = run.held_out()
+        fitted = run.mask('triangle', 'noise', 'settle', 'step') & ~held
+        masks.append((fitted, held))
+    rows = errors_of(model, runs, masks)
+    return model, delay_result, dynamics, result, rows, said, []
+
+
+def _unlabelled(
+    runs: list[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
+) -> Found:
+    run = max(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n))
+    piece = run.piece
+    share = max(1.5, 0.2 * piece.duration)
+    held_time = settings.hold_out or min(share, 0.25 * piece.duration)
+    n_fit = piece.n - round(held_time * rate)
+    if n_fit < 100:
+        raise IdentificationError(
+            f'{run.record}: {piece.n} samples, of which {max(n_fit, 0)} are left to fit after '
+            f'holding out {held_time:.3g} s; record longer or hold out less (--hold-out)'
+        )
+    joint = joint_fit(run, n_fit, scaling, settings, progress)
+    delay = Delay(joint.delay.samples)
+    u, x = run.u[:n_fit], run.x[:n_fit]
+    use = run.known[:n_fit].copy()
+    if use.sum() < n_fit // 5:
+        use[:] = True
+    # what chooses the thresholds is a part of what is fitted in the end, never the held-out end
+    late = np.zeros(n_fit, dtype=bool)
+    late[n_fit - int(0.25 * use.sum()) :] = True
+    fit_part = [Excerpt(u, x, use & ~late, joint.memory)]
+    late_part = [Excerpt(u, x, use & late, joint.memory)]
+    if settings.refine:
+        r = choose_thresholds(fit_part, late_part, float(np.ptp(u[use])), joint.G, delay)
+        R = factorise([Excerpt(u, x, use, joint.memory)], r, joint.G, delay)
+        result = fit_hysteresis(R, r, int(use.sum()))
+    else:
+        whole = [Excerpt(u, x, use, joint.memory)]
+        result = _third_step(whole, [], joint.G, delay, settings, progress)
+    model = _model(rate, scaling, result, joint.G, delay)
+    low, high = float(u.min()), float(u.max())
+    span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
+    model = replace(model, scaling=replace(model.scaling, range=span))
+    start = None if joint.memory is None else joint.memory(model.hysteresis.thresholds)
+    masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
+    for other in runs:
+        fitted = np.zeros(other.piece.n, dtype=bool)
+        if other is run:
+            fitted[:n_fit] = True
+        masks.append((fitted, np.zeros(other.piece.n, dtype=bool)))
+    rows = errors_of(model, runs, masks, {id(run): start})
+    said = [
+        'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
+        f'together on the first {n_fit / rate:.4g} s of {run.record}'
+    ]
+    fitted_error = [row.percent for row in rows if row.data == 'fitted']
+    held_error = [row.percent for row in rows if row.data == 'held out']
+    if fitted_error and held_error and held_error[0] > 3.0 * fitted_error[0]:
+        said.append(
+            f'the held-out error is {held_error[0] / fitted_error[0]:.1f} times the fitted one: '
+            'this record does not pin the model down; drive the range more than once'
+        )
+    progress('hysteresis', 1.0)
+    return model, joint.delay, joint.dynamics, result, rows, said, list(joint.not_identified)
+
+
+def _model(
+    rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
+) -> StageModel:
+    moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
+    return StageModel(rate, moved, fit.hysteresis, G, delay)
+
+
+def errors_of(
+    model: StageModel,
+    runs: Sequence[Run],
+    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    memories: dict[int, NDArray[np.float64] | None] | None = None,
+) -> list[ErrorRow]:
+    """
+    Return the free-run error of every segment, split into what was fitted and what was not.
+
+    Parameters
+    ----------
+    model : StageModel
+    runs : sequence of Run
+    masks : sequence of (fitted, selection)
+        For each run, the samples that were fitted and those that only chose between models.
+    memories : dict, optional
+        Known memory at the start of a run, by its ``id``.
+    """
+    static = model.without_dynamics()
+    rows = []
+    for run, (fitted, selection) in zip(runs, masks, strict=True):
+        memory = (memories or {}).get(id(run))
+        y = run.piece.y
+        y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
+        stroke = float(np.ptp(y))
+        names = [(s.label, s.start, s.stop) for s in run.piece.segments]
+        for label, start, stop in names or [('', 0, run.piece.n)]:
+            part = np.zeros(run.piece.n, dtype=bool)
+            part[start:stop] = True
+            for data, mask in (
+                ('fitted', part & fitted),
+                ('selection', part & selection),
+                ('held out', part & ~fitted & ~selection),
+            ):
+                if not mask.any():
+                    continue
+                rows.append(
+                    ErrorRow(
+                        record=run.record,
+                        segment=label,
+                        percent=percent_of_stroke(y[mask], y_hat[mask], stroke),
+                        static_percent=percent_of_stroke(y[mask], y_static[mask], stroke),
+                        fit=fit_percent(y[mask], y_hat[mask]),
+                        n=int(mask.sum()),
+                        data=data,
+                    )
+                )
+    return rows
+
+
+def _check(
+    delay: DelayResult,
+    dynamics: DynamicsResult,
+    fit: HysteresisFit,
+    floor: float | None,
+    scaling: Scaling,
+) -> list[str]:
+    said = []
+    if delay.agree is False and delay.step is not None:
+        said.append(
+            f'steps say a delay of {delay.step.samples} samples, the ARX loss says {delay.scan}; '
+            'the steps were followed'
+        )
+    measured, modelled = dynamics.slope_measured, dynamics.slope_model
+    if np.isfinite(measured) and abs(measured / modelled - 1.0) > SLOPE_TOLERANCE:
+        said.append(
+            f'the small-signal gain of the noise, {measured:.3g}, is not the slope of H at its '
+            f'bias, {modelled:.3g} (normalised)'
+        )
+    if floor is not None and floor > 0.01 * abs(scaling.Y):
+        said.append(f'the sensor noise is {100 * floor / abs(scaling.Y):.2g} % of stroke')
+    if fit.swarm is not None and fit.swarm_loss is not None:
+        excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0 else 0.0
+        if excess > 0.01:
+            said.append(
+                f'before polishing the swarm was {excess:.2g} of the loss above the optimum; '
+                'more iterations would bring it closer'
+            )
+    return said
+
+
+def _story(result: Identification, names: list[str]) -> dict[str, Any]:
+    """Return what the model file tells about its own origin."""
+    fit, dynamics = result.hysteresis, result.dynamics
+    m = fit.hysteresis.thresholds.size
+    na = dynamics.order[0]
+    sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
+    return {
+        'method': 'three steps' if dynamics.table is not None else 'joint free-run fit',
+        'reference': 'doi:10.1109/TMECH.2015.2465868',
+        'solver': fit.solver,
+        'seed': result.settings.seed,
+        'records': names,
+        'versions': {
+            'python': platform.python_version(),
+            'numpy': np.__version__,
+            'scipy': scipy.__version__,
+        },
+        'errors': {
+            'unit': '% of stroke',
+            'formula': FORMULA,
+            **{
+                data.replace(' ', '_'): result.error(data)
+                for data in ('fitted', 'selection', 'held out')
+                if np.isfinite(result.error(data))
+            },
+        },
+        'uncertainties': {
+            'delay': result.delay.std if np.isfinite(result.delay.std) else None,
+            'weights': fit.std[:m].tolist(),
+            'p1': float(fit.std[m]),
+            'p2': float(fit.std[m + 1]),
+            'a': sigma[:na].tolist(),
+            'b': sigma[na : na + dynamics.order[1]].tolist(),
+        },
+        'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
+        'warnings': list(result.warnings),
+        'not_identified': [f'{what}: {why}' for what, why in result.not_identified],
+    }

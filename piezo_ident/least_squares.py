@@ -1,0 +1,103 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Least squares on a triangular factor: samples are read once, every fit after that is small."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+__all__ = ['bounded_least_squares', 'residual_inflation', 'triangular_factor']
+
+#: rows that are factorised at once
+ROWS = 4096
+
+
+def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDArray[np.float64]:
+    """
+    Return R of the QR factorisation of all rows, in constant memory.
+
+    Parameters
+    ----------
+    blocks : iterable of ndarray, shape (rows, width)
+    width : int
+        Number of columns.
+
+    Returns
+    -------
+    ndarray, shape (width, width)
+        Upper triangular; ``R'R`` is the Gram matrix of the columns.
+    """
+    R = np.zeros((width, width))
+    for block in blocks:
+        for start in range(0, block.shape[0], ROWS):
+            rows = np.vstack([R, block[start : start + ROWS]])
+            R = np.asarray(np.linalg.qr(rows, mode='r'))
+    return R
+
+
+def bounded_least_squares(
+    R: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """
+    Minimise ``|A x - y|^2`` inside bounds, where R is the factor of ``[A y]``.
+
+    Parameters
+    ----------
+    R : ndarray, shape (n + 1, n + 1)
+    lower, upper : ndarray, shape (n,)
+        Bounds, possibly infinite.
+
+    Returns
+    -------
+    x : ndarray, shape (n,)
+    loss : float
+        The sum of squares at x.
+    """
+    A, y = R[:, :-1], R[:, -1]
+    scale = np.linalg.norm(A, axis=0)
+    scale[scale == 0.0] = 1.0
+    result = lsq_linear(A / scale, y, (lower * scale, upper * scale), method='bvls')
+    if result.status <= 0:
+        result = lsq_linear(A / scale, y, (lower * scale, upper * scale), method='trf')
+    x = np.clip(result.x / scale, lower, upper)
+    return x, float(np.sum((A @ x - y) ** 2))
+
+
+def residual_inflation(e: NDArray[np.float64], limit: int = 2000) -> float:
+    """
+    Return by how much correlated residuals inflate a variance over white ones.
+
+    The sum ``1 + 2 sum rho_k`` of the autocorrelation up to its first crossing of zero.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n,)
+        Residual.
+    limit : int, optional
+        Largest lag.
+    """
+    x = e - e.mean()
+    power = float(x @ x)
+    if power == 0.0 or x.size < 4:
+        return 1.0
+    spectrum = np.fft.rfft(x, 2 * x.size)
+    rho = np.fft.irfft(np.abs(spectrum) ** 2)[: min(limit, x.size // 2)] / power
+    negative = np.flatnonzero(rho <= 0.0)
+    end = int(negative[0]) if negative.size else rho.size
+    return float(max(1.0, 1.0 + 2.0 * rho[1:end].sum()))

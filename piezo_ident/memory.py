@@ -1,0 +1,116 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The memory of a stage at the start of a record: unknown, unless it begins from a known rest.
+
+Before the voltage has swept as far as its threshold, a play is its unknown start, held between
+
+    max(v so far) - r   <=   F_r   <=   min(v so far),
+
+and after that it has forgotten it.  So the start is a handful of bounded numbers, found by least
+squares on the early part of a record.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.dynamics import filter_arx
+from piezo_ident.model import StageModel
+from piezo_ident.play import play_columns
+from piezo_ident.record import Piece
+from scipy.optimize import lsq_linear
+
+__all__ = ['fit_memory', 'forgotten', 'is_at_rest']
+
+#: pull towards the memory of a stage that came down to zero, as a share of the data's weight
+PULL = 1e-4
+
+
+def forgotten(u: NDArray[np.float64], share: float = 0.98) -> int:
+    """
+    Return the sample from which the start is forgotten.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+        Voltage in any unit.
+    share : float, optional
+        Share of the record's range that must have been swept.
+    """
+    swept = np.maximum.accumulate(u) - np.minimum.accumulate(u)
+    return int(np.argmax(swept >= share * swept[-1]))
+
+
+def is_at_rest(model: StageModel, piece: Piece) -> bool:
+    """Return whether a piece starts near the lowest voltage, where the memory is known."""
+    return abs(float(model.scaling.u(piece.v[0]))) < 0.01
+
+
+def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDArray[np.float64]:
+    """
+    Estimate the play outputs before the first sample of a piece.
+
+    Parameters
+    ----------
+    model : StageModel
+    piece : Piece
+    stop : int, optional
+        Samples to use; up to where the start is forgotten when absent.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        For `StageModel.predict`.
+    """
+    h = model.hysteresis
+    end = max(forgotten(piece.v), 10) if stop is None else stop
+    end = min(end, piece.n)
+    part = piece.cut(0, end)
+    u = model.scaling.u(part.v)
+    x = model.scaling.x(part.y)
+    memory = h.initial_memory(float(u[0]))
+    low, high = float(u[0]) - h.thresholds, np.full(h.thresholds.size, float(u[0]))
+    if not h.weights.any():
+        return memory
+    top, bottom = np.maximum.accumulate(u), np.minimum.accumulate(u)
+    # rows are thinned: a few numbers do not need a hundred thousand samples
+    keep = slice(None, None, max(1, end // 5000))
+    for _ in range(8):
+        e = (x - model.scaling.x(model.predict_piece(part, memory)))[keep]
+        columns = []
+        for r, q, m in zip(h.thresholds, h.weights, memory, strict=True):
+            # the play follows its start only while neither bound has caught it
+            moved = np.clip(m, np.minimum(top - r, bottom), bottom)
+            free = ((np.abs(moved - m) < 1e-12) & (top - r < bottom)).astype(np.float64)
+            filtered = filter_arx(model.dynamics.a, model.dynamics.b, model.delay.apply(free))
+            columns.append(q * filtered[keep])
+        J = np.array(columns).T
+        pull = np.sqrt(PULL * e.size) * np.maximum(h.weights, 1e-3)
+        A = np.vstack([J, np.diag(pull)])
+        target = np.concatenate([e, pull * (h.initial_memory(float(u[0])) - memory)])
+        width = np.maximum(high - low, 1e-9)
+        step = lsq_linear(A, target, (low - memory - 1e-9 * width, high - memory + 1e-9 * width)).x
+        memory = np.clip(memory + step, low, high)
+        if np.abs(step).max() < 1e-6:
+            break
+    return memory
+
+
+def play_memory(
+    u: NDArray[np.float64], thresholds: NDArray[np.float64], memory: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the play outputs after a stretch of voltage, shape (m,)."""
+    return play_columns(u, thresholds, memory)[:, -1]

@@ -1,0 +1,66 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The error numbers, each with its formula."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ['FORMULA', 'fit_percent', 'percent_of_stroke']
+
+#: how `percent_of_stroke` is defined, for tables and files
+FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
+
+
+def percent_of_stroke(
+    y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float | None = None
+) -> float:
+    """
+    Return ``100 rms(y - y_hat) / (max y - min y)``.
+
+    Parameters
+    ----------
+    y, y_hat : ndarray, shape (n,)
+        Measured and simulated displacement, same unit.
+    stroke : float, optional
+        Replaces ``max y - min y``, where a part of a record is judged by the whole.
+
+    Returns
+    -------
+    float
+        Infinite when the stroke is zero and the error is not.
+    """
+    span = float(np.ptp(y)) if stroke is None else stroke
+    rms = float(np.sqrt(np.mean((y - y_hat) ** 2)))
+    if span == 0.0:
+        return 0.0 if rms == 0.0 else float('inf')
+    return 100.0 * rms / span
+
+
+def fit_percent(y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> float:
+    """
+    Return the NRMSE fit ``100 (1 - |y - y_hat| / |y - mean y|)``, as MATLAB's ``compare`` does.
+
+    Parameters
+    ----------
+    y, y_hat : ndarray, shape (n,)
+        Measured and simulated displacement, same unit.
+    """
+    spread = float(np.linalg.norm(y - y.mean()))
+    error = float(np.linalg.norm(y - y_hat))
+    if spread == 0.0:
+        return 100.0 if error == 0.0 else float('-inf')
+    return 100.0 * (1.0 - error / spread)

@@ -1,0 +1,79 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Outputs appear whole or not at all: written under a temporary name beside, then renamed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+import shutil
+import tempfile
+
+from piezo_ident.errors import DataError
+
+__all__ = ['temporary_output']
+
+
+@contextmanager
+def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """
+    Yield a path of the same file name in a new folder beside `path`; rename it on success.
+
+    Parameters
+    ----------
+    path : path
+        Where the finished file or folder will stand.
+    overwrite : bool
+        Replace what stands there.  A folder is only replaced when it is a bag.
+
+    Raises
+    ------
+    DataError
+        When the place is taken or cannot be written to.
+
+    Examples
+    --------
+    >>> with temporary_output('model.yaml', overwrite=True) as file:  # doctest: +SKIP
+    ...     file.write_text(text)
+    """
+    path = Path(path)
+    taken = path.exists() or path.is_symlink()
+    if taken and not overwrite:
+        raise DataError(f'{path}: exists already; choose another name or ask to overwrite it')
+    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+        raise DataError(f'{path}: is a folder and no bag; choose another name')
+    # a folder of our own keeps the name, which rosbag2 repeats inside, and takes the old output
+    try:
+        work = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent))
+        try:
+            yield work / path.name
+            if path.is_dir():
+                path.rename(work / 'replaced')
+            (work / path.name).replace(path)
+        except BaseException:
+            old = work / 'replaced'
+            if old.exists() and not path.exists():
+                with suppress(OSError):
+                    old.rename(path)
+            raise
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(
+            f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
+            'the right to write'
+        ) from None

@@ -1,0 +1,185 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Refinement of G by output error: the parameters that simulate best, not those that predict a step.
+
+Gauss-Newton with Levenberg's damping on  sum (y - B/A z^-d w - offset)^2.  With w_f = w/A and
+y_f = y_sim/A the gradients are shifts of two filtered signals:
+
+    d y_sim / d b_j = w_f(k-d-j+1),      d y_sim / d a_i = - y_f(k-i)
+
+after Ljung, System Identification, 2nd ed. (1999), section 10.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.dynamics import Dynamics, filter_arx
+
+__all__ = ['OutputErrorFit', 'Stretch', 'output_error']
+
+#: poles beyond this radius count as unstable: they would ring for longer than any record
+RADIUS = 0.99999
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """
+    Data for one simulation.
+
+    Attributes
+    ----------
+    w, y : ndarray, shape (n,)
+        Input, already delayed by d, and output; the run starts in equilibrium with ``w[0]``.
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    """
+
+    w: NDArray[np.float64]
+    y: NDArray[np.float64]
+    use: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class OutputErrorFit:
+    """
+    Result of the refinement.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+    covariance : ndarray, shape (na + nb, na + nb)
+        Of (a, b), for white output noise.
+    rms : float
+        Root mean square of the simulation error.
+    offsets : ndarray
+        Constant added to each stretch.
+    iterations : int
+    improved : bool
+        Whether anything better than the start was found.
+    """
+
+    dynamics: Dynamics
+    covariance: NDArray[np.float64]
+    rms: float
+    offsets: NDArray[np.float64]
+    iterations: int
+    improved: bool
+
+
+def _shifts(x: NDArray[np.float64], count: int, first: int) -> NDArray[np.float64]:
+    # rows are x delayed by first, first + 1, ...; before the record the stage was at rest
+    padded = np.concatenate([np.full(first + count, x[0]), x])
+    begin = [first + count - (first + i) for i in range(count)]
+    return np.stack([padded[b : b + x.size] for b in begin])
+
+
+class _Problem:
+    """Normal equations of the linearised problem, offsets eliminated stretch by stretch."""
+
+    def __init__(self, stretches: Sequence[Stretch], na: int, nb: int) -> None:
+        self.stretches, self.na, self.nb = stretches, na, nb
+        self.n = int(sum(s.use.sum() for s in stretches))
+
+    def loss(self, model: Dynamics) -> tuple[float, NDArray[np.float64]]:
+        total, offsets = 0.0, []
+        for s in self.stretches:
+            e = (s.y - filter_arx(model.a, model.b, s.w))[s.use]
+            offsets.append(float(e.mean()))
+            total += float(np.sum((e - offsets[-1]) ** 2))
+        return total / self.n, np.array(offsets)
+
+    def normal(self, model: Dynamics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        p = self.na + self.nb
+        H, g = np.zeros((p, p)), np.zeros(p)
+        one = np.ones(1)
+        for s in self.stretches:
+            y_sim = filter_arx(model.a, model.b, s.w)
+            w_f, y_f = filter_arx(model.a, one, s.w), filter_arx(model.a, one, y_sim)
+            J = np.concatenate([-_shifts(y_f, self.na, 1), _shifts(w_f, self.nb, 0)])[:, s.use]
+            J -= J.mean(axis=1, keepdims=True)
+            e = (s.y - y_sim)[s.use]
+            H += J @ J.T
+            g += J @ (e - e.mean())
+        return H, g
+
+
+def output_error(
+    stretches: Sequence[Stretch],
+    start: Dynamics,
+    maxiter: int = 30,
+    tol: float = 1e-7,
+    tick: Callable[[], None] | None = None,
+) -> OutputErrorFit:
+    """
+    Refine dynamics by free-run simulation error.
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+    start : Dynamics
+        Stable start; its orders are kept.
+    maxiter : int, optional
+    tol : float, optional
+        Stop when the loss falls by less than this share.
+    tick : callable, optional
+        Called once an iteration; may raise to stop the work.
+
+    Returns
+    -------
+    OutputErrorFit
+        Always stable; the start itself when nothing better was found.
+    """
+    na, nb = start.a.size, start.b.size
+    problem = _Problem(stretches, na, nb)
+    model = start
+    loss, offsets = problem.loss(model)
+    first_loss = loss
+    damping, iterations = 1e-3, 0
+    H, g = problem.normal(model)
+    while iterations < maxiter:
+        iterations += 1
+        if tick is not None:
+            tick()
+        diagonal = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+        scaled = H / np.outer(diagonal, diagonal)
+        accepted = False
+        while damping < 1e8:
+            step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
+            trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
+            if trial.radius < RADIUS:
+                new, new_offsets = problem.loss(trial)
+                if new < loss:
+                    accepted = True
+                    break
+            damping *= 4.0
+        if not accepted:
+            break
+        fall = 1.0 - new / loss
+        model, loss, offsets = trial, new, new_offsets
+        damping = max(damping / 10.0, 1e-12)
+        if fall < tol or loss == 0.0:
+            break
+        H, g = problem.normal(model)
+    H, _ = problem.normal(model)
+    covariance = np.asarray(
+        loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
+    )
+    rms = float(np.sqrt(loss))
+    return OutputErrorFit(model, covariance, rms, offsets, iterations, loss < first_loss)

@@ -1,0 +1,216 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Records made ready for fitting: one rate, one scaling, normalised runs with their masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import IdentificationError
+from piezo_ident.memory import forgotten
+from piezo_ident.model import Scaling
+from piezo_ident.record import Piece, Record
+
+__all__ = ['Run', 'common_rate', 'noise_floor', 'refuse_closed_loop', 'runs_of', 'scaling_of']
+
+#: share of a triangle that is one block of held-out data, and how many blocks share one
+BLOCKS, EVERY = 60, 5
+#: share at the end of every noise segment that is not fitted
+NOISE_HELD = 0.2
+#: a record starts from a known memory when its voltage starts within this share of the lowest
+REST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """
+    One piece, normalised.
+
+    Attributes
+    ----------
+    record : str
+        Name of the record it belongs to.
+    piece : Piece
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement.
+    known : ndarray of bool, shape (n,)
+        Samples at which the memory of the start no longer matters, or was known.
+    """
+
+    record: str
+    piece: Piece
+    u: NDArray[np.float64]
+    x: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+    def mask(self, *kinds: str) -> NDArray[np.bool_]:
+        """Return which samples belong to segments of these kinds."""
+        chosen = np.zeros(self.piece.n, dtype=bool)
+        for s in self.piece.segments:
+            if s.kind in kinds:
+                chosen[s.start : s.stop] = True
+        return chosen
+
+    def held_out(self) -> NDArray[np.bool_]:
+        """
+        Return which samples of the triangle and the noise are kept from every fit.
+
+        Of a triangle every fifth block that holds no turning point, of the noise the end.
+        """
+        held = np.zeros(self.piece.n, dtype=bool)
+        for s in self.piece.segments:
+            if s.kind == 'noise':
+                held[s.stop - int(NOISE_HELD * s.n) : s.stop] = True
+            elif s.kind == 'triangle':
+                edges = np.linspace(s.start, s.stop, BLOCKS + 1).astype(int)
+                for start, stop in zip(edges[2::EVERY], edges[3::EVERY], strict=False):
+                    dv = np.diff(self.u[start:stop])
+                    if dv.size and (np.all(dv >= 0) or np.all(dv <= 0)):
+                        held[start:stop] = True
+        return held
+
+
+def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
+    """
+    Return the sampling rate that carries the most voltage travel, and what is left out.
+
+    Raises
+    ------
+    IdentificationError
+        When the voltage never moves.
+    """
+    travel: dict[float, float] = {}
+    time: dict[float, float] = {}
+    for record in records:
+        for piece in record:
+            rate = piece.sample_rate
+            travel[rate] = travel.get(rate, 0.0) + float(np.abs(np.diff(piece.v)).sum())
+            time[rate] = time.get(rate, 0.0) + piece.duration
+    best = max(travel, key=lambda rate: travel[rate])
+    names = ', '.join(record.name for record in records)
+    if travel[best] == 0.0:
+        raise IdentificationError(
+            f'{names}: the voltage never moves; record the stage while it is driven'
+        )
+    left = [
+        f'{time[rate]:.3g} s sampled at {rate:g} Hz are left out: the model holds for one rate, '
+        f'{best:g} Hz'
+        for rate in travel
+        if rate != best
+    ]
+    return best, left
+
+
+def scaling_of(pieces: Sequence[Piece]) -> Scaling:
+    """
+    Return the normalisation: voltage range and stroke to 1, the sign of the gain in Y.
+
+    Raises
+    ------
+    IdentificationError
+        When voltage or displacement never move.
+    """
+    low = min(float(p.v.min()) for p in pieces)
+    high = max(float(p.v.max()) for p in pieces)
+    if high <= low:
+        raise IdentificationError('the voltage is constant; record the stage while it is driven')
+    stroke = max(float(p.y.max()) for p in pieces) - min(float(p.y.min()) for p in pieces)
+    if stroke == 0.0:
+        raise IdentificationError('the displacement is constant; is the sensor connected?')
+    covariance = sum(float(np.sum((p.v - p.v.mean()) * (p.y - p.y.mean()))) for p in pieces)
+    sign = 1.0 if covariance >= 0.0 else -1.0
+    widest = max(pieces, key=lambda p: float(np.ptp(p.v)))
+    y0 = float(widest.y[np.argmin(widest.v)])
+    return Scaling(v0=low, V=high - low, y0=y0, Y=sign * stroke, range=(low, high))
+
+
+def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Run]:
+    """Return the pieces of one rate, normalised."""
+    runs = []
+    for record in records:
+        for piece in record:
+            if piece.sample_rate != rate:
+                continue
+            u = scaling.u(piece.v)
+            known = np.ones(piece.n, dtype=bool)
+            if u[0] > REST:
+                known[: forgotten(u)] = False
+            runs.append(Run(record.name, piece, u, scaling.x(piece.y), known))
+    return runs
+
+
+def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
+    """
+    Return the rms of the sensor noise [m] and where it was read.
+
+    Stretches of constant voltage of at least 50 ms and 200 samples count, after half of each has
+    passed; a line is taken out of each.
+    """
+    total, n = 0.0, 0
+    for piece in pieces:
+        moves = np.flatnonzero(np.diff(piece.v) != 0.0) + 1
+        edges = np.concatenate([[0], moves, [piece.n]])
+        for start, stop in itertools.pairwise(edges):
+            middle = (start + stop) // 2
+            if stop - middle < max(100, 0.025 * piece.sample_rate):
+                continue
+            y = piece.y[middle:stop]
+            k = np.arange(y.size)
+            rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
+            total += float(rest @ rest)
+            n += y.size - 2
+    if n == 0:
+        return None, 'unknown: the voltage never rests'
+    return float(np.sqrt(total / n)), 'stretches of constant voltage'
+
+
+def refuse_closed_loop(record: Record) -> None:
+    """
+    Refuse a record in which the drive moves and the position does not.
+
+    A stage under voltage control cannot do that; a position controller that makes up for creep
+    does exactly that, and then the voltage is the answer and the position the command.
+
+    Raises
+    ------
+    IdentificationError
+    """
+    span = np.ptp(record.voltage_range)
+    if span == 0.0 or record.stroke == 0.0:
+        return
+    for piece in record:
+        window = max(16, int(0.5 * piece.sample_rate))
+        if piece.n < 4 * window:
+            continue
+        n = piece.n // window
+        v = piece.v[: n * window].reshape(n, window).mean(axis=1)
+        y = piece.y[: n * window].reshape(n, window).mean(axis=1)
+        still = np.abs(np.diff(y)) < 1e-4 * record.stroke
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            moved = abs(v[stop] - v[start]) / span
+            followed = abs(y[stop] - y[start]) / record.stroke
+            if stop - start >= 4 and moved > 0.005 and followed < 0.05 * moved:
+                t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
+                raise IdentificationError(
+                    f'{record.name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by '
+                    f'{moved:.1%} of its range while the position moves by {followed:.2%} of its '
+                    'stroke: a position controller was on, so the position is no response to '
+                    'the voltage; record in open loop'
+                )

@@ -1,0 +1,330 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Records in tables: CSV, NumPy's npz and MATLAB's mat, columns by name.
+
+``t``, ``v`` and ``y`` must be there; ``x_<name>`` are further channels.  In CSV the column
+``segment`` labels each row; npz and mat carry ``segment_name`` and ``segment_start``, the sample
+(counted from 0) at which each segment begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+import csv
+from dataclasses import dataclass, field
+import io
+import itertools
+from pathlib import Path
+from typing import Any, BinaryIO
+import zipfile
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.errors import DataError
+from piezo_ident.sampling import label_runs
+import scipy.io
+
+__all__ = ['READERS', 'WRITERS', 'Table']
+
+#: rows of a CSV file taken together
+_ROWS = 65536
+_REQUIRED = ('t', 'v', 'y')
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Raw columns of a file, the segments' names and starts, and the names of unused columns."""
+
+    columns: dict[str, NDArray[np.float64]]
+    names: list[str] = field(default_factory=list)
+    starts: ArrayLike = ()
+    ignored: tuple[str, ...] = ()
+
+
+def _wanted(name: str) -> bool:
+    return name in _REQUIRED or (name.startswith('x_') and len(name) > 2)
+
+
+def _check_names(names: Iterable[str], path: Path) -> None:
+    found = list(names)
+    missing = [c for c in _REQUIRED if c not in found]
+    if missing:
+        raise DataError(
+            f'{path}: {", ".join(missing)} missing (found: {", ".join(found)[:200] or "nothing"})'
+            '; name the columns t [s], v [V] and y'
+        )
+
+
+# --- CSV ------------------------------------------------------------------------------------
+
+
+def read_csv(path: Path) -> Table:
+    """Read a CSV file with a header line."""
+    try:
+        # newline='' leaves line ends to the csv module; utf-8-sig drops a byte order mark
+        with path.open(encoding='utf-8-sig', newline='') as file:
+            return _parse_csv(csv.reader(file, strict=True), path)
+    except UnicodeDecodeError:
+        raise DataError(f'{path}: no text in UTF-8; save it as CSV in UTF-8') from None
+    except csv.Error as error:
+        raise DataError(f'{path}: no CSV file ({error}); save it as comma-separated CSV') from None
+
+
+def _parse_csv(reader: Any, path: Path) -> Table:
+    header = _header(reader, path)
+    numeric = {name: i for i, name in enumerate(header) if _wanted(name)}
+    label = header.index('segment') if 'segment' in header else None
+    chunks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in numeric}
+    names: list[str] = []
+    starts: list[int] = []
+    n = 0
+    while True:
+        line = reader.line_num + 1
+        chunk = list(itertools.islice(reader, _ROWS))
+        if not chunk:
+            break
+        try:
+            columns = list(zip(*(r for r in chunk if r), strict=True))
+            if not columns:
+                continue
+            if len(columns) != len(header):
+                raise ValueError
+            for name, i in numeric.items():
+                column = map(float, columns[i])
+                chunks[name].append(np.fromiter(column, np.float64, len(columns[i])))
+        except ValueError:
+            raise _culprit(chunk, line, header, numeric, path) from None
+        if label is not None:
+            new, at = label_runs(map(str.strip, columns[label]))
+            names += new
+            starts += [n + i for i in at]
+        n += len(columns[0])
+    if not n:
+        raise DataError(f'{path}: no rows below the header; record some samples')
+    return Table(
+        {name: np.concatenate(parts) for name, parts in chunks.items()},
+        names,
+        starts,
+        tuple(c for c in header if c and c not in numeric and c != 'segment'),
+    )
+
+
+def _header(reader: Any, path: Path) -> list[str]:
+    header = [c.strip() for c in next((r for r in reader if r), [])]
+    if not header:
+        raise DataError(f'{path}: empty file; write a header line t,v,y and the samples below it')
+    for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if len(header) == 1 and separator in header[0]:
+            raise DataError(f'{path}: separated by {name}; save it with commas and decimal points')
+    if all(_is_number(c) for c in header):
+        raise DataError(f"{path}: no header line; put 't,v,y' on top of the numbers")
+    twice = sorted({c for c in header if c and header.count(c) > 1})
+    if twice:
+        raise DataError(f'{path}: column {", ".join(twice)} stands there twice; keep one of them')
+    _check_names(header, path)
+    return header
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _culprit(
+    chunk: list[list[str]], line: int, header: list[str], numeric: Mapping[str, int], path: Path
+) -> DataError:
+    """Return the error for the first row of a chunk that cannot be read."""
+    for number, row in enumerate(chunk, start=line):
+        if row and len(row) != len(header):
+            return DataError(
+                f'{path}: line {number} has {len(row)} columns, the header has {len(header)}; '
+                'mend or delete the line'
+            )
+        for name, i in numeric.items():
+            if row and not _is_number(row[i]):
+                return DataError(
+                    f'{path}: line {number}, column {name}: {row[i][:40]!r} is no number; '
+                    'mend or delete the line'
+                )
+    return DataError(f'{path}: unreadable rows from line {line}; save it again')
+
+
+def write_csv(file: BinaryIO, table: Table) -> None:
+    """Write a CSV file whose numbers read back exactly."""
+    n = table.columns['t'].size
+    starts = np.asarray(table.starts, dtype=np.int64)
+    labels = [_quoted(name) for name in table.names]
+    header = [*table.columns, *(['segment'] if labels else [])]
+    file.write((','.join(header) + '\n').encode())
+    for i in range(0, n, _ROWS):
+        columns: list[Iterable[str]] = [
+            map(repr, x[i : i + _ROWS].tolist()) for x in table.columns.values()
+        ]
+        if labels:
+            rows = np.arange(i, min(i + _ROWS, n))
+            columns.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
+        lines = map(','.join, zip(*columns, strict=True))
+        file.write(('\n'.join(lines) + '\n').encode())
+
+
+def _quoted(text: str) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator='').writerow([text, ''])
+    return line.getvalue()[:-1]
+
+
+# --- npz ------------------------------------------------------------------------------------
+
+
+def read_npz(path: Path) -> Table:
+    """Read a NumPy archive; pickled objects are refused."""
+    with _damage(path, 'npz archive', 'save it again with numpy.savez'):
+        _check_npz(path)
+        with np.load(path, allow_pickle=False) as archive:
+            return _from_arrays({k: archive[k] for k in archive.files if _used(k)}, archive, path)
+
+
+def _check_npz(path: Path) -> None:
+    """Refuse what only pretends to be arrays, before memory is spent on what it announces."""
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if not _used(info.filename.removesuffix('.npy')):
+                continue
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                header = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }.get(version)
+                if header is None:
+                    raise ValueError('unknown version of the npy format')
+                shape, _, dtype = header(member)
+                size = dtype.itemsize * int(np.prod([float(s) for s in shape]))
+                if not dtype.hasobject and size != info.file_size - member.tell():
+                    raise ValueError(f'{info.filename} does not hold the size that it announces')
+                if dtype.hasobject:
+                    raise DataError(
+                        f'{path}: {info.filename} holds Python objects; save plain numbers'
+                    )
+
+
+def _used(name: str) -> bool:
+    return _wanted(name) or name in ('segment_name', 'segment_start')
+
+
+def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Path) -> Table:
+    _check_names(everything, path)
+    columns = {}
+    for name in filter(_wanted, arrays):
+        x = np.asarray(arrays[name])
+        if x.dtype.kind not in 'fiu':
+            raise DataError(f'{path}: {name} holds {x.dtype}, no real numbers; save plain numbers')
+        if x.ndim != 1 and sum(s != 1 for s in x.shape) > 1:
+            shape = ' x '.join(map(str, x.shape))
+            raise DataError(f'{path}: {name} is {shape}; give one column of samples')
+        columns[name] = x.astype(np.float64).reshape(-1)
+    lengths = {name: x.size for name, x in columns.items()}
+    if len(set(lengths.values())) > 1:
+        text = ', '.join(f'{k} {n}' for k, n in lengths.items())
+        raise DataError(f'{path}: columns differ in length ({text}); give one value a sample')
+    ignored = tuple(k for k in everything if not _used(k))
+    if ('segment_name' in arrays) != ('segment_start' in arrays):
+        raise DataError(f'{path}: segment_name and segment_start need each other; save both')
+    if 'segment_name' not in arrays:
+        return Table(columns, ignored=ignored)
+    starts = np.asarray(arrays['segment_start'])
+    if starts.dtype.kind not in 'fiu':
+        raise DataError(f'{path}: segment_start holds no numbers; save sample indices from 0')
+    names = [_text(x, path) for x in np.atleast_1d(arrays['segment_name']).reshape(-1)]
+    return Table(columns, names, starts.reshape(-1), ignored)
+
+
+def _text(value: object, path: Path) -> str:
+    # a cell of a MATLAB cell array is an array of one string, or of none
+    while isinstance(value, np.ndarray):
+        if value.size > 1:
+            break
+        value = value.reshape(-1)[0] if value.size else ''
+    if not isinstance(value, str):
+        raise DataError(f'{path}: segment_name holds no text; save it as text (MATLAB: a cellstr)')
+    return value.strip()
+
+
+def write_npz(file: BinaryIO, table: Table) -> None:
+    """Write a NumPy archive."""
+    arrays: dict[str, Any] = dict(table.columns)
+    if table.names:
+        arrays |= {'segment_name': np.array(table.names), 'segment_start': table.starts}
+    np.savez(file, **arrays)
+
+
+# --- MATLAB ---------------------------------------------------------------------------------
+
+
+def read_mat(path: Path) -> Table:
+    """Read a MATLAB file of version 5 to 7."""
+    with _damage(path, 'MATLAB file', 'save it again with save -v7'):
+        with path.open('rb') as file:
+            head = file.read(1024)
+        if b'\x89HDF\r\n\x1a\n' in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
+            raise DataError(f'{path}: MATLAB 7.3 file (HDF5); save it with save -v7')
+        if head[126:128] not in (b'IM', b'MI'):
+            raise ValueError('not a MATLAB 5 file')
+        listed = [name for name, _, _ in scipy.io.whosmat(path)]
+        return _from_arrays(
+            scipy.io.loadmat(path, variable_names=[k for k in listed if _used(k)]), listed, path
+        )
+
+
+def write_mat(file: BinaryIO, table: Table) -> None:
+    """Write a MATLAB 5 file of column vectors."""
+    arrays: dict[str, Any] = dict(table.columns)
+    if table.names:
+        names = np.empty(len(table.names), dtype=object)
+        names[:] = table.names
+        starts = np.asarray(table.starts, dtype=np.float64)
+        arrays |= {'segment_name': names, 'segment_start': starts}
+    to: Any = file  # the stubs know paths only
+    scipy.io.savemat(to, arrays, oned_as='column', long_field_names=True)
+
+
+@contextmanager
+def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
+    """Turn whatever a parser throws at damaged bytes into one line."""
+    try:
+        yield
+    except (DataError, OSError):
+        raise
+    # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
+    except Exception as error:  # noqa: BLE001
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
+
+
+READERS: Mapping[str, Callable[[Path], Table]] = {
+    '.csv': read_csv,
+    '.npz': read_npz,
+    '.mat': read_mat,
+}
+WRITERS: Mapping[str, Callable[[BinaryIO, Table], None]] = {
+    '.csv': write_csv,
+    '.npz': write_npz,
+    '.mat': write_mat,
+}

@@ -1,0 +1,318 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The three steps on labelled records: delay from steps, G from noise, H from a triangle.
+
+Small noise does not make H a constant slope: its plays are dragged along inside the noise, and a
+linear fit takes that for slow dynamics.  So the steps are taken twice.  After a first G, an H with
+fine thresholds is fitted to the triangle and undone in the noise, w = H[v], and G is found again
+from w to y, where it is alone.  The H that is returned is fitted last, with the thresholds asked
+for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.arx import (
+    arx_factor,
+    ArxFactor,
+    excited_band,
+    instrumental_variables,
+    prefilter,
+    scan_orders,
+    stabilised,
+)
+from piezo_ident.delay import delay_from_loss, delay_from_steps
+from piezo_ident.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.errors import IdentificationError
+from piezo_ident.frequency_response import frequency_response
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.hysteresis_fit import Excerpt, factorise, fine_thresholds, fit_hysteresis
+from piezo_ident.least_squares import triangular_factor
+from piezo_ident.output_error import output_error, OutputErrorFit, Stretch
+from piezo_ident.results import DelayResult, DynamicsResult, Progress, Settings
+from piezo_ident.runs import NOISE_HELD, Run
+from scipy import signal
+
+__all__ = ['first_step', 'second_step', 'triangle_excerpts']
+
+#: delays that the scan tries [samples]
+MAX_DELAY = 30
+#: na and nb of the scan
+SCAN_ORDER = 8
+#: orders within this share of the best held-out error count as equal; the smaller one wins
+SLACK = 0.05
+#: candidates that are refined and judged again
+CANDIDATES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """One noise segment: input (voltage or w) and output, prefiltered, fitted part first."""
+
+    u: NDArray[np.float64]
+    y: NDArray[np.float64]
+    n_fit: int
+    band: float
+
+
+def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
+    rate = run.piece.sample_rate
+    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
+    u = prefilter(signal[start:stop], rate, band)
+    y = prefilter(run.x[start:stop], rate, band)
+    settle = min(500, u.size // 20)
+    n_fit = u.size - int(NOISE_HELD * u.size) - settle
+    return _Noise(u[settle:], y[settle:], n_fit, band)
+
+
+def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
+    found = [(s.n, run, s) for run in runs for s in run.piece.find('noise')]
+    n, run, s = max(found, key=lambda item: item[0])
+    if n < 2000:
+        raise IdentificationError(
+            f'{run.record}: the noise segment has {n} samples; at least 2000 are needed'
+        )
+    return run, s.start, s.stop
+
+
+def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
+    """
+    Find the delay.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    settings : Settings
+    progress : callable
+
+    Returns
+    -------
+    DelayResult
+        From the steps when there are any, else from the scan of the ARX loss over the noise.
+    """
+    progress('delay', 0.0)
+    if settings.delay is not None:
+        return DelayResult(settings.delay, 0.0, 'given')
+    pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
+    step = delay_from_steps(pieces) if pieces else None
+    # steps have power at all frequencies; noise up to f leaves a doubt of half a period of f
+    loss = _scan(runs, 'step') if pieces else None
+    if loss is None:
+        loss = _scan(runs, 'noise')
+    scan = None if loss is None else delay_from_loss(loss)
+    progress('delay', 1.0)
+    if step is not None and step.samples is not None:
+        return DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+    if scan is None:
+        raise IdentificationError('delay: no step, and noise too short to scan; set --delay')
+    run, start, stop = _longest_noise(runs)
+    rate = run.piece.sample_rate
+    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
+    return DelayResult(scan, 0.5 * rate / band, 'scan', step, loss, scan)
+
+
+def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:
+    """Return the one-step loss over the delay, from all segments of a kind."""
+    width = SCAN_ORDER + SCAN_ORDER + MAX_DELAY + 1
+    factors, n = [], 0
+    for run in runs:
+        for s in run.piece.find(kind):
+            if s.n < 4 * width:
+                continue
+            u, y = run.u[s.start : s.stop], run.x[s.start : s.stop]
+            factor = arx_factor(u - u[0], y - y[:20].mean(), SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
+            factors.append(factor.R)
+            n += factor.n
+    if not factors:
+        return None
+    R = triangular_factor(factors, width)
+    both = ArxFactor(R, n, SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
+    return np.array([both.fit(SCAN_ORDER, SCAN_ORDER, d)[1] for d in range(MAX_DELAY)])
+
+
+def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
+    """Return the triangles for fitting H, without (or only) their held-out blocks."""
+    excerpts = []
+    for run in runs:
+        out = run.held_out()
+        use = run.mask('triangle') & run.known & (out if held else ~out)
+        if use.any():
+            excerpts.append(Excerpt(run.u, run.x, use))
+    return excerpts
+
+
+def _held_error(noise: _Noise, model: Dynamics, delay: int) -> float:
+    """Free-run error on the held-out noise in % of its rms, infinite when unstable."""
+    if not model.is_stable:
+        return float('inf')
+    u, y = noise.u[noise.n_fit :], noise.y[noise.n_fit :]
+    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
+    e = (y - filter_arx(model.a, model.b, delayed, at_rest=False))[u.size // 5 :]
+    return float(100.0 * e.std() / y.std())
+
+
+def _refined_on_noise(noise: _Noise, start: Dynamics, delay: int, maxiter: int) -> OutputErrorFit:
+    use = np.ones(noise.n_fit, dtype=bool)
+    use[: noise.n_fit // 50] = False
+    u = noise.u[: noise.n_fit]
+    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
+    stretch = Stretch(delayed, noise.y[: noise.n_fit], use)
+    return output_error([stretch], start, maxiter=maxiter)
+
+
+def _factor(noise: _Noise, settings: Settings, delay: int) -> ArxFactor:
+    size = max(settings.max_order, *(settings.order or (1, 1)))
+    return arx_factor(noise.u[: noise.n_fit], noise.y[: noise.n_fit], size, size + delay)
+
+
+def _orders(
+    noise: _Noise, settings: Settings, delay: int, progress: Progress, low: float, high: float
+) -> tuple[DynamicsResult, Dynamics]:
+    """Search the orders, refine the best few, and take the one with the least held-out error."""
+    factor = _factor(noise, settings, delay)
+    table = scan_orders(
+        factor,
+        delay,
+        settings.max_order,
+        noise.u[noise.n_fit :],
+        noise.y[noise.n_fit :],
+        lambda share: progress('dynamics', low + 0.5 * share * (high - low)),
+    )
+    orders = [settings.order] if settings.order else table.ranked(SLACK)[:CANDIDATES]
+    if not orders:
+        raise IdentificationError(
+            'dynamics: no order up to '
+            f'({settings.max_order}, {settings.max_order}) gave a stable model; '
+            'is the noise segment really noise, and is the displacement its answer?'
+        )
+    best: tuple[float, DynamicsResult, Dynamics] | None = None
+    for i, (na, nb) in enumerate(orders):
+        theta, _ = factor.fit(na, nb, delay)
+        ls = Dynamics(a=theta[:na], b=theta[na:])
+        u, y = noise.u[: noise.n_fit], noise.y[: noise.n_fit]
+        iv = instrumental_variables(u, y, ls, delay)
+        errors = {
+            'least squares': _held_error(noise, ls, delay),
+            'instrumental variables': _held_error(noise, iv, delay),
+        }
+        start = iv if errors['instrumental variables'] < errors['least squares'] else ls
+        fit = _refined_on_noise(noise, stabilised(start), delay, maxiter=10)
+        errors['output error'] = _held_error(noise, fit.dynamics, delay)
+        result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
+        score = errors['output error']
+        # a larger model must earn its size
+        if best is None or score < best[0] / (1.0 + SLACK / 5):
+            best = (score, result, fit.dynamics)
+        progress('dynamics', low + (0.5 + 0.5 * (i + 1) / len(orders)) * (high - low))
+    if best is None or not np.isfinite(best[0]):
+        raise IdentificationError('dynamics: no stable model was found; set --order')
+    return best[1], best[2]
+
+
+def second_step(
+    runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress
+) -> tuple[DynamicsResult, Dynamics]:
+    """
+    Find G, with the hysteresis undone.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        With noise and triangle segments.
+    delay : Delay
+    settings : Settings
+    progress : callable
+
+    Returns
+    -------
+    result : DynamicsResult
+    dynamics : Dynamics
+        With G(1) = 1, stable.
+
+    Raises
+    ------
+    IdentificationError
+        When no order gives a stable model.
+    """
+    d = delay.samples
+    run, start, stop = _longest_noise(runs)
+    progress('dynamics', 0.0)
+    raw = _noise(run, run.u, start, stop)
+    _, first = _orders(raw, settings, d, progress, 0.0, 0.3)
+    G = first.normalised()
+
+    excerpts = triangle_excerpts(runs)
+    n = int(sum(e.use.sum() for e in excerpts))
+    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    excursion = float(np.ptp(run.u[start:stop]))
+    r = fine_thresholds(swing, excursion)
+
+    def undo(G: Dynamics) -> Hysteresis:
+        return fit_hysteresis(factorise(excerpts, r, G, delay), r, n).hysteresis
+
+    H = undo(G)
+    progress('dynamics', 0.45)
+    result, G = _orders(_noise(run, H(run.u), start, stop), settings, d, progress, 0.45, 0.75)
+    G = G.normalised()
+    covariance = result.covariance
+    for i in range(2):
+        fit = output_error(_stretches(runs, H, delay), G, maxiter=8)
+        gain = fit.dynamics.gain
+        G = fit.dynamics.normalised()
+        scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
+        covariance = fit.covariance * np.outer(scale, scale)
+        progress('dynamics', 0.75 + 0.1 * (i + 1))
+        if i == 0:
+            H = undo(G)
+    # the same regression on the measured and on the modelled answer: the plays that the noise
+    # drags along count in both
+    noise = slice(start, stop)
+    g_u = filter_arx(G.a, G.b, delay.apply(run.u))[noise]
+    g_w = filter_arx(G.a, G.b, delay.apply(H(run.u)))[noise]
+    g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[noise]))
+    slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
+    bias = float(run.u[start:stop].mean())
+    response = frequency_response(
+        run.u[start:stop], run.x[start:stop], run.piece.sample_rate, raw.band
+    )
+    progress('dynamics', 1.0)
+    return (
+        DynamicsResult(
+            order=result.order,
+            table=result.table,
+            methods=result.methods,
+            covariance=covariance,
+            response=response,
+            bias=bias,
+            slope_measured=slope_measured,
+            slope_model=slope_model,
+            band=raw.band,
+        ),
+        G,
+    )
+
+
+def _stretches(runs: Sequence[Run], H: Hysteresis, delay: Delay) -> list[Stretch]:
+    stretches = []
+    for run in runs:
+        use = run.mask('step', 'settle', 'noise') & ~run.held_out()
+        if use.any():
+            stretches.append(Stretch(delay.apply(H(run.u)), run.x, use))
+    return stretches

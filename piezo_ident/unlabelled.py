@@ -1,0 +1,245 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Records without labelled segments: everything that one record excites, by free-run error.
+
+H and G are fitted in turn: H by bounded least squares with the plays seen through G, G by output
+error from w = H[v].  What the record does not excite is left at its neutral value and said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.arx import arx_factor, excited_band, instrumental_variables, stabilised
+from piezo_ident.delay import delay_from_steps, find_jumps
+from piezo_ident.dynamics import Delay, Dynamics
+from piezo_ident.errors import IdentificationError
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.hysteresis_fit import even_thresholds, Excerpt, factorise, fit_hysteresis
+from piezo_ident.memory import fit_memory
+from piezo_ident.model import Scaling, StageModel
+from piezo_ident.output_error import output_error, OutputErrorFit, Stretch
+from piezo_ident.results import DelayResult, DynamicsResult, Progress, Settings
+from piezo_ident.runs import Run
+
+__all__ = ['JointFit', 'joint_fit']
+
+#: orders (na, nb) tried on a record with little dynamic content, from none upwards
+ORDERS = ((1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4), (4, 4), (4, 5))
+#: time after a jump in which the dynamics are looked for [s]
+WINDOW = 0.2
+#: a record whose voltage has power above this frequency excites the dynamics throughout [Hz]
+FAST = 20.0
+#: dynamics must lower the loss in their windows by this share to be believed
+GAIN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """
+    What one unlabelled run gave.
+
+    Attributes
+    ----------
+    delay : DelayResult
+    dynamics : DynamicsResult
+    G : Dynamics
+    memory : ndarray or None
+        Play outputs before the first sample, for the thresholds of `hysteresis`.
+    hysteresis : Hysteresis
+        The H that went with the search for G.
+    not_identified : tuple of (str, str)
+        What stayed at its neutral value, and why.
+    """
+
+    delay: DelayResult
+    dynamics: DynamicsResult
+    G: Dynamics
+    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None
+    hysteresis: Hysteresis
+    not_identified: tuple[tuple[str, str], ...]
+
+
+def _memory_rule(
+    thresholds: NDArray[np.float64], memory: NDArray[np.float64], u0: float
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Carry a fitted memory over to other thresholds: it is a smooth curve over r."""
+
+    def rule(r: NDArray[np.float64]) -> NDArray[np.float64]:
+        curve = np.interp(r, np.concatenate([[0.0], thresholds]), np.concatenate([[u0], memory]))
+        return np.asarray(np.clip(curve, u0 - r, u0))
+
+    return rule
+
+
+def _windows(run: Run, n_fit: int) -> NDArray[np.bool_]:
+    """Return the samples behind each jump of the voltage in the fitted part."""
+    rate = run.piece.sample_rate
+    use = np.zeros(n_fit, dtype=bool)
+    before = min(50, n_fit // 10)
+    for k in find_jumps(run.u[:n_fit], before, min(20, n_fit // 10)):
+        use[max(0, k - before) : k + int(WINDOW * rate)] = True
+    return use
+
+
+def _find_delay(run: Run, n_fit: int, settings: Settings) -> tuple[DelayResult, str | None]:
+    if settings.delay is not None:
+        return DelayResult(settings.delay, 0.0, 'given'), None
+    before = min(100, n_fit // 10)
+    step = delay_from_steps([run.piece.cut(0, n_fit)], before, min(60, n_fit // 10))
+    if step.samples is not None:
+        return DelayResult(step.samples, step.std, 'steps', step), None
+    reason = (
+        'the voltage never jumps out of a rest, and a slow record cannot tell a delay from the '
+        'lag of the hysteresis; add steps'
+    )
+    return DelayResult(0, float('inf'), 'none', step), reason
+
+
+def _search_order(
+    w: NDArray[np.float64],
+    x: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    settings: Settings,
+    progress: Progress,
+) -> tuple[tuple[int, int], OutputErrorFit] | None:
+    """Return the order with the smallest BIC of free-run loss that beats G = 1 clearly."""
+    stretch = Stretch(w, x, use)
+    n = int(use.sum())
+    still = (x - w)[use]
+    static_loss = float(np.mean((still - still.mean()) ** 2))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
+    longest = int(np.argmax(edges[1::2] - edges[::2]))
+    part = slice(int(edges[2 * longest]), int(edges[2 * longest + 1]))
+    u, y = w[part] - w[part.start], x[part] - x[part.start]
+    best: tuple[float, tuple[int, int], OutputErrorFit] | None = None
+    orders = [settings.order] if settings.order else list(ORDERS)
+    na_max, nb_max = max(o[0] for o in orders), max(o[1] for o in orders)
+    if u.size < 4 * (na_max + nb_max + 1):
+        return None
+    factor = arx_factor(u, y, na_max, nb_max)
+    for i, (na, nb) in enumerate(orders):
+        theta, _ = factor.fit(na, nb, 0)
+        ls = Dynamics(a=theta[:na], b=theta[na:])
+        starts = [stabilised(ls), stabilised(instrumental_variables(u, y, ls, 0))]
+        for start in starts:
+            fit = output_error([stretch], start, maxiter=20)
+            bic = n * np.log(max(fit.rms**2, np.finfo(float).tiny)) + np.log(n) * (na + nb)
+            if best is None or bic < best[0]:
+                best = (bic, (na, nb), fit)
+        progress('dynamics', 0.2 + 0.6 * (i + 1) / len(orders))
+    if best is None or best[2].rms ** 2 > (1.0 - GAIN) * static_loss:
+        return None
+    return best[1], best[2]
+
+
+def joint_fit(
+    run: Run, n_fit: int, scaling: Scaling, settings: Settings, progress: Progress
+) -> JointFit:
+    """
+    Fit delay, low-order dynamics and the memory of the start on the first part of a run.
+
+    Parameters
+    ----------
+    run : Run
+    n_fit : int
+        Samples that may be used.
+    scaling : Scaling
+    settings : Settings
+    progress : callable
+
+    Raises
+    ------
+    IdentificationError
+        When the fitted part is too short, or its voltage hardly moves.
+    """
+    if n_fit < 100:
+        raise IdentificationError(
+            f'{run.record}: {n_fit} samples to fit are too few; at least 100 are needed'
+        )
+    u, x = run.u[:n_fit], run.x[:n_fit]
+    swing = float(np.ptp(u))
+    if swing < 0.02:
+        raise IdentificationError(
+            f'{run.record}: the voltage moves by {swing:.1%} of its range in the fitted part; '
+            'let it move there, or hold out less (--hold-out)'
+        )
+    progress('delay', 0.0)
+    found, no_delay = _find_delay(run, n_fit, settings)
+    missing = [('delay', no_delay)] if no_delay else []
+    progress('delay', 1.0)
+    delay = Delay(found.samples)
+    rate = run.piece.sample_rate
+    r = even_thresholds(swing, 40)
+    known = run.known[:n_fit]
+    # a record that never comes back over its range has no part without the unknown start
+    if known.sum() < n_fit // 5:
+        known = np.ones(n_fit, dtype=bool)
+    G = Dynamics.unit()
+    rule: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    windows = _windows(run, n_fit)
+    band = excited_band(u[known] - u[known].mean(), rate, depth=1e-6)
+    if band > FAST:
+        windows |= known
+    order: tuple[int, int] = (0, 1)
+    fit: OutputErrorFit | None = None
+    H = Hysteresis(r, np.zeros(r.size), 0.0, 1.0)
+    for turn in range(3):
+        progress('dynamics', turn / 3 if turn != 1 else 0.2)
+        R = factorise([Excerpt(u, x, known, rule)], r, G, delay)
+        result = fit_hysteresis(R, r, int(known.sum()))
+        H, offset = result.hysteresis, float(result.offsets[0])
+        if u[0] > 0.01:
+            shifted = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
+            trial = StageModel(rate, shifted, H, G, delay)
+            memory = fit_memory(trial, run.piece.cut(0, n_fit))
+            rule = _memory_rule(H.thresholds, memory, float(u[0]))
+        if not windows.any():
+            break
+        start = None if rule is None else rule(H.thresholds)
+        w = delay.apply(H(u, start))
+        if fit is None:
+            searched = _search_order(w, x - offset, windows, settings, progress)
+            if searched is None:
+                break
+            order, fit = searched
+        else:
+            fit = output_error([Stretch(w, x - offset, windows)], G, maxiter=20)
+        G = fit.dynamics.normalised()
+    if fit is None:
+        missing.append(('dynamics', _why_static(windows, band)))
+    covariance = np.zeros((1, 1)) if fit is None else fit.covariance
+    progress('dynamics', 1.0)
+    return JointFit(
+        delay=found,
+        dynamics=DynamicsResult(order, None, {}, covariance, band=band),
+        G=G,
+        memory=rule,
+        hysteresis=H,
+        not_identified=tuple(missing),
+    )
+
+
+def _why_static(windows: NDArray[np.bool_], band: float) -> str:
+    if not windows.any():
+        return (
+            f'the voltage has no jump and no power above {band:.3g} Hz, where every stage follows '
+            'statically; add steps or noise'
+        )
+    return 'no order up to (4, 5) explains more than the hysteresis alone; add noise'

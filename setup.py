@@ -1,0 +1,82 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Installs piezo_ident, for pip and for colcon alike."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = 'piezo_ident'
+
+lint = [
+    'mypy>=2.4,<3',
+    'ruff>=0.17,<0.18',
+    'types-PyYAML>=6,<7',
+]
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    packages=find_packages(include=[package_name, f'{package_name}.*']),
+    package_data={package_name: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+        (f'share/{package_name}', ['package.xml']),
+        (f'share/{package_name}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'PyYAML>=6,<7',
+        'matplotlib>=3.6,<4',
+        # 0.58.1 is the first that takes NumPy 1.26
+        'numba>=0.58.1,<1',
+        'numpy>=1.26,<3',
+        # 0.10.9 writes mcap, 0.10.11 also the statistics that other readers of it look for
+        'rosbags>=0.10.11,<0.12',
+        'scipy>=1.11,<2',
+        'tqdm>=4.60,<5',
+    ],
+    extras_require={
+        # Real ROS 2 Jazzy for a machine without ROS.  Never on top of a ROS installation.
+        'ros': [
+            'ros-jazzy-common-interfaces>=5.3,<6',
+            'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
+        ],
+        'test': [
+            *lint,
+            'hypothesis>=6,<7',
+            'jsonschema>=4,<5',
+            'mcap>=1.1,<2',
+            'mcap-ros2-support>=0.5,<1',
+            'pytest>=7.4,<10',
+            'pytest-timeout>=2.2,<3',
+        ],
+        'colcon': [
+            'colcon-common-extensions>=0.3,<0.4',
+            'colcon-ros>=0.5,<0.6',
+        ],
+    },
+    zip_safe=False,
+    maintainer='piezo_ident maintainers',
+    maintainer_email='maintainers@piezo-ident.invalid',
+    description='Identifies piezo nanopositioning stages: delay, dynamics, hysteresis and more',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            'piezo_ident = piezo_ident.cli:main',
+        ],
+    },
+)

@@ -1,0 +1,266 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The house rules that no linter knows."""
+
+import ast
+from collections.abc import Iterator
+import json
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / 'piezo_ident'
+
+HEADER = """\
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+
+# Storeys by the first name below piezo_ident; whatever is not named here is numerics.
+NUMERICS, PICTURES, TOP = range(3)
+STOREYS = {
+    'report': PICTURES,
+    'plots': PICTURES,
+    '__main__': TOP,
+    'cli': TOP,
+    'demo': TOP,
+    'nodes': TOP,
+}
+
+# Import names whose rosdep keys read otherwise; a ROS package is its own key.
+ROSDEP_KEYS = {
+    'matplotlib': 'python3-matplotlib',
+    'numba': 'python3-numba',
+    'numpy': 'python3-numpy',
+    'rosbags': 'python3-rosbags-pip',
+    'scipy': 'python3-scipy',
+    'tqdm': 'python3-tqdm',
+    'yaml': 'python3-yaml',
+}
+
+# Runs in an interpreter of its own: imports the modules named as arguments with ROS out of reach,
+# prints which of them asked for it all the same.
+BLOCKED_IMPORTS = """
+import importlib
+import json
+import sys
+
+ROS = ('rclpy', 'rcl_interfaces', 'rosidl_', 'builtin_interfaces', 'std_msgs', 'std_srvs',
+       'sensor_msgs', 'diagnostic_msgs', 'ament_index_python', 'launch')
+asked = []
+
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.startswith(ROS):
+            asked.append([module, name])
+            raise ModuleNotFoundError(f'{name} is blocked', name=name)
+        return None
+
+
+sys.meta_path.insert(0, Blocker())
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+print(json.dumps(asked))
+"""
+
+
+def python_files(*folders: str) -> list[Path]:
+    return [path for folder in folders for path in sorted((ROOT / folder).rglob('*.py'))]
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def imported_names(path: Path) -> Iterator[str]:
+    """Absolute dotted names of all that a file imports, wherever in the file it does so."""
+    package = path.relative_to(ROOT).parts[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package[: len(package) - node.level + 1] if node.level else ()
+            base = '.'.join([*parents, *filter(None, [node.module])])
+            yield from (f'{base}.{alias.name}' for alias in node.names)
+
+
+def storey(name: str) -> int:
+    """Storey of a dotted name that starts with piezo_ident."""
+    below = name.split('.')[1:2]
+    return STOREYS.get(below[0], NUMERICS) if below else NUMERICS
+
+
+def breaches(path: Path) -> list[str]:
+    """List imports of a higher storey, or of the nodes from outside of them."""
+    name = module_name(path)
+    return [
+        f'{name} imports {target}'
+        for target in imported_names(path)
+        if target.startswith('piezo_ident.')
+        and (storey(target) > storey(name) or (is_node(target) and not is_node(name)))
+    ]
+
+
+def is_node(name: str) -> bool:
+    return f'{name}.'.startswith('piezo_ident.nodes.')
+
+
+def tracked_files() -> list[Path]:
+    """Files that git has or would take."""
+    if shutil.which('git') is None or not (ROOT / '.git').exists():
+        pytest.skip('not a git working tree')
+    listing = subprocess.run(
+        ['git', 'ls-files', '-z', '--cached', '--others', '--exclude-standard'],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+    return [ROOT / name for name in listing.split('\0') if name and (ROOT / name).is_file()]
+
+
+def setup_keywords() -> dict[str, ast.expr]:
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    (setup,) = (c for c in calls if isinstance(c.func, ast.Name) and c.func.id == 'setup')
+    return {keyword.arg: keyword.value for keyword in setup.keywords if keyword.arg}
+
+
+def dependencies(tag: str) -> set[str]:
+    return {node.text or '' for node in ElementTree.parse(ROOT / 'package.xml').iter(tag)}
+
+
+def test_versions_are_equal():
+    tree = ast.parse((PACKAGE / '__init__.py').read_text(encoding='utf-8'))
+    (in_package,) = (
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == '__version__'
+    )
+    manifest = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    assert in_package == manifest == ast.literal_eval(setup_keywords()['version'])
+    assert re.fullmatch(r'\d+\.\d+\.\d+', in_package)
+
+
+@pytest.mark.parametrize(
+    'path',
+    [ROOT / 'setup.py', *python_files('piezo_ident', 'test', 'benchmarks', 'launch')],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_licence_header(path):
+    assert path.read_text(encoding='utf-8').startswith(HEADER)
+
+
+def test_licence_is_apache_2():
+    text = (ROOT / 'LICENSE').read_text(encoding='utf-8')
+    assert 'Apache License\n' in text
+    assert 'Version 2.0, January 2004' in text
+    assert 'END OF TERMS AND CONDITIONS' in text
+
+
+def test_everything_but_the_nodes_imports_without_ros():
+    names = [module_name(path) for path in python_files('piezo_ident')]
+    names = [name for name in names if not is_node(name) and not name.endswith('.__main__')]
+    done = subprocess.run(
+        [sys.executable, '-c', BLOCKED_IMPORTS, *names],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == []
+
+
+def test_no_storey_imports_a_higher_one():
+    found = [breach for path in python_files('piezo_ident') for breach in breaches(path)]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ('where', 'line', 'caught'),
+    [
+        ('model.py', 'from piezo_ident import plots', True),
+        ('model.py', 'from . import report', True),
+        ('effects/creep.py', 'from ..cli import main', True),
+        ('effects/creep.py', 'def f():\n    import piezo_ident.nodes.wire', True),
+        ('report.py', 'from piezo_ident.demo import run', True),
+        ('cli.py', 'from piezo_ident.nodes import stage', True),
+        ('report.py', 'from piezo_ident.plots import draw', False),
+        ('cli.py', 'from piezo_ident import demo, report', False),
+        ('nodes/stage.py', 'from .wire import Block\nimport piezo_ident.nodes.wire', False),
+        ('effects/creep.py', 'from .base import Effect\nimport numpy', False),
+    ],
+)
+def test_storey_check_sees_every_way_to_import(tmp_path, monkeypatch, where, line, caught):
+    monkeypatch.setattr(sys.modules[__name__], 'ROOT', tmp_path)
+    path = tmp_path / 'piezo_ident' / where
+    path.parent.mkdir(parents=True)
+    path.write_text(line, encoding='utf-8')
+    assert bool(breaches(path)) is caught
+
+
+def test_manifest_declares_what_is_imported():
+    names = {
+        name.partition('.')[0]
+        for path in python_files('piezo_ident', 'launch')
+        for name in imported_names(path)
+    }
+    names -= {*sys.stdlib_module_names, 'piezo_ident'}
+    assert {ROSDEP_KEYS.get(name, name) for name in names} <= dependencies('exec_depend')
+
+
+def test_manifest_and_setup_require_the_same_libraries():
+    required = ast.literal_eval(setup_keywords()['install_requires'])
+    distributions = {re.match(r'[\w-]+', text)[0] for text in required}
+    keys = {ROSDEP_KEYS['yaml' if name == 'PyYAML' else name] for name in distributions}
+    assert keys == {name for name in dependencies('exec_depend') if name.startswith('python3-')}
+
+
+def test_changelog_has_a_forthcoming_section():
+    # REP-132, which catkin_prepare_release reads
+    lines = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8').splitlines()
+    assert lines[1] == 'Changelog for package piezo_ident'
+    assert lines[0] == lines[2] == '^' * len(lines[1])
+    assert lines[lines.index('Forthcoming') + 1] == '-' * len('Forthcoming')
+
+
+def test_no_file_names_a_package_registry():
+    hosts = ['py' + 'pi.org', 'python' + 'hosted']
+    found = [
+        f'{path.relative_to(ROOT)}: {host}'
+        for path in tracked_files()
+        for host in hosts
+        if host.encode() in path.read_bytes().lower()
+    ]
+    assert found == []
