@@ -45,7 +45,7 @@ setup(
         'numba>=0.58.1,<1',
         'numpy>=1.26,<3',
         # 0.10.9 writes mcap, 0.10.11 also the statistics that other readers of it look for
-        'rosbags>=0.10.11,<0.12',
+        'rosbags>=0.11,<0.12',
         'scipy>=1.11,<2',
         'tqdm>=4.60,<5',
     ],

@@ -155,9 +155,9 @@ def _opened(path: Path) -> Iterator[Reader]:
         ) from None
 
 
-def _messages(reader: Reader, connections: list[Connection]) -> Iterator[tuple[str, Any]]:
-    for connection, _, raw in reader.messages(connections=connections):
-        yield connection.topic, typestore().deserialize_cdr(raw, connection.msgtype)
+def _messages(reader: Reader, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
+    for connection, stamp, raw in reader.messages(connections=connections):
+        yield connection.topic, stamp, typestore().deserialize_cdr(raw, connection.msgtype)
 
 
 def _carried(reader: Reader, path: Path) -> dict[str, str]:
@@ -166,7 +166,7 @@ def _carried(reader: Reader, path: Path) -> dict[str, str]:
     for connection in reader.connections:
         if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
             continue
-        for topic, message in _messages(reader, [connection]):
+        for topic, _, message in _messages(reader, [connection]):
             base = topic.rpartition('/')[2]
             # a damaged layout must not hide a topic that is ours by name
             ours = base if base in ('voltage', 'displacement') else None
@@ -235,7 +235,7 @@ def _collect(reader: Reader, topics: Mapping[str, str], path: Path) -> dict[str,
     by_topic = {topic: streams[quantity] for quantity, topic in topics.items()}
     index = dict.fromkeys(by_topic, 0)
     wanted = [c for c in reader.connections if c.topic in by_topic and c.msgtype == MESSAGE_TYPE]
-    for order, (topic, message) in enumerate(_messages(reader, wanted)):
+    for topic, stamp, message in _messages(reader, wanted):
         layout = message.layout
         try:
             samples = decode(message.data, layout.dim, layout.data_offset)
@@ -244,7 +244,7 @@ def _collect(reader: Reader, topics: Mapping[str, str], path: Path) -> dict[str,
                 f'{path}: topic {topic}, message {index[topic]}: {error}; record it again with '
                 'a publisher that keeps to the layout'
             ) from None
-        by_topic[topic].append(samples, order)
+        by_topic[topic].append(samples, stamp)
         index[topic] += 1
     return streams
 

@@ -85,7 +85,8 @@ class Resolution:
         # 13 digits leave a float64 three to tell a rounded number from any other
         decimals = (d for d in range(13 - top) if _rounded_to(x, np.full(x.shape, d)))
         digits = (s for s in range(1, 13) if _rounded_to(x, s - 1 - place))
-        single = bool(np.all(x.astype(np.float32).astype(np.float64) == x))
+        with np.errstate(over='ignore'):
+            single = bool(np.all(x.astype(np.float32).astype(np.float64) == x))
         return cls(next(decimals, None), next(digits, None), single)
 
     def half(self, t: Vector) -> Vector:
@@ -197,9 +198,10 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
         k += 1
     if not _SHORT <= k <= n - _SHORT:
         return []
-    rms = max(float(np.std(_residual(part))) for part in (t[:k], t[k:]))
-    # jitter does not get smaller by cutting
-    return [k] if rms < 0.5 * float(np.std(residual)) else []
+    rms = float(np.std(residual))
+    parts = sorted(float(np.std(_residual(part))) for part in (t[:k], t[k:]))
+    # behind a true cut one side at least is clean; jitter does not get smaller by cutting
+    return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
 
 
 def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
@@ -223,15 +225,16 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
     """
     dt = float(t[-1] - t[0]) / (t.size - 1)
     low, high = _rates(t, _rounding(resolution, dt))
-    jitter = 0.0
+    jitter, start = 0.0, float(t[0])
     if low > high:
-        deviation = float(np.abs(_residual(t)).max())
-        jitter = deviation / dt
+        residual = _residual(t)
+        deviation = float(np.abs(residual).max())
+        jitter, start = deviation / dt, float(t[0] - residual[0])
         slack = 2 * deviation / float(t[-1] - t[0])
         low, high = (1 - slack) / dt, (1 + slack) / dt
     rate = next((r for r in known if low <= r <= high), None)
     if rate is not None:
-        return Clock(rate, _start(float(t[0]), rate, resolution), jitter)
+        return Clock(rate, _start(start, rate, resolution), jitter)
     if not jitter:
         # stamps may be far better than their last decimal: 0.0001 s steps at four decimals
         for half in (_last_bit, lambda x: 8 * np.spacing(np.abs(x))):
@@ -239,7 +242,7 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
             if tight[0] <= tight[1]:
                 low, high = tight
                 break
-    clocks = [Clock(r, _start(float(t[0]), r, resolution), jitter) for r in _nice(low, high)]
+    clocks = [Clock(r, _start(start, r, resolution), jitter) for r in _nice(low, high)]
     return next((c for c in clocks if not jitter and _reproduces(c, t)), clocks[0])
 
 

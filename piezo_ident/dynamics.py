@@ -33,6 +33,9 @@ from piezo_ident.record import frozen_array
 
 __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
 
+#: longest pure delay that a model may have [samples]
+MAX_DELAY = 1_000_000
+
 
 @kernel
 def _filter(
@@ -42,15 +45,15 @@ def _filter(
     z: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
-    # transposed direct form II; b = (b1, b2, ...), a = (a1, a2, ...) padded to one length m,
-    # z holds m numbers of which the last is always zero
+    # transposed direct form II; a = (a1, a2, ...) padded to m numbers, b = (b1, b2, ...) to m + 1,
+    # z holds m numbers
     m = a.size
     for k in range(x.size):
         u = x[k]
         y = z[0] + b[0] * u
         for i in range(m - 1):
             z[i] = z[i + 1] + b[i + 1] * u - a[i] * y
-        z[m - 1] = -a[m - 1] * y
+        z[m - 1] = b[m] * u - a[m - 1] * y
         out[k] = y
 
 
@@ -100,8 +103,9 @@ class Dynamics:
 
     @property
     def gain(self) -> float:
-        """Static gain G(1)."""
-        return float(self.b.sum() / (1.0 + self.a.sum()))
+        """Static gain G(1), infinite for an integrator."""
+        numerator, denominator = float(self.b.sum()), 1.0 + float(self.a.sum())
+        return numerator / denominator if denominator != 0.0 else float('inf')
 
     @property
     def poles(self) -> NDArray[np.complex128]:
@@ -241,8 +245,10 @@ class Delay:
     fraction: float = 0.0
 
     def __post_init__(self) -> None:
-        if int(self.samples) != self.samples or self.samples < 0:
-            raise ModelError(f'delay: samples must be a whole number >= 0, got {self.samples}')
+        if not 0 <= self.samples <= MAX_DELAY or int(self.samples) != self.samples:
+            raise ModelError(
+                f'delay: samples must be a whole number, 0 to {MAX_DELAY}, got {self.samples}'
+            )
         if not 0.0 <= self.fraction < 1.0:
             raise ModelError(f'delay: fraction must be in [0, 1), got {self.fraction}')
 

@@ -38,6 +38,7 @@ from piezo_ident.hysteresis_fit import (
     fit_hysteresis,
     HysteresisFit,
 )
+from piezo_ident.memory import fit_memory
 from piezo_ident.metrics import fit_percent, FORMULA, percent_of_stroke
 from piezo_ident.model import Scaling, StageModel
 from piezo_ident.record import Record
@@ -268,7 +269,8 @@ def _unlabelled(
     low, high = float(u.min()), float(u.max())
     span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
     model = replace(model, scaling=replace(model.scaling, range=span))
-    start = None if joint.memory is None else joint.memory(model.hysteresis.thresholds)
+    # the start of these very thresholds; the rule carried over from other ones is an approximation
+    start = None if joint.memory is None else fit_memory(model, piece.cut(0, n_fit))
     masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
     for other in runs:
         fitted = np.zeros(other.piece.n, dtype=bool)

@@ -16,8 +16,8 @@
 Streams of blocks to columns: voltage and displacement meet on equal time stamps.
 
 Blocks may be lost, come twice, or start over with a restarted clock, and the streams need not
-be cut into the same blocks.  Where a time stamp occurs more than once, the two rows that arrived
-closest to each other belong together.
+be cut into the same blocks.  Where a time stamp occurs more than once, the first of one stream
+belongs to the first of the other; after a loss, the two that arrived closest to each other do.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from piezo_ident.wire_format import Samples
 
 __all__ = ['Joined', 'Stream', 'join']
 
-#: two blocks that came within so many messages are of the same run of the sample clock
-NEARBY = 6
+#: rows of a stream no further apart than this are of the same run of the sample clock
+NEARBY = 300
 
 
 class Stream:
@@ -44,15 +44,15 @@ class Stream:
     def __init__(self) -> None:
         self._rows = array('d')
         self._sizes = array('q')
-        self._orders = array('q')
+        self._arrivals = array('q')
         self._segments: list[str] = []
 
-    def append(self, samples: Samples, order: int) -> None:
-        """Add a block; `order` counts the messages of all streams as they arrived."""
+    def append(self, samples: Samples, arrival: int) -> None:
+        """Add a block that arrived at a time [ns] of a clock that all streams share."""
         rows = np.column_stack([samples.t, samples.values])
         self._rows.frombytes(rows.tobytes())
         self._sizes.append(samples.t.size)
-        self._orders.append(order)
+        self._arrivals.append(arrival)
         # one string for all blocks of a segment, not one a block
         last = self._segments[-1] if self._segments else ''
         self._segments.append(last if last == samples.segment else samples.segment)
@@ -68,9 +68,9 @@ class Stream:
         return np.array(self._rows, dtype=np.float64).reshape(-1, 2)
 
     @property
-    def order(self) -> NDArray[np.int64]:
-        """Number of the message that brought each sample."""
-        return np.repeat(np.array(self._orders, dtype=np.int64), self._sizes)
+    def arrivals(self) -> NDArray[np.int64]:
+        """When each sample arrived [ns]."""
+        return np.repeat(np.array(self._arrivals, dtype=np.int64), self._sizes)
 
     def labels(self, rows: NDArray[np.int64]) -> tuple[list[str], list[int]]:
         """Return the label of each stretch of `rows`, and where in `rows` it begins."""
@@ -101,7 +101,7 @@ def join(streams: Mapping[str, Stream]) -> Joined:
     Parameters
     ----------
     streams : mapping of str to Stream
-        By quantity; the first gives order and segments.
+        By quantity; the first gives the order and the segments.
 
     Returns
     -------
@@ -114,12 +114,12 @@ def join(streams: Mapping[str, Stream]) -> Joined:
         When a stream has two values for one time, or no stamp is in all streams.
     """
     (first, lead), *others = streams.items()
-    tables = {name: (s.rows, s.order) for name, s in streams.items()}
-    rows, order = tables[first]
+    tables = {name: (s.rows, s.arrivals) for name, s in streams.items()}
+    rows, arrivals = tables[first]
     partner = {}
     matched = np.ones(lead.n, dtype=np.bool_)
     for name, _ in others:
-        partner[name] = _partners(rows[:, 0], order, tables[name][0][:, 0], tables[name][1])
+        partner[name] = _partners(rows[:, 0], arrivals, tables[name][0][:, 0], tables[name][1])
         matched &= partner[name] >= 0
     if not matched.any():
         names = ' and '.join(streams)
@@ -130,8 +130,8 @@ def join(streams: Mapping[str, Stream]) -> Joined:
     keep = np.flatnonzero(matched)
     used = {first: keep, **{name: p[keep] for name, p in partner.items()}}
     faults: list[Fault] = []
-    for name, (table, arrived) in tables.items():
-        faults.extend(_left_over(name, table, arrived, used[name]))
+    for name, (table, _) in tables.items():
+        faults.extend(_left_over(name, table, used[name]))
     return Joined(
         t=rows[keep, 0],
         columns={name: tables[name][0][used[name], 1] for name in streams},
@@ -142,55 +142,63 @@ def join(streams: Mapping[str, Stream]) -> Joined:
 
 def _partners(
     ta: NDArray[np.float64],
-    order_a: NDArray[np.int64],
+    arrived_a: NDArray[np.int64],
     tb: NDArray[np.float64],
-    order_b: NDArray[np.int64],
+    arrived_b: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     """Return for each row of a the row of b with the same time, -1 for none."""
+    partner = np.full(ta.size, -1, dtype=np.int64)
     if not (ta.size and tb.size):
-        return np.full(ta.size, -1)
+        return partner
     if np.all(ta[1:] > ta[:-1]) and np.all(tb[1:] > tb[:-1]):
         at = np.minimum(np.searchsorted(tb, ta), tb.size - 1)
         return np.where(tb[at] == ta, at, -1)
-    _, rank = np.unique(np.concatenate([ta, tb]), return_inverse=True)
-    span = 2 * int(max(order_a.max(), order_b.max())) + 2
-    # rows of one time sit together on this scale, as far apart as they arrived
-    key = span * rank.reshape(-1) + np.concatenate([order_a, order_b])
-    key_a, key_b = key[: ta.size], key[ta.size :]
-    ab = _nearest(key_a, key_b, span)
-    ba = _nearest(key_b, key_a, span)
-    mutual = (ab >= 0) & (ba[ab] == np.arange(ta.size))
-    return np.where(mutual, ab, -1)
+    by_a, by_b = np.lexsort((arrived_a, ta)), np.lexsort((arrived_b, tb))
+    if np.array_equal(ta[by_a], tb[by_b]):
+        partner[by_a] = by_b
+        return partner
+    t, arrived = np.concatenate([ta, tb]), np.concatenate([arrived_a, arrived_b])
+    by = np.lexsort((arrived, t))
+    nearest = _nearest(t[by], arrived[by], by >= ta.size)
+    # both must be the nearest to each other: a lost row's twin of another run has its own partner
+    mutual = np.flatnonzero((nearest >= 0) & (nearest[nearest] == np.arange(by.size)))
+    mutual = mutual[by[mutual] < ta.size]
+    partner[by[mutual]] = by[nearest[mutual]] - ta.size
+    return partner
 
 
-def _nearest(key: NDArray[np.int64], of: NDArray[np.int64], span: int) -> NDArray[np.int64]:
-    by = np.argsort(of, kind='stable')
-    right = np.searchsorted(of[by], key)
-    best = np.full(key.size, -1)
-    distance = np.full(key.size, span)
-    for at in (right - 1, right):
-        inside = (at >= 0) & (at < of.size)
-        there = by[np.where(inside, at, 0)]
-        same = inside & (of[there] // span == key // span)
-        gap = np.abs(of[there] - key)
-        closer = same & (gap < distance)
+def _nearest(
+    t: NDArray[np.float64], arrived: NDArray[np.int64], in_b: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Return for sorted rows of two streams the row of the other with equal time, -1 for none."""
+    here = np.arange(t.size)
+    best = np.full(t.size, -1)
+    distance = np.full(t.size, np.iinfo(np.int64).max)
+    before = {b: np.maximum.accumulate(np.where(in_b == b, here, -1)) for b in (True, False)}
+    after = {
+        b: np.minimum.accumulate(np.where(in_b == b, here, t.size)[::-1])[::-1]
+        for b in (True, False)
+    }
+    for side in (before, after):
+        other = np.where(in_b, side[False], side[True])
+        there = np.clip(other, 0, t.size - 1)
+        gap = np.abs(arrived[there] - arrived)
+        closer = (other == there) & (t[there] == t) & (gap < distance)
         best[closer], distance[closer] = there[closer], gap[closer]
     return best
 
 
-def _left_over(
-    name: str, table: NDArray[np.float64], arrived: NDArray[np.int64], used: NDArray[np.int64]
-) -> list[Fault]:
+def _left_over(name: str, table: NDArray[np.float64], used: NDArray[np.int64]) -> list[Fault]:
     """Say what became of the samples of a stream that found no partner."""
-    left = np.ones(arrived.size, dtype=np.bool_)
+    left = np.ones(len(table), dtype=np.bool_)
     left[used] = False
     if not left.any():
         return []
     t, x = table[:, 0], table[:, 1]
-    by = np.lexsort((arrived, t))
+    by = np.argsort(t, kind='stable')
     same_time = t[by][1:] == t[by][:-1]
     same_value = x[by][1:] == x[by][:-1]
-    close = np.abs(np.diff(arrived[by])) <= NEARBY
+    close = np.diff(by) <= NEARBY
     one_left = left[by][1:] ^ left[by][:-1]
     clash = np.flatnonzero(same_time & ~same_value & close & one_left)
     if clash.size:

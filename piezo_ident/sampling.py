@@ -45,6 +45,8 @@ UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm':
 STROKE = (1e-9, 10e-3)
 #: share of samples without a number that can be cut out
 MAX_NOT_FINITE = 0.01
+#: later times [s] and higher rates [Hz] are counted in another unit than seconds
+MAX_TIME, MAX_RATE = 1e11, 1e9
 #: more pieces than this, with fewer samples than this in each, are no uniform sampling
 MANY = 10
 #: a stretch of fewer samples has no sampling rate
@@ -190,6 +192,9 @@ def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
 
 def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float] | None) -> None:
     v, y = table.columns['v'], table.columns['y']
+    latest = float(np.abs(table.t).max())
+    if latest > MAX_TIME:
+        raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
     if limits is not None:
         outside = np.flatnonzero((v < limits[0]) | (v > limits[1]))
         if outside.size:
@@ -249,6 +254,8 @@ def _clocks(
     for part in sorted(parts, key=lambda p: p[0] - p[1]):
         clocks[part] = clock = fit_clock(t[slice(*part)], resolution, known)
         known[clock.sample_rate] = None
+        if clock.sample_rate > MAX_RATE:
+            raise DataError(f'{name}: t says {clock.sample_rate:.3g} Hz; write t in seconds')
         if clock.jitter > 0.5:
             raise DataError(
                 f'{name}: time stamps from {t[part[0]]:.6g} s stray {clock.jitter:.2g} samples '

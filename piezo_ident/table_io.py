@@ -310,10 +310,12 @@ def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
     """Turn whatever a parser throws at damaged bytes into one line."""
     try:
         yield
-    except (DataError, OSError):
+    except DataError:
         raise
     # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the file's
         reason = ' '.join(str(error).split()) or type(error).__name__
         raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
 

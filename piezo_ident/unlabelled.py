@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 from piezo_ident.arx import arx_factor, excited_band, instrumental_variables, stabilised
 from piezo_ident.delay import delay_from_steps, find_jumps
 from piezo_ident.dynamics import Delay, Dynamics
@@ -41,11 +42,16 @@ from piezo_ident.runs import Run
 __all__ = ['JointFit', 'joint_fit']
 
 #: orders (na, nb) tried on a record with little dynamic content, from none upwards
-ORDERS = ((1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4), (4, 4), (4, 5))
+ORDERS = ((1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (5, 4), (5, 5), (6, 6))
 #: time after a jump in which the dynamics are looked for [s]
-WINDOW = 0.2
-#: a record whose voltage has power above this frequency excites the dynamics throughout [Hz]
-FAST = 20.0
+WINDOW = 0.1
+#: below this the signals are taken away before dynamics are fitted to jumps: slow errors of H and
+#: of the unknown start would be larger than a ring [Hz]
+HIGH_PASS = 30.0
+#: rms above that frequency from which the voltage excites the dynamics throughout, normalised
+FAST = 2e-3
+#: samples of such a record that the search uses
+MOST = 40_000
 #: dynamics must lower the loss in their windows by this share to be believed
 GAIN = 0.2
 
@@ -110,6 +116,11 @@ def _find_delay(run: Run, n_fit: int, settings: Settings) -> tuple[DelayResult, 
         'lag of the hysteresis; add steps'
     )
     return DelayResult(0, float('inf'), 'none', step), reason
+
+
+def _high_passed(x: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
+    sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, x - x[0]))
 
 
 def _search_order(
@@ -194,9 +205,18 @@ def joint_fit(
     G = Dynamics.unit()
     rule: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     windows = _windows(run, n_fit)
-    band = excited_band(u[known] - u[known].mean(), rate, depth=1e-6)
-    if band > FAST:
-        windows |= known
+    band = excited_band(u[known] - u[known].mean(), rate, depth=1e-4)
+    fast = _high_passed(u, rate) if 4 * HIGH_PASS < rate else np.zeros(n_fit)
+    quiet = known & ~windows
+    broad = bool(quiet.any() and np.sqrt(np.mean(fast[quiet] ** 2)) > FAST)
+    if broad:
+        windows |= known & (np.arange(n_fit) < np.flatnonzero(known)[0] + MOST)
+
+    def view(*signals: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        if broad or 4 * HIGH_PASS > rate:
+            return signals
+        return tuple(_high_passed(z, rate) for z in signals)
+
     order: tuple[int, int] = (0, 1)
     fit: OutputErrorFit | None = None
     H = Hysteresis(r, np.zeros(r.size), 0.0, 1.0)
@@ -205,22 +225,21 @@ def joint_fit(
         R = factorise([Excerpt(u, x, known, rule)], r, G, delay)
         result = fit_hysteresis(R, r, int(known.sum()))
         H, offset = result.hysteresis, float(result.offsets[0])
-        if u[0] > 0.01:
-            shifted = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
-            trial = StageModel(rate, shifted, H, G, delay)
-            memory = fit_memory(trial, run.piece.cut(0, n_fit))
-            rule = _memory_rule(H.thresholds, memory, float(u[0]))
+        # even at its lowest voltage a stage may not have come down from the top: it relaxes
+        shifted = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
+        trial = StageModel(rate, shifted, H, G, delay)
+        memory = fit_memory(trial, run.piece.cut(0, n_fit))
+        rule = _memory_rule(H.thresholds, memory, float(u[0]))
         if not windows.any():
             break
-        start = None if rule is None else rule(H.thresholds)
-        w = delay.apply(H(u, start))
+        w = delay.apply(H(u, memory))
         if fit is None:
-            searched = _search_order(w, x - offset, windows, settings, progress)
+            searched = _search_order(*view(w, x - offset), windows, settings, progress)
             if searched is None:
                 break
             order, fit = searched
         else:
-            fit = output_error([Stretch(w, x - offset, windows)], G, maxiter=20)
+            fit = output_error([Stretch(*view(w, x - offset), windows)], G, maxiter=20)
         G = fit.dynamics.normalised()
     if fit is None:
         missing.append(('dynamics', _why_static(windows, band)))
@@ -239,7 +258,7 @@ def joint_fit(
 def _why_static(windows: NDArray[np.bool_], band: float) -> str:
     if not windows.any():
         return (
-            f'the voltage has no jump and no power above {band:.3g} Hz, where every stage follows '
+            f'the voltage has no jump and no power above {band:.3g} Hz, where a stage follows '
             'statically; add steps or noise'
         )
-    return 'no order up to (4, 5) explains more than the hysteresis alone; add noise'
+    return 'no order up to (6, 6) explains more than the hysteresis alone; add noise'

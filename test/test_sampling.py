@@ -110,6 +110,14 @@ def test_rate_change_splits(other):
     assert 'rate_change' in faults(record)
 
 
+def test_rate_that_changes_a_little_and_back():
+    t = np.cumsum(np.repeat([1 / 1000, 1 / 1050, 1 / 1000], [500, 600, 700]))
+    v = np.arange(t.size) / 200
+    record = read([t, v, 1e-6 * v])
+    assert [round(p.sample_rate, 3) for p in record] == [1000, 1050, 1000]
+    np.testing.assert_allclose(sizes(record), [500, 600, 700], atol=1)
+
+
 @pytest.mark.parametrize('decimals', [4, 5, 6])
 @pytest.mark.parametrize('rate', [256.0, 1024.0, 2048.0, 1000 / 3])
 def test_rounded_stamps_are_no_jitter(decimals, rate):
@@ -280,6 +288,13 @@ def test_voltage_limits():
     read(columns(), voltage_limits=(0.0, 10.0))
     with pytest.raises(DataError, match=r'voltage limits 0\.\.9 V, worst (9\.9|10)'):
         read(columns(), voltage_limits=(0.0, 9.0))
+
+
+@pytest.mark.parametrize('factor', [1e15, 1e-9])
+def test_time_in_another_unit_is_refused(factor):
+    t, v, y = columns()
+    with pytest.raises(DataError, match='write t in seconds'):
+        read([t * factor, v, y])
 
 
 def test_an_idle_record_is_a_record():

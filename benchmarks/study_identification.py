@@ -1,0 +1,160 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How well simulated stages are identified: 20 seeds, three noise levels, and thresholds off the grid.
+
+    .venv/bin/python benchmarks/study_identification.py docs/identification_study.md
+
+Errors are free-run errors against the noise-free stage, 100 rms(y - y_hat) / (max y - min y), on
+motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and minor loops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+import platform
+import sys
+
+import numpy as np
+import scipy
+from tqdm import tqdm
+
+from piezo_ident import __version__
+from piezo_ident.identification import identify
+from piezo_ident.metrics import percent_of_stroke
+from piezo_ident.model import StageModel
+from piezo_ident.program import load_program
+from piezo_ident.record import Record
+from piezo_ident.results import Identification, Settings
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import SimulatedStage, load_stage, simulate, simulate_truth
+from piezo_ident.validation import sine_errors
+
+SEEDS = 20
+NOISES = (1e-5, 1e-4, 5e-4)
+
+
+def record_of(stage: SimulatedStage, program: str, seed: int) -> Record:
+    """Return what the stage answers to a shipped programme, with its noise."""
+    sequence = load_program(find_config(program, 'program')).build(stage.model.sample_rate)
+    return simulate(stage, sequence, np.random.default_rng(seed))
+
+
+def truth_of(stage: SimulatedStage, program: str) -> Record:
+    """Return the same without noise and converters."""
+    sequence = load_program(find_config(program, 'program')).build(stage.model.sample_rate)
+    return simulate_truth(stage, sequence)
+
+
+def with_noise(stage: SimulatedStage, share: float) -> SimulatedStage:
+    """Return the stage with sensor noise of a share of its stroke."""
+    sensor = replace(stage.sensor, noise_rms=share * abs(stage.model.scaling.Y))
+    return replace(stage, sensor=sensor)
+
+
+def minor_loop_error(model: StageModel, truth: Record) -> float:
+    """Return the error over all minor loops and decaying triangles."""
+    y = np.concatenate([p.y for p in truth])
+    return percent_of_stroke(y, np.concatenate(model.predict(truth).pieces))
+
+
+def seeds_table(stage: SimulatedStage) -> list[str]:
+    """Run all seeds and noise levels on the stage whose thresholds are the model's own."""
+    truth = truth_of(stage, 'validation')
+    lines = [
+        '| noise / stroke | runs | d right | stable | swarm within 1 % | worst error, % of stroke '
+        '| allowed | median error |',
+        '|---|---|---|---|---|---|---|---|',
+    ]
+    for noise in NOISES:
+        noisy = with_noise(stage, noise)
+        found: list[tuple[Identification, float]] = []
+        for seed in tqdm(range(SEEDS), desc=f'noise {noise:g}', disable=not sys.stderr.isatty()):
+            record = record_of(noisy, 'identification', seed)
+            result = identify(record, Settings(seed=seed))
+            worst = max(e.percent for e in sine_errors(result.model, truth))
+            found.append((result, worst))
+        d_right = sum(r.delay.samples == stage.model.delay.samples for r, _ in found)
+        stable = sum(r.model.dynamics.is_stable for r, _ in found)
+        excess = [(r.hysteresis.swarm_loss or 0) / r.hysteresis.optimum_loss - 1 for r, _ in found]
+        worst = [w for _, w in found]
+        lines.append(
+            f'| {noise:g} | {SEEDS} | {d_right} | {stable} | {sum(e < 0.01 for e in excess)} '
+            f'| {max(worst):.4f} | {max(0.02, 200 * noise):.3g} | {np.median(worst):.4f} |'
+        )
+    return lines
+
+
+def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
+    """Compare ten with refined thresholds on both stages."""
+    frequencies = (1, 10, 50, 80, 100, 120)
+    lines = [
+        '| stage | thresholds | ' + ' | '.join(f'{f} Hz' for f in frequencies) + ' | minor loops |',
+        '|---|---|' + '---|' * (len(frequencies) + 1),
+    ]
+    for name, stage in stages.items():
+        record = record_of(stage, 'identification', 0)
+        sines, loops = truth_of(stage, 'validation'), truth_of(stage, 'minor_loops')
+        for refine in (False, True):
+            model = identify(record, Settings(refine=refine)).model
+            rows = [(f'{model.hysteresis.thresholds.size + 1}', model)]
+            if not refine:
+                rows.append(('10, hysteresis alone', model.without_dynamics()))
+            else:
+                rows[0] = (f'refined: {rows[0][0]}', model)
+            for label, m in rows:
+                errors = {round(e.frequency): e.percent for e in sine_errors(m, sines)}
+                cells = ' | '.join(f'{errors[f]:.4f}' for f in frequencies)
+                lines.append(f'| {name} | {label} | {cells} | {minor_loop_error(m, loops):.4f} |')
+    return lines
+
+
+def main() -> None:
+    """Write the study to the file named on the command line."""
+    target = Path(sys.argv[1])
+    paper, dense = (load_stage(find_config(name, 'stage')) for name in ('paper', 'dense'))
+    noise = paper.sensor.noise_rms / abs(paper.model.scaling.Y)
+    text = [
+        '# How well simulated stages are identified',
+        '',
+        'Made by `make study-identification`. Errors are free-run errors against the noise-free',
+        'stage, 100 rms(y - y_hat) / (max y - min y), on motions that were not fitted: the sines',
+        'v = 5 + 5 sin(2 pi f t) in steady state (the first second and at least one period of',
+        'each dropped), and minor loops at three biases with a decaying triangle.',
+        '',
+        f'piezo_ident {__version__}, Python {platform.python_version()}, '
+        f'numpy {np.__version__}, scipy {scipy.__version__}',
+        '',
+        '## Twenty seeds and three noise levels, the paper\'s stage',
+        '',
+        'The flattering case: the truth lies on the model\'s own thresholds. 16-bit converters.',
+        '"Worst error" is the largest over the six sines and all seeds; "swarm" counts the seeds',
+        'whose loss before polishing was within 1 % of bounded least squares.',
+        '',
+        *seeds_table(paper),
+        '',
+        f'## On and off the grid, noise {noise:g} of stroke',
+        '',
+        'The second stage has 40 thresholds that are none of the model\'s. % of stroke.',
+        '',
+        *thresholds_table({'paper (flattering)': paper, '40 thresholds off the grid': dense}),
+        '',
+    ]
+    target.write_text('\n'.join(text), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

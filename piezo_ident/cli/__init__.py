@@ -1,0 +1,251 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The command line: ``piezo_ident VERB ...``.
+
+Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted.
+Nothing heavy is imported before the arguments are understood.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import signal
+import sys
+from typing import NoReturn
+
+from piezo_ident import __version__
+from piezo_ident.errors import PiezoIdentError
+
+__all__ = ['main']
+
+DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage above it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f'{self.prog}: error: {_one_line(message)} (see {self.prog} -h)\n')
+
+
+def _one_line(text: str) -> str:
+    return ' '.join(text.split('\n'))
+
+
+def _whole(text: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = -1
+    if number < 0:
+        raise argparse.ArgumentTypeError(f'{text!r} is no whole number; give 0 or more')
+    return number
+
+
+def _order(text: str) -> tuple[int, int]:
+    parts = text.split(',')
+    if len(parts) != 2:
+        raise argparse.ArgumentTypeError(f'{text!r} is no order; give two numbers, say 10,10')
+    return _whole(parts[0]), _whole(parts[1])
+
+
+def _thresholds(text: str) -> int | None:
+    if text == 'refined':
+        return None
+    try:
+        return _whole(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f'{text!r}: give a number, or refined') from None
+
+
+def _unit(text: str) -> str:
+    # both characters that look like a micro
+    return text.replace('\u00b5', 'u').replace('\u03bc', 'u')
+
+
+def _reading() -> _Parser:
+    """Return the options of every verb that reads records."""
+    options = _Parser(add_help=False)
+    group = options.add_argument_group('how to read records')
+    group.add_argument(
+        '--displacement-unit',
+        type=_unit,
+        choices=('m', 'mm', 'um', 'nm'),
+        default='m',
+        help='unit of y in the files',
+    )
+    group.add_argument(
+        '--voltage-limits',
+        type=float,
+        nargs=2,
+        metavar=('LO', 'HI'),
+        help='refuse records whose voltage leaves these [V]',
+    )
+    group.add_argument('--namespace', help='take the topics of a bag below this namespace')
+    group.add_argument('--voltage-topic', metavar='TOPIC', help='topic of a bag with the voltage')
+    group.add_argument(
+        '--displacement-topic', metavar='TOPIC', help='topic of a bag with the displacement'
+    )
+    return options
+
+
+def _json() -> _Parser:
+    option = _Parser(add_help=False)
+    option.add_argument('--json', action='store_true', help='print the result as JSON, only that')
+    return option
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        'out',
+        type=Path,
+        metavar='OUT',
+        help='.csv, .npz, .mat, .mcap, .db3, or a folder for a rosbag2 bag',
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing OUT')
+    parser.add_argument(
+        '--storage', choices=('mcap', 'sqlite3'), help='of a bag folder (default: mcap)'
+    )
+
+
+def _build_parser() -> _Parser:
+    parser = _Parser(
+        prog='piezo_ident',
+        description='Identifies piezo nanopositioning stages from voltage and displacement.',
+        allow_abbrev=False,
+    )
+    parser.add_argument('--version', action='version', version=f'piezo_ident {__version__}')
+    verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True)
+
+    def verb(name: str, text: str, *parents: _Parser) -> _Parser:
+        return verbs.add_parser(
+            name, help=text, description=f'{text}.', parents=[*parents], allow_abbrev=False
+        )
+
+    p = verb('simulate', 'Make a record with the simulated stage', _json())
+    p.add_argument('--config', default='stage_paper', help='stage: a file, or the name of one')
+    p.add_argument(
+        '--program', default='identification', help='programme: a file, or the name of one'
+    )
+    p.add_argument('--seed', type=_whole, help="of the sensor noise; the stage's own when absent")
+    p.add_argument('--sample-rate', type=float, metavar='HZ', help="the stage's own when absent")
+    _add_output(p)
+
+    p = verb('identify', 'Learn a model from records', _reading(), _json())
+    p.add_argument(
+        'records', nargs='+', type=Path, metavar='RECORD', help='file, bag, or folder of records'
+    )
+    p.add_argument('--model', type=Path, metavar='YAML', help='write the model there')
+    p.add_argument('--report', type=Path, metavar='DIR', help='write tables and pictures there')
+    p.add_argument(
+        '--validation',
+        nargs='+',
+        type=Path,
+        default=[],
+        metavar='RECORD',
+        help='further records: predicted, not fitted',
+    )
+    p.add_argument(
+        '--thresholds',
+        type=_thresholds,
+        default=10,
+        metavar='N|refined',
+        help='number of plays, or chosen by held-out error (default: 10)',
+    )
+    p.add_argument('--solver', choices=('swarm', 'least_squares'), default='swarm')
+    p.add_argument('--order', type=_order, metavar='NA,NB', help='of G; searched when absent')
+    p.add_argument(
+        '--max-order', type=_whole, default=15, metavar='N', help='of the search (default: 15)'
+    )
+    p.add_argument(
+        '--delay', type=_whole, metavar='SAMPLES', help='found from the data when absent'
+    )
+    p.add_argument(
+        '--hold-out', type=float, metavar='SECONDS', help='end of an unlabelled record not fitted'
+    )
+    p.add_argument('--seed', type=_whole, default=0, help='of the swarm (default: 0)')
+
+    p = verb('predict', 'Run a model over a record', _reading(), _json())
+    p.add_argument('model', type=Path, metavar='MODEL', help='model file')
+    p.add_argument('record', type=Path, metavar='RECORD', help='file or bag')
+    p.add_argument(
+        '--out', type=Path, metavar='OUT', help='.csv or .npz with the columns t, v, y, y_hat'
+    )
+    p.add_argument('--plot', type=Path, metavar='PNG', help='picture of measured and predicted')
+
+    p = verb('convert', 'Turn a record into another format', _reading(), _json())
+    p.add_argument('record', type=Path, metavar='IN', help='file or bag')
+    _add_output(p)
+
+    verb('effects', 'List the effects that a model can have', _json())
+
+    p = verb('demo', 'Identify simulated stages, and a measured one if it is there')
+    p.add_argument('--out', type=Path, default=Path('demo_report'), metavar='DIR', help='reports')
+    p.add_argument('--measured', type=Path, metavar='RECORD', help='a measured record')
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process when absent.
+
+    Returns
+    -------
+    int
+        Exit code.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        # a terminal without micro signs gets question marks instead of a traceback
+        if hasattr(stream, 'reconfigure'):
+            stream.reconfigure(errors='replace')
+    try:
+        try:
+            args = _build_parser().parse_args(argv)
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        from piezo_ident.cli import commands
+
+        commands.run(args)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        # a second Ctrl-C has nothing left to stop
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return _stop(INTERRUPTED, 'interrupted; nothing was left half written')
+    except BrokenPipeError:
+        # whoever read has read enough; the interpreter's own flush must not complain
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except PiezoIdentError as error:
+        return _stop(BAD_INPUT, f'error: {error}')
+    except OSError as error:
+        where = f'{error.filename}: ' if error.filename else ''
+        return _stop(BAD_INPUT, f'error: {where}{error.strerror or error}')
+    except MemoryError:
+        return _stop(BAD_INPUT, 'error: out of memory; give fewer or shorter records')
+    return DONE
+
+
+def _stop(code: int, text: str) -> int:
+    sys.stderr.write(f'piezo_ident: {_one_line(text)}\n')
+    return code

@@ -1,0 +1,148 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs, thin over the library."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+import inspect
+from pathlib import Path
+
+import numpy as np
+from piezo_ident.cli.common import check_record_output, read, say_faults, story
+from piezo_ident.cli.console import Console
+from piezo_ident.cli.model_commands import identify_command, predict_command
+from piezo_ident.cli.outputs import check_folder
+from piezo_ident.effects import catalogue
+from piezo_ident.errors import ConfigError
+from piezo_ident.program import load_program
+from piezo_ident.record_io import write_record
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
+
+__all__ = ['run']
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    Do what the arguments ask.
+
+    Raises
+    ------
+    PiezoIdentError
+        With a message that names the file and the cure.
+    """
+    COMMANDS[args.verb](args, Console(getattr(args, 'json', False)))
+
+
+def simulate_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident simulate``."""
+    out: Path = args.out
+    check_record_output(args)
+    files = {}
+    for kind, name in (('stage', args.config), ('program', args.program)):
+        files[kind] = find_config(name, kind)
+        if Path(name).suffix and not Path(name).is_file():
+            console.note(f'{name} is not here; taking the shipped {files[kind]}')
+    stage, program = load_stage(files['stage']), load_program(files['program'])
+    rate = stage.model.sample_rate if args.sample_rate is None else args.sample_rate
+    if not stage.model.is_static and rate != stage.model.sample_rate:
+        raise ConfigError(
+            f'{files["stage"]}: the stage holds for {stage.model.sample_rate:g} Hz, not for '
+            f'{rate:g} Hz; leave out --sample-rate'
+        )
+    seed = stage.seed if args.seed is None else args.seed
+    sequence = program.build(rate)
+    record = simulate(stage, sequence, np.random.default_rng(seed), name=out.name)
+    data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
+    is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
+    losses = write_record(
+        record,
+        out,
+        overwrite=args.overwrite,
+        storage=args.storage,
+        custom_data=data if is_bag else None,
+    )
+    console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, seed {seed}')
+    if not console.as_json:
+        console.say(sequence.describe())
+    say_faults(record, losses, console)
+    warnings = stage.model.extrapolation(record)
+    for warning in warnings:
+        console.say(f'warning: {warning}')
+    console.result(
+        {**data, 'seed': seed, 'out': str(out), **story(record, losses), 'warnings': warnings}
+    )
+
+
+def convert_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident convert``."""
+    check_record_output(args)
+    record = read(args.record, args)
+    losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
+    console.say(
+        f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
+        f'{record.duration:.6g} s'
+    )
+    say_faults(record, losses, console)
+    console.result({'in': str(args.record), 'out': str(args.out), **story(record, losses)})
+
+
+def effects_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident effects``."""
+    data = []
+    for name, effect in sorted(catalogue().items()):
+        about = (inspect.getdoc(effect) or '').partition('\n')[0]
+        console.say(f'{name}  (slot: {effect.slot})\n    {about}')
+        for p in effect.parameters:
+            shape = 'list of ' if p.vector else ''
+            neutral = 'no neutral value' if np.isnan(p.neutral) else f'neutral {p.neutral:g}'
+            console.say(
+                f'    {p.name:15s} {shape}[{p.unit}]  {p.lower:g} .. {p.upper:g}, {neutral}: '
+                f'{p.description}'
+            )
+        parameters = [
+            {
+                'name': p.name,
+                'unit': p.unit,
+                'description': p.description,
+                'neutral': p.neutral,
+                'lower': p.lower,
+                'upper': p.upper,
+                'list': p.vector,
+            }
+            for p in effect.parameters
+        ]
+        data.append({'name': name, 'slot': effect.slot, 'about': about, 'parameters': parameters})
+    console.result(data)
+
+
+def demo_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident demo``."""
+    from piezo_ident.cli.demo import demo
+
+    check_folder(args.out)
+    demo(args.out, args.measured, console)
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], None]] = {
+    'convert': convert_command,
+    'demo': demo_command,
+    'effects': effects_command,
+    'identify': identify_command,
+    'predict': predict_command,
+    'simulate': simulate_command,
+}

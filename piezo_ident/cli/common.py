@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What several commands share: reading records, and saying what was met in them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from piezo_ident.cli.console import Console
+from piezo_ident.cli.outputs import check_file, check_suffix
+from piezo_ident.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.record import Record
+from piezo_ident.record_io import read_record
+
+__all__ = ['check_record_output', 'expand', 'naming', 'read', 'say_faults', 'story']
+
+RECORD_FILES = ('.csv', '.npz', '.mat', '.mcap', '.db3')
+
+
+@contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Put a name before messages that do not say what they are about."""
+    try:
+        yield
+    except PiezoIdentError as error:
+        if name in str(error):
+            raise
+        raise type(error)(f'{name}: {error}') from None
+
+
+def expand(paths: Sequence[Path]) -> list[Path]:
+    """Return the records that are named: a folder that is no bag stands for all in it."""
+    found = []
+    for path in paths:
+        if not path.is_dir() or (path / 'metadata.yaml').is_file():
+            found.append(path)
+            continue
+        inside = [
+            p
+            for p in sorted(path.iterdir())
+            if not p.name.startswith('.')
+            and ((p / 'metadata.yaml').is_file() or (p.is_file() and p.suffix in RECORD_FILES))
+        ]
+        if not inside:
+            raise DataError(
+                f'{path}: a folder without records; give a bag, or a folder with '
+                f'{", ".join(RECORD_FILES)} files'
+            )
+        found += inside
+    return found
+
+
+def read(path: Path, args: argparse.Namespace) -> Record:
+    """Read one record as the options say."""
+    limits = args.voltage_limits
+    if limits is not None and not limits[0] < limits[1]:
+        raise ConfigError(
+            f'--voltage-limits {limits[0]:g} {limits[1]:g}: give the lower one first'
+        )
+    return read_record(
+        path,
+        displacement_unit=args.displacement_unit,
+        voltage_limits=None if limits is None else (limits[0], limits[1]),
+        namespace=args.namespace,
+        voltage_topic=args.voltage_topic,
+        displacement_topic=args.displacement_topic,
+    )
+
+
+def check_record_output(args: argparse.Namespace) -> None:
+    """Refuse an OUT to which no record could be written."""
+    check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
+    check_file(args.out, overwrite=args.overwrite, folder_too=True)
+
+
+def say_faults(record: Record, losses: Sequence[str], console: Console) -> None:
+    """Say what was met in a record, and what the file it was written to cannot keep."""
+    for fault in record.faults:
+        console.say(f'met: {fault}')
+    for loss in losses:
+        console.say(f'not kept: {loss}')
+
+
+def story(record: Record, losses: Sequence[str]) -> dict[str, Any]:
+    """Return for programs what `say_faults` says, and what the record holds."""
+    return {
+        'record': record.name,
+        'pieces': len(record.pieces),
+        'samples': record.n,
+        'duration': record.duration,
+        'sample_rates': list(dict.fromkeys(p.sample_rate for p in record)),
+        'labels': list(record.labels),
+        'faults': [
+            {'name': f.name, 'where': f.where, 'count': f.count, 'action': f.action}
+            for f in record.faults
+        ],
+        'not_kept': list(losses),
+    }

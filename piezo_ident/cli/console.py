@@ -1,0 +1,104 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the commands say: text or JSON on standard output, progress on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+import math
+import shutil
+import sys
+from typing import Any
+
+from piezo_ident.model_io import plain
+from piezo_ident.results import Progress, silent
+
+__all__ = ['Console']
+
+
+class Console:
+    """
+    Standard output and error of one command.
+
+    Parameters
+    ----------
+    as_json : bool
+        Only JSON goes to standard output.
+    """
+
+    def __init__(self, as_json: bool = False) -> None:
+        self.as_json = as_json
+
+    def say(self, text: str = '') -> None:
+        """Write lines for people; nothing in JSON."""
+        if not self.as_json:
+            sys.stdout.write(f'{text}\n')
+            # whoever looks on through a pipe should see it when it is said
+            sys.stdout.flush()
+
+    def note(self, text: str) -> None:
+        """Write a line that belongs to no result."""
+        sys.stderr.write(f'piezo_ident: {text}\n')
+
+    def result(self, data: Any) -> None:
+        """Write the result for programs; nothing as text."""
+        if self.as_json:
+            text = json.dumps(_finite(plain(data)), indent=2, ensure_ascii=False, allow_nan=False)
+            sys.stdout.write(f'{text}\n')
+
+    @contextmanager
+    def progress(self) -> Iterator[Progress]:
+        """Yield what shows the progress: one bar a step on a terminal, nothing elsewhere."""
+        if not sys.stderr.isatty():
+            yield silent
+            return
+        from tqdm import tqdm
+
+        size = shutil.get_terminal_size()
+        bars: dict[str, Any] = {}
+
+        def show(step: str, share: float) -> None:
+            if step not in bars:
+                for bar in bars.values():
+                    bar.close()
+                bars[step] = tqdm(
+                    total=1.0,
+                    desc=f'{step:12s}',
+                    bar_format='{desc} {percentage:3.0f}% |{bar}| {elapsed}',
+                    # a terminal that does not tell its size would get no bar at all
+                    ncols=min(80, size.columns),
+                    nrows=size.lines,
+                    leave=False,
+                    file=sys.stderr,
+                )
+            bar = bars[step]
+            bar.update(max(0.0, min(1.0, share) - bar.n))
+
+        try:
+            yield show
+        finally:
+            for bar in bars.values():
+                bar.close()
+
+
+def _finite(value: Any) -> Any:
+    """Return plain data with None for numbers that JSON cannot write."""
+    if isinstance(value, dict):
+        return {key: _finite(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [_finite(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

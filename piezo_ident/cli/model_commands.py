@@ -1,0 +1,203 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``identify`` and ``predict``: the verbs that make and use a model."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from piezo_ident.cli.common import expand, naming, read, say_faults, story
+from piezo_ident.cli.console import Console
+from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
+from piezo_ident.identification import identify
+from piezo_ident.metrics import FORMULA
+from piezo_ident.model import StageModel
+from piezo_ident.model_io import load_model, save_model
+from piezo_ident.output import temporary_output
+from piezo_ident.prediction import predict_record, RecordPrediction
+from piezo_ident.record import Record
+from piezo_ident.results import Settings
+from piezo_ident.table_io import Table, WRITERS
+
+__all__ = ['identify_command', 'predict_command']
+
+TABLE_FILES = ('.csv', '.npz')
+PICTURES = ('.png', '.pdf', '.svg')
+
+
+def identify_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident identify``."""
+    settings = Settings(
+        thresholds=10 if args.thresholds is None else args.thresholds,
+        refine=args.thresholds is None,
+        solver=args.solver,
+        max_order=args.max_order,
+        order=args.order,
+        delay=args.delay,
+        hold_out=args.hold_out,
+        seed=args.seed,
+    )
+    paths, further = expand(args.records), expand(args.validation)
+    if args.model is not None:
+        check_suffix(args.model, ('.yaml', '.yml'), 'a model')
+        if args.model.parent == args.report:
+            # the report makes the folder first
+            check_folder(args.report)
+        else:
+            check_file(args.model, overwrite=True)
+        check_distinct(args.model, [*paths, *further])
+    if args.report is not None:
+        check_folder(args.report)
+    records = [read(path, args) for path in paths]
+    validation = [read(path, args) for path in further]
+    with naming(', '.join(record.name for record in records)), console.progress() as progress:
+        result = identify(records, settings, progress=progress)
+    checks = [_validate(result.model, record) for record in validation]
+
+    from piezo_ident import report
+
+    page = None
+    if args.report is not None:
+        page = report.write_report(result, [*records, *validation], args.report)
+    if args.model is not None:
+        save_model(result.model, args.model)
+    console.say(report.text_summary(result))
+    for check in checks:
+        console.say()
+        console.say('\n'.join(check.text))
+    if args.model is not None:
+        console.say(f'\nmodel: {args.model}')
+    if page is not None:
+        console.say(f'report: {page}')
+    if args.model is None and page is None:
+        console.say(
+            '\nnothing was written; --model model.yaml keeps the model, --report DIR the tables '
+            'and pictures'
+        )
+    console.result(
+        {
+            **report.to_json(result, records),
+            'validation': [check.data for check in checks],
+            'files': {
+                'model': None if args.model is None else str(args.model),
+                'report': None if page is None else str(page),
+            },
+        }
+    )
+
+
+class _Check:
+    """What a record that was not fitted says about a model, as text and as data."""
+
+    def __init__(self, text: list[str], data: Mapping[str, Any]) -> None:
+        self.text, self.data = text, data
+
+
+def _validate(model: StageModel, record: Record) -> _Check:
+    from piezo_ident.report import table_one
+    from piezo_ident.validation import sine_errors
+
+    free_run = predict_record(model, record)
+    text = [f'{record.name}, not fitted:', *_error_lines(free_run)]
+    sines = sine_errors(model, record) if record.find('sine') else ()
+    if sines:
+        text += ['', *table_one(sines).splitlines()]
+    data = {
+        **_error_data(free_run),
+        'record': record.name,
+        'sines': [asdict(row) for row in sines],
+    }
+    return _Check(text, data)
+
+
+def predict_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident predict``."""
+    for path, suffixes, what in (
+        (args.out, TABLE_FILES, 'a prediction'),
+        (args.plot, PICTURES, 'a picture'),
+    ):
+        if path is not None:
+            check_suffix(path, suffixes, what)
+            check_file(path, overwrite=True)
+            check_distinct(path, [args.model, args.record])
+    model = load_model(args.model)
+    record = read(args.record, args)
+    with naming(str(args.model)):
+        free_run = predict_record(model, record)
+    if args.out is not None:
+        columns = {
+            't': np.concatenate([p.t for p in record]),
+            'v': np.concatenate([p.v for p in record]),
+            'y': np.concatenate([p.y for p in record]),
+            'y_hat': np.concatenate(free_run.prediction.pieces),
+        }
+        with temporary_output(args.out, overwrite=True) as target, target.open('xb') as file:
+            WRITERS[args.out.suffix.lower()](file, Table(columns))
+    if args.plot is not None:
+        from piezo_ident.plots import write_prediction_plot
+
+        write_prediction_plot(record, free_run.prediction, args.plot)
+    console.say(f'{args.model} on {record.name}, free run:')
+    console.say('\n'.join(_error_lines(free_run)))
+    say_faults(record, (), console)
+    for path in (args.out, args.plot):
+        if path is not None:
+            console.say(f'wrote {path}')
+    console.result(
+        {
+            'model': str(args.model),
+            **story(record, ()),
+            **_error_data(free_run),
+            'out': None if args.out is None else str(args.out),
+            'plot': None if args.plot is None else str(args.plot),
+        }
+    )
+
+
+def _error_lines(free_run: RecordPrediction) -> list[str]:
+    lines = []
+    rows = [('whole record', free_run.whole)]
+    if any(free_run.estimated):
+        if free_run.after is None:
+            lines.append('  no sample at which the start is forgotten: drive a wider range')
+        else:
+            rows.append(('start forgotten', free_run.after))
+    table = [
+        f'  {name:16s} {e.percent:8.3f} % of stroke   fit {e.fit:7.2f} %   {e.n} samples'
+        for name, e in rows
+    ]
+    return [
+        *table,
+        *lines,
+        f'  % of stroke = {FORMULA}; fit = 100 (1 - |y - y_hat| / |y - mean y|)',
+        *(f'  warning: {warning}' for warning in free_run.prediction.warnings),
+    ]
+
+
+def _error_data(free_run: RecordPrediction) -> dict[str, Any]:
+    def row(errors: Any) -> dict[str, Any]:
+        return {'percent_of_stroke': errors.percent, 'fit_percent': errors.fit, 'n': errors.n}
+
+    return {
+        'formula': FORMULA,
+        'whole': row(free_run.whole),
+        'start_forgotten': None if free_run.after is None else row(free_run.after),
+        'memory_estimated': list(free_run.estimated),
+        'warnings': list(free_run.prediction.warnings),
+    }

@@ -1,0 +1,118 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Places for results are tried before the long work begins, not after it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+import tempfile
+
+from piezo_ident.errors import ConfigError, DataError
+
+__all__ = ['check_distinct', 'check_file', 'check_folder', 'check_suffix']
+
+
+def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
+    """
+    Refuse a suffix that names no format.
+
+    Raises
+    ------
+    ConfigError
+    """
+    known = list(suffixes)
+    if path.suffix.lower() not in known:
+        names = ', '.join(s or 'a folder' for s in known)
+        raise ConfigError(
+            f'{path}: {what} cannot be written as {path.suffix or "a folder"}; choose {names}'
+        )
+
+
+def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
+    """
+    Refuse an output that could not be written in the end.
+
+    Parameters
+    ----------
+    path : path
+    overwrite : bool
+        Whether an existing one may be replaced.
+    folder_too : bool
+        Whether the output may be a folder (a bag).
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        if path.is_dir() and not folder_too:
+            raise DataError(f'{path}: is a folder; name a file')
+        if path.is_dir() and not (path / 'metadata.yaml').is_file():
+            raise DataError(f'{path}: is a folder and no bag; choose another name')
+        if path.exists() and not (path.is_dir() or path.is_file()):
+            raise DataError(f'{path}: is a device, no file; choose another name')
+        if (path.exists() or path.is_symlink()) and not overwrite:
+            raise DataError(f'{path}: exists already; choose another name or add --overwrite')
+        if not path.parent.exists():
+            raise DataError(f'{path}: there is no folder {path.parent}; make it first')
+        _try(path.parent)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def check_folder(path: Path) -> None:
+    """
+    Refuse a folder in which files could not be written in the end; it need not exist yet.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        if path.exists() and not path.is_dir():
+            raise DataError(f'{path}: is a file; name a folder')
+        here = path.absolute()
+        while not here.exists():
+            here = here.parent
+        _try(here)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
+    """
+    Refuse to write a result over what it is made of.
+
+    Raises
+    ------
+    DataError
+    """
+    if output.exists() and any(p.exists() and output.samefile(p) for p in inputs):
+        raise DataError(f'{output}: is one of the inputs; choose another name')
+
+
+def _try(folder: Path) -> None:
+    # root passes every permission bit, and a read-only file system shows only when written to
+    with tempfile.TemporaryFile(dir=folder, prefix='.piezo_ident.'):
+        pass
+
+
+def _unwritable(path: Path, error: OSError) -> DataError:
+    reason = error.strerror or str(error)
+    return DataError(
+        f'{path}: cannot be written ({reason}); choose a folder that exists, with room and the '
+        'right to write'
+    )

@@ -1,0 +1,386 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Pictures of what the three steps found: delay, frequency response, orders, weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.delay import delay_from_steps, StepDelay
+from piezo_ident.plots.style import (
+    COLOURS,
+    figure,
+    GREY,
+    legend,
+    NORMAL,
+    NothingToDraw,
+    plain_log,
+    SMALL,
+    tidy,
+)
+from piezo_ident.results import Identification
+from piezo_ident.validation import FreeRun
+
+__all__ = ['delay_figure', 'orders_figure', 'response_figure', 'weights_figure']
+
+#: samples shown ahead of a step, and behind it
+BEFORE, AFTER = 15, 40
+#: an error this many times the best ends the colour scale of the orders
+WORST = 10.0
+#: at most so many modes are named in a frequency response, the least damped ones
+MODES = 4
+
+
+def delay_figure(identification: Identification, runs: Sequence[FreeRun] = ()) -> Figure:
+    """
+    Draw the averaged step response with the delay, and the scan of the ARX loss.
+
+    Parameters
+    ----------
+    identification : Identification
+    runs : sequence of FreeRun, optional
+        For what the model makes of the same steps.
+
+    Raises
+    ------
+    NothingToDraw
+        Without steps and without scan.
+    """
+    result = identification.delay
+    step = result.step if result.step is not None and result.step.repeats else None
+    if step is None and result.loss is None:
+        if result.source == 'given':
+            raise NothingToDraw('the delay was given, not measured')
+        raise NothingToDraw('no steps and no noise segment to read a delay from')
+    panels = 2 * (step is not None) + (result.loss is not None)
+    fig = figure(2.7)
+    axes = fig.subplots(1, panels, squeeze=False)[0]
+    if step is not None:
+        _draw_step(axes[:2], identification, step, _model_step(step, runs))
+    if result.loss is not None:
+        _draw_scan(axes[-1], result.loss, result.scan, result.samples)
+    for letter, each in zip('abc', axes, strict=False):
+        each.set_title(f'({letter}) {each.get_title(loc="left")}', fontsize=NORMAL, loc='left')
+    return fig
+
+
+def _model_step(step: StepDelay, runs: Sequence[FreeRun]) -> NDArray[np.float64] | None:
+    """Return the model's averaged response to the same steps, if they are all there."""
+    before, after = -int(step.lag[0]), int(step.lag[-1]) + 1
+    for labelled in (True, False):
+        pieces = []
+        for run in runs:
+            predicted = replace(run.piece, y=run.y_hat)
+            if labelled:
+                pieces += [predicted.cut(s.start, s.stop) for s in predicted.find('step')]
+            else:
+                pieces.append(predicted)
+        if pieces:
+            found = delay_from_steps(pieces, before, after)
+            if found.repeats == step.repeats:
+                return found.response
+    return None
+
+
+def _draw_step(
+    panels: Sequence[Axes],
+    identification: Identification,
+    step: StepDelay,
+    modelled: NDArray[np.float64] | None,
+) -> None:
+    """Draw the response, and beside it the moment at which it leaves the noise."""
+    rate, d = identification.model.sample_rate, identification.delay.samples
+    level, y = 1e9 * step.threshold, 1e9 * step.response
+    show = (step.lag >= -BEFORE) & (step.lag <= max(AFTER, 2 * d))
+    near = (step.lag >= d - 10) & (step.lag <= d + 10)
+    # a logarithm shows the noise and the first sample above it side by side
+    floor = 0.02 * level
+    for axes, which, size in ((panels[0], show, False), (panels[1], near, True)):
+        lag, response = step.lag[which], y[which]
+        traces = [response] if modelled is None else [response, 1e9 * modelled[which]]
+        if size:
+            traces = [np.maximum(np.abs(x), floor) for x in traces]
+        axes.axhspan(
+            floor if size else -level,
+            level,
+            color=COLOURS['band'],
+            label='noise threshold',
+            zorder=1,
+            linewidth=0,
+        )
+        axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2, label=f'd = {d}')
+        if modelled is not None:
+            axes.plot(lag, traces[1], color=COLOURS['model'], linewidth=1.2, label='model')
+        axes.plot(lag, traces[0], 'o', color=COLOURS['measured'], markersize=2.8, label='measured')
+        axes.margins(x=0.03)
+    panels[1].set_yscale('log')
+    top = float(np.abs(y[near]).max(initial=0.0))
+    if top > floor > 0.0:
+        panels[1].set_ylim(floor, 2.0 * top)
+        plain_log(panels[1].yaxis, floor, 2.0 * top)
+    steps = 'one step' if step.repeats == 1 else f'average of {step.repeats} steps'
+    tidy(panels[0], 'samples after the step', 'response / nm V$^{-1}$', steps)
+    tidy(panels[1], 'samples after the step', '', f'its size; d = {_time(d / rate)}')
+    panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend(panels[0], loc='best')
+
+
+def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: int) -> None:
+    d = np.arange(loss.size)
+    axes.semilogy(d, loss / loss.min(), 'o-', color=COLOURS['measured'], markersize=3, linewidth=1)
+    axes.axvline(chosen, color=COLOURS['mark'], linewidth=1.4, label=f'used: {chosen}')
+    if scan is not None and scan != chosen:
+        axes.axvline(
+            scan, color=COLOURS['static'], linestyle='--', linewidth=1.2, label=f'scan: {scan}'
+        )
+    tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the noise')
+    plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend(axes, loc='best')
+
+
+def _time(seconds: float) -> str:
+    return f'{1e6 * seconds:.4g} µs' if seconds < 1e-3 else f'{1e3 * seconds:.4g} ms'
+
+
+def response_figure(identification: Identification) -> Figure:
+    """
+    Draw the frequency response, measured and modelled, with its coherence.
+
+    Raises
+    ------
+    NothingToDraw
+        When G = 1 and no noise was measured.
+    """
+    model, dynamics = identification.model, identification.dynamics
+    measured = dynamics.response
+    static = model.dynamics.a.size == 0 and model.dynamics.b.size == 1
+    if measured is None and static:
+        raise NothingToDraw('no noise segment, and no dynamics were identified')
+    rate = model.sample_rate
+    top = 0.5 * rate if measured is None else float(measured.frequency[-1])
+    low = top / 300.0 if measured is None else float(measured.frequency[0])
+    f = np.geomspace(low, top, 800)
+    slope, unit = 1.0, '/ static'
+    if measured is not None:
+        slope = dynamics.slope_model
+        if not np.isfinite(slope):
+            slope = dynamics.slope_measured
+        slope *= 1e6 * abs(model.scaling.Y) / model.scaling.V
+        unit = '/ µm V$^{-1}$'
+
+    def modelled(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        lag = np.exp(-2j * np.pi * frequency * model.delay.total / rate)
+        return slope * model.dynamics.response(frequency, rate) * lag
+
+    G = modelled(f)
+    phase = np.degrees(np.unwrap(np.angle(G)))
+    fig = figure(4.9 if measured is not None else 3.6)
+    heights = [2.0, 1.5, 0.9] if measured is not None else [2.0, 1.5]
+    axes = fig.subplots(
+        len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights}, squeeze=False
+    )[:, 0]
+    if measured is not None:
+        size = 1e6 * abs(model.scaling.Y) / model.scaling.V
+        R, std = size * measured.response, np.minimum(measured.std, 0.99)
+        # the turn that lies nearest to the model: noise cannot make it slip by a whole one
+        at = modelled(measured.frequency)
+        turns = np.degrees(np.angle(R / at)) + np.interp(measured.frequency, f, phase)
+        band = {'color': COLOURS['band'], 'linewidth': 0, 'zorder': 1}
+        x = measured.frequency
+        axes[0].fill_between(
+            x, np.abs(R) * (1 - std), np.abs(R) * (1 + std), label='± 1 standard dev.', **band
+        )
+        axes[1].fill_between(x, turns - np.degrees(std), turns + np.degrees(std), **band)
+        dots = {'color': COLOURS['measured'], 'markersize': 1.8, 'linestyle': 'none'}
+        axes[0].plot(x, np.abs(R), marker='o', label='measured', **dots)
+        axes[1].plot(x, turns, marker='o', **dots)
+        axes[2].plot(x, measured.coherence, color=COLOURS['measured'], linewidth=0.9)
+        axes[2].set_ylim(-0.02, 1.05)
+    axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model')
+    axes[1].plot(f, phase, color=COLOURS['model'], linewidth=1.4)
+    tidy(axes[0], '', f'magnitude {unit}')
+    tidy(axes[1], '', 'phase / °')
+    if measured is not None:
+        tidy(axes[2], '', 'coherence')
+        axes[2].yaxis.set_major_locator(MaxNLocator(3))
+    plain_log(axes[0].yaxis, *axes[0].get_ylim())
+    plain_log(axes[-1].xaxis, low, top)
+    axes[-1].set_xlabel('frequency / Hz', fontsize=NORMAL)
+    axes[-1].set_xlim(0.9 * low, 1.05 * top)
+    legend(axes[0], loc='lower left')
+    _mark_modes(axes, [m for m in model.dynamics.modes(rate) if low < m[0] < top])
+    fig.align_ylabels(list(axes))
+    return fig
+
+
+def _mark_modes(axes: Sequence[Axes], modes: list[tuple[float, float]]) -> None:
+    lightest = sorted(sorted(modes, key=lambda mode: mode[1])[:MODES])
+    for frequency, damping in lightest:
+        if damping > 0.5:
+            continue
+        for each in axes:
+            each.axvline(frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1)
+        axes[0].annotate(
+            f'{frequency:.0f} Hz',
+            (frequency, 1.0),
+            xycoords=('data', 'axes fraction'),
+            xytext=(0, 2),
+            textcoords='offset points',
+            ha='left',
+            va='bottom',
+            rotation=30,
+            rotation_mode='anchor',
+            fontsize=SMALL,
+            color=COLOURS['mark'],
+        )
+
+
+def orders_figure(identification: Identification) -> Figure:
+    """
+    Draw the held-out error of every order, with the chosen one and what the criteria prefer.
+
+    Raises
+    ------
+    NothingToDraw
+        When no table of orders was made, or it is a single line.
+    """
+    table = identification.dynamics.table
+    if table is None:
+        raise NothingToDraw('orders are compared on a noise segment, and there is none')
+    if min(table.held_out.shape) < 2 or not np.isfinite(table.held_out).any():
+        raise NothingToDraw('a single order was tried')
+    best = float(np.min(table.held_out))
+    if best <= 0.0:
+        raise NothingToDraw('the held-out error is zero')
+    ratio = np.where(np.isfinite(table.held_out), table.held_out / best, np.nan)
+    fig = figure(4.4, 5.0)
+    axes = fig.subplots()
+    axes.set_facecolor('#D9D9D9')
+    image = axes.imshow(
+        np.ma.masked_invalid(ratio),
+        origin='lower',
+        norm=LogNorm(1.0, WORST),
+        cmap=_lightness(),
+        extent=(0.5, ratio.shape[1] + 0.5, 0.5, ratio.shape[0] + 0.5),
+        interpolation='nearest',
+        aspect='auto',
+    )
+    tidy(axes, 'nb', 'na')
+    axes.grid(False)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+    chosen = identification.dynamics.order
+    # markers of different shape and size, so that criteria that agree are all seen
+    marks = {
+        f'chosen ({chosen[0]}, {chosen[1]})': (chosen, 's', 13.0, COLOURS['static'], 2.0),
+        'least held-out error': (table.best('held_out'), 'o', 9.0, COLOURS['measured'], 1.3),
+        'least AIC': (table.best('aic'), '^', 6.0, COLOURS['measured'], 1.0),
+        'least FPE': (table.best('fpe'), 'v', 6.0, COLOURS['measured'], 1.0),
+        'least BIC': (table.best('bic'), 'x', 6.0, COLOURS['measured'], 1.5),
+    }
+    for name, ((na, nb), shape, size, colour, edge) in marks.items():
+        axes.plot(
+            nb,
+            na,
+            shape,
+            markersize=size,
+            markerfacecolor='none',
+            markeredgecolor=colour,
+            markeredgewidth=edge,
+            linestyle='none',
+            label=name,
+            clip_on=False,
+        )
+    bar = fig.colorbar(image, ax=axes, extend='max', shrink=0.9)
+    bar.set_ticks([1, 2, 5, 10], labels=['1', '2', '5', '10'])
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(labelsize=SMALL)
+    bar.set_label('held-out free-run error / smallest', fontsize=NORMAL)
+    axes.legend(
+        fontsize=SMALL,
+        frameon=False,
+        loc='lower center',
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=2,
+        handletextpad=0.4,
+        columnspacing=1.2,
+    )
+    return fig
+
+
+def _lightness() -> ListedColormap:
+    """Return a map of one hue, light where the error is small, so that marks are seen on it."""
+    share = np.linspace(0.0, 1.0, 256)[:, None]
+    light, dark = np.array([[0.97, 0.98, 1.0]]), np.array([[0.03, 0.19, 0.42]])
+    return ListedColormap(np.clip(light + (dark - light) * share**0.8, 0.0, 1.0), 'lightness')
+
+
+def weights_figure(identification: Identification) -> Figure:
+    """
+    Draw the weights of the plays over their thresholds, with their standard deviations.
+
+    Raises
+    ------
+    NothingToDraw
+        When the model has no plays.
+    """
+    model, std = identification.model, identification.hysteresis.std
+    h = model.hysteresis
+    if h.thresholds.size == 0:
+        raise NothingToDraw('the hysteresis has no plays')
+    r = h.thresholds * model.scaling.V
+    fig = figure(2.8)
+    axes = fig.subplots()
+    gaps = np.diff(np.concatenate([[0.0], r]))
+    axes.bar(
+        r,
+        h.weights,
+        width=0.7 * float(gaps.min()),
+        color=COLOURS['model'],
+        yerr=std[: r.size] if std.size >= r.size else None,
+        error_kw={'ecolor': COLOURS['measured'], 'elinewidth': 1.0, 'capsize': 2.5},
+    )
+    bound = h.weights == 0.0
+    if bound.any():
+        axes.plot(
+            r[bound],
+            np.zeros(int(bound.sum())),
+            'o',
+            markersize=4,
+            markerfacecolor='white',
+            markeredgecolor=GREY,
+            label='on the bound q = 0',
+            clip_on=False,
+            zorder=4,
+        )
+        legend(axes)
+    tidy(axes, 'threshold r / V', 'weight q (normalised)')
+    axes.set_title(
+        f'plus  $p_1 v^3 + p_2 v$  with  $p_1 = {h.p1:.4f}$,  $p_2 = {h.p2:.4f}$',
+        fontsize=NORMAL,
+        loc='left',
+    )
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    axes.set_xlim(left=0.0)
+    axes.grid(False, axis='x')
+    return fig

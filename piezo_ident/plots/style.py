@@ -1,0 +1,200 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How the pictures look: colours, fonts, axes, and long traces without losing their extremes.
+
+Everything is set on the objects themselves: neither pyplot nor the global settings are touched,
+so pictures can be drawn from any thread and beside a lab's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    'COLOURS',
+    'NothingToDraw',
+    'Picture',
+    'envelope',
+    'figure',
+    'legend',
+    'legend_above',
+    'line',
+    'note',
+    'plain_log',
+    'safe',
+    'tidy',
+]
+
+# Okabe and Ito's palette: told apart with every common colour vision, and by lightness in grey
+BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
+GREEN, ORANGE, SKY, PURPLE = '#009E73', '#E69F00', '#56B4E9', '#CC79A7'
+GREY = '#7A7A7A'
+
+#: who is drawn how, in every picture; 'under' is the measured trace below that of the model
+COLOURS = {
+    'measured': BLACK,
+    'under': '#B0B0B0',
+    'model': BLUE,
+    'model held out': GREEN,
+    'static': VERMILION,
+    'held out': '#FFF3D6',
+    'band': '#C9C9C9',
+    'mark': GREEN,
+}
+
+#: text width of an A4 page [inch]; pictures are drawn at the size at which they are read
+WIDTH = 7.0
+#: [points]
+SMALL, NORMAL = 8.0, 9.0
+#: points of one trace; two a pixel column are enough to show every extreme
+POINTS = 3000
+
+
+class NothingToDraw(Exception):
+    """The data hold nothing for a picture; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """
+    A drawn picture.
+
+    Attributes
+    ----------
+    name : str
+        File name without its ending.
+    title, caption : str
+    figure : matplotlib.figure.Figure
+    """
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+
+
+def safe(text: str) -> str:
+    """Return text that shows as it is: no mathematics, no control characters, not too long."""
+    shown = ''.join(c if c.isprintable() else '?' for c in text)
+    if len(shown) > 60:
+        shown = shown[:57] + '...'
+    return shown.replace('$', r'\$')
+
+
+def figure(height: float, width: float = WIDTH) -> Figure:
+    """Return an empty white figure [inch] that keeps its labels apart."""
+    return Figure(figsize=(width, height), layout='constrained', facecolor='white')
+
+
+def tidy(axes: Axes, xlabel: str = '', ylabel: str = '', title: str = '') -> Axes:
+    """Label an axes and take away what carries no information."""
+    axes.set_xlabel(xlabel, fontsize=NORMAL)
+    axes.set_ylabel(ylabel, fontsize=NORMAL)
+    if title:
+        axes.set_title(title, fontsize=NORMAL, loc='left')
+    axes.tick_params(which='both', labelsize=SMALL, direction='out')
+    axes.xaxis.get_offset_text().set_fontsize(SMALL)
+    axes.yaxis.get_offset_text().set_fontsize(SMALL)
+    for side in ('top', 'right'):
+        axes.spines[side].set_visible(False)
+    axes.grid(True, which='major', color='#E6E6E6', linewidth=0.6)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """Add a legend where it covers the least."""
+    given: dict[str, Any] = {'fontsize': SMALL, 'frameon': True, 'framealpha': 0.85}
+    axes.legend(**{**given, 'edgecolor': 'none', 'borderpad': 0.3, **options})
+
+
+def envelope(y: NDArray[np.float64], points: int = POINTS) -> NDArray[np.int64]:
+    """
+    Return the samples that have to be drawn for a trace to show every extreme.
+
+    Parameters
+    ----------
+    y : ndarray, shape (n,)
+    points : int, optional
+        Most samples to return, about.
+
+    Returns
+    -------
+    ndarray of int
+        All samples of a short trace; of a long one the smallest and the largest of each stretch.
+    """
+    if y.size <= points:
+        return np.arange(y.size)
+    stretch = -(-2 * y.size // points)
+    whole = y.size // stretch * stretch
+    rows = y[:whole].reshape(-1, stretch)
+    first = np.arange(rows.shape[0]) * stretch
+    found = [first + rows.argmin(axis=1), first + rows.argmax(axis=1)]
+    if whole < y.size:
+        rest = y[whole:]
+        found.append(whole + np.array([rest.argmin(), rest.argmax()]))
+    return np.unique(np.concatenate([*found, [0, y.size - 1]]))
+
+
+def line(
+    axes: Axes,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    colour: str,
+    label: str | None = None,
+    **options: Any,
+) -> None:
+    """Draw a trace by its envelope, shapes (n,)."""
+    k = envelope(y)
+    axes.plot(x[k], y[k], color=colour, label=label, **{'linewidth': 1.0, **options})
+
+
+def plain_log(axis: Axis, low: float, high: float) -> None:
+    """Write plain numbers on a logarithmic axis, as many as its range [low, high] has room for."""
+    decades = np.log10(high / low)
+    subs = (1.0,) if decades > 3.0 else (1.0, 2.0, 5.0)
+    if decades < 0.5:
+        subs = tuple(float(k) for k in range(1, 10))
+    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axis.set_minor_locator(LogLocator(subs=tuple(float(k) for k in range(1, 10)), numticks=20))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def note(axes: Axes, text: str) -> None:
+    """Write a remark above the right end of an axes, where it covers no data."""
+    axes.set_title(text, fontsize=SMALL, loc='right', color='#444444', pad=3.0)
+
+
+def legend_above(axes: Axes) -> None:
+    """Add a legend in one line above the left end of an axes."""
+    legend(
+        axes,
+        loc='lower left',
+        bbox_to_anchor=(0.0, 0.98),
+        ncols=4,
+        borderaxespad=0.0,
+        handlelength=1.6,
+        columnspacing=1.4,
+    )

@@ -1,0 +1,132 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A recorded drive through a model: free run, with the unknown start estimated, and its errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import ModelError
+from piezo_ident.memory import fit_memory, forgotten, is_at_rest
+from piezo_ident.metrics import fit_percent, percent_of_stroke
+from piezo_ident.model import Prediction, StageModel
+from piezo_ident.record import Record
+
+__all__ = ['RecordErrors', 'RecordPrediction', 'predict_record']
+
+
+@dataclass(frozen=True)
+class RecordErrors:
+    """
+    How far a free run is from the measurement.
+
+    Attributes
+    ----------
+    n : int
+        Samples judged.
+    percent : float
+        `piezo_ident.metrics.percent_of_stroke`, by the stroke of the whole record.
+    fit : float
+        `piezo_ident.metrics.fit_percent`.
+    """
+
+    n: int
+    percent: float
+    fit: float
+
+
+@dataclass(frozen=True, eq=False)
+class RecordPrediction:
+    """
+    Free run over a record.
+
+    Attributes
+    ----------
+    prediction : Prediction
+        With what a reader has to know before trusting it.
+    estimated : tuple of bool
+        For each piece, whether its memory at the start was estimated from its early part.
+    whole : RecordErrors
+        Of every sample.
+    after : RecordErrors or None
+        Of the samples at which the start is forgotten, or was known; None when there are none.
+    """
+
+    prediction: Prediction
+    estimated: tuple[bool, ...]
+    whole: RecordErrors
+    after: RecordErrors | None
+
+
+def predict_record(model: StageModel, record: Record) -> RecordPrediction:
+    """
+    Predict a record in free run.
+
+    A piece that does not start at the lowest voltage starts from an unknown memory, which is
+    estimated from its early part; the error behind that part is the one that nothing was fitted
+    to.
+
+    Parameters
+    ----------
+    model : StageModel
+    record : Record
+        Its displacement serves only the estimate and the errors.
+
+    Raises
+    ------
+    ModelError
+        When a piece has another sampling rate than the model.
+    """
+    for piece in record:
+        try:
+            model.check_rate(piece)
+        except ModelError as error:
+            raise ModelError(f'{record.name}: {error}') from None
+    estimated = tuple(not is_at_rest(model, piece) for piece in record)
+    memories = tuple(
+        fit_memory(model, piece) if unknown else None
+        for piece, unknown in zip(record, estimated, strict=True)
+    )
+    prediction = model.predict(record, memories)
+    if any(estimated):
+        said = (
+            f'{record.name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
+            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start was '
+            'estimated from their early part'
+        )
+        prediction = replace(prediction, warnings=(said, *prediction.warnings))
+    late = []
+    for piece, unknown in zip(record, estimated, strict=True):
+        mask = np.ones(piece.n, dtype=bool)
+        if unknown:
+            mask[: forgotten(piece.v)] = False
+            # a voltage that rests forgets nothing
+            mask &= np.ptp(piece.v) > 0.0
+        late.append(mask)
+    y = np.concatenate([piece.y for piece in record])
+    y_hat = np.concatenate(prediction.pieces)
+    mask = np.concatenate(late)
+    return RecordPrediction(
+        prediction=prediction,
+        estimated=estimated,
+        whole=_errors(y, y_hat, record.stroke),
+        after=_errors(y[mask], y_hat[mask], record.stroke) if mask.any() else None,
+    )
+
+
+def _errors(y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float) -> RecordErrors:
+    return RecordErrors(y.size, percent_of_stroke(y, y_hat, stroke), fit_percent(y, y_hat))

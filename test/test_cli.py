@@ -1,0 +1,584 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command line: every verb works, and whatever a user gets wrong ends in one line."""
+
+from collections.abc import Callable, Iterator
+import contextlib
+import json
+import os
+from pathlib import Path
+import pty
+import signal
+import sqlite3
+import subprocess
+import sys
+
+import numpy as np
+from piezo_ident import __version__
+from piezo_ident.cli import main
+from piezo_ident.cli.demo import find_measured
+from piezo_ident.cli.outputs import check_file, check_folder
+from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.model_io import load_model
+from piezo_ident.record import Piece, Record
+from piezo_ident.record_io import read_record, write_record
+from piezo_ident.shipped import find_config, shipped_names
+import pytest
+import yaml
+
+# a stage with one slow mode at 2 kHz, so that an identification takes a moment only
+STAGE = """\
+schema_version: 1
+sample_rate: 2000.0
+input: {v0: 0.0, V: 10.0, range: [0.0, 10.0]}
+output: {y0: 0.0, Y: 75.0e-6}
+delay: {samples: 2}
+hysteresis: {thresholds: [0.2, 0.4, 0.6], weights: [0.3, 0.2, 0.1], p1: -0.2, p2: 0.9}
+dynamics: {a: [-1.2, 0.5], b: [0.2, 0.1]}
+sensor: {noise_rms: 1.0e-9}
+seed: 7
+"""
+PROGRAM = """\
+limits: [0, 10]
+seed: 1
+segments:
+  - {signal: idle, duration: 0.3}
+  - {signal: step, bias: 5, size: 1, hold: 0.06, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 12, frequency: 20}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 600, duration: 3}
+  - {signal: triangle, slope: 10}
+  - {signal: idle, duration: 0.3}
+"""
+SINE = """\
+limits: [0, 10]
+segments:
+  - {signal: sine, bias: 5, amplitude: 5, frequency: 5, duration: 2}
+"""
+FAST = ['--order', '2,2', '--thresholds', '5', '--solver', 'least_squares']
+
+
+def run(capsys, *argv: object) -> tuple[int, str, str]:
+    code = main([str(a) for a in argv])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def succeed(capsys, *argv: object) -> str:
+    code, out, err = run(capsys, *argv)
+    assert (code, err) == (0, '')
+    return out
+
+
+def refuse(capsys, folder: Path, argv: list[object], *words: object) -> str:
+    """Run a command that cannot work: one line, exit code 2, and nothing new on disk."""
+    before = sorted(folder.rglob('*'))
+    code, out, err = run(capsys, *argv)
+    assert code == 2, out
+    assert out == ''
+    assert err.count('\n') == 1, err
+    assert err.endswith('\n')
+    assert err.startswith('piezo_ident')
+    assert 'Traceback' not in err
+    for word in words:
+        assert str(word) in err
+    assert sorted(folder.rglob('*')) == before
+    return err
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory) -> Path:
+    """Return a folder with a stage, its record, a record of a sine and the model."""
+    folder = tmp_path_factory.mktemp('made')
+    (folder / 'stage.yaml').write_text(STAGE)
+    (folder / 'program.yaml').write_text(PROGRAM)
+    (folder / 'sine.yaml').write_text(SINE)
+    for program, out in (('program.yaml', 'record.npz'), ('sine.yaml', 'sine.csv')):
+        files = ['--config', folder / 'stage.yaml', '--program', folder / program, folder / out]
+        assert main(['simulate', *map(str, files)]) == 0
+    argv = ['identify', folder / 'record.npz', '--model', folder / 'model.yaml', *FAST]
+    assert main([str(a) for a in argv]) == 0
+    return folder
+
+
+# --- the way it is meant --------------------------------------------------------------------
+
+
+def test_version_and_help(capsys):
+    assert succeed(capsys, '--version') == f'piezo_ident {__version__}\n'
+    text = succeed(capsys, '--help')
+    for verb in ('simulate', 'identify', 'predict', 'convert', 'effects', 'demo'):
+        assert verb in text
+        assert verb in succeed(capsys, verb, '--help')
+
+
+def test_heavy_libraries_wait_for_the_arguments():
+    code = (
+        'import sys; from piezo_ident.cli import main; main(["--version"]); '
+        'print([m for m in ("numpy", "scipy", "numba", "matplotlib") if m in sys.modules])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[1] == '[]'
+
+
+def test_the_module_runs_as_a_program():
+    done = subprocess.run(
+        [sys.executable, '-m', 'piezo_ident', 'simulate', 'no.xyz'], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith('piezo_ident: error: no.xyz')
+    assert done.stderr.count('\n') == 1
+
+
+def test_effects(capsys):
+    text = succeed(capsys, 'effects')
+    data = json.loads(succeed(capsys, 'effects', '--json'))
+    assert {'creep', 'thermal_drift'} <= {e['name'] for e in data}
+    for effect in data:
+        assert effect['name'] in text
+        assert effect['about'] in text
+        assert effect['slot'] in ('input', 'hysteresis', 'hidden', 'output', 'acquisition')
+        for p in effect['parameters']:
+            assert p['lower'] < p['upper']
+            assert p['name'] in text
+
+
+def test_simulate_is_repeatable_and_its_seed_counts(capsys, tmp_path, made):
+    def simulated(name: str, *more: object) -> np.ndarray:
+        out = tmp_path / name
+        files = ['--config', made / 'stage.yaml', '--program', made / 'sine.yaml']
+        succeed(capsys, 'simulate', *files, *more, out)
+        return read_record(out).pieces[0].y
+
+    first = simulated('a.csv')
+    np.testing.assert_array_equal(simulated('b.mat'), first)
+    np.testing.assert_array_equal(simulated('c.db3', '--seed', 7), first)
+    assert np.any(simulated('d', '--seed', 8) != first)
+
+
+def test_simulate_json(capsys, tmp_path, made):
+    files = ['--config', made / 'stage.yaml', '--program', made / 'program.yaml']
+    data = json.loads(succeed(capsys, 'simulate', *files, '--json', tmp_path / 'r.npz'))
+    assert data['seed'] == 7
+    assert data['samples'] == read_record(tmp_path / 'r.npz').n
+    assert {'noise', 'triangle', 'step'} <= set(data['labels'])
+
+
+def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made):
+    model = load_model(made / 'model.yaml')
+    assert model.delay.samples == 2
+    out, picture = tmp_path / 'y.csv', tmp_path / 'y.png'
+    argv = ['predict', made / 'model.yaml', made / 'sine.csv', '--out', out, '--plot', picture]
+    text = succeed(capsys, *argv)
+    assert '% of stroke' in text
+    assert 'rms(y - y_hat)' in text
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    table = np.genfromtxt(out, delimiter=',', names=True)
+    assert table.dtype.names == ('t', 'v', 'y', 'y_hat')
+    piece = read_record(made / 'sine.csv').pieces[0]
+    np.testing.assert_array_equal(table['y'], piece.y)
+    np.testing.assert_array_equal(table['y_hat'], model.predict_piece(piece))
+    data = json.loads(succeed(capsys, *argv[:3], '--json', '--out', tmp_path / 'y.npz'))
+    error = 100 * np.sqrt(np.mean((table['y'] - table['y_hat']) ** 2)) / np.ptp(table['y'])
+    assert data['whole']['percent_of_stroke'] == pytest.approx(error, rel=1e-9)
+    # thresholds of the truth lie on the grid of the fit, so little but noise is left
+    assert error < 0.2
+    assert data['memory_estimated'] == [False]
+    assert data['warnings'] == []
+    with np.load(tmp_path / 'y.npz') as archive:
+        np.testing.assert_array_equal(archive['y_hat'], table['y_hat'])
+
+
+def test_predict_estimates_an_unknown_start_and_says_so(capsys, tmp_path, made):
+    piece = read_record(made / 'sine.csv').pieces[0]
+    cut = Record((piece.cut(piece.n // 2 + 130, piece.n),))
+    write_record(cut, tmp_path / 'cut.npz')
+    argv = ['predict', made / 'model.yaml', tmp_path / 'cut.npz']
+    text = succeed(capsys, *argv)
+    assert 'start forgotten' in text
+    assert 'estimated' in text
+    data = json.loads(succeed(capsys, *argv, '--json'))
+    assert data['memory_estimated'] == [True]
+    assert data['start_forgotten']['n'] < data['whole']['n']
+    assert data['start_forgotten']['percent_of_stroke'] < 0.3
+
+
+def test_predict_warns_outside_the_identified_range(capsys, tmp_path, made):
+    t = np.arange(2000) / 2000.0
+    v = 14.0 * np.sin(np.pi * t) ** 2
+    write_record(Record((Piece(v, 7e-6 * v, 2000.0),)), tmp_path / 'far.csv')
+    text = succeed(capsys, 'predict', made / 'model.yaml', tmp_path / 'far.csv')
+    assert 'outside the identified range' in text
+
+
+def test_identify_without_model_writes_nothing(capsys, tmp_path, made, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = succeed(capsys, 'identify', made / 'record.npz', *FAST)
+    assert '--model' in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
+    folder = tmp_path / 'in'
+    folder.mkdir()
+    write_record(read_record(made / 'record.npz'), folder / 'bag')
+    (folder / 'notes.txt').write_text('not a record')
+    model, report = tmp_path / 'm.yaml', tmp_path / 'deep' / 'report'
+    model.write_text('an older one')
+    argv = ['identify', folder, '--model', model, '--report', report, *FAST]
+    data = json.loads(succeed(capsys, *argv, '--validation', made / 'sine.csv', '--json'))
+    assert data['files'] == {'model': str(model), 'report': str(report / 'report.html')}
+    assert load_model(model).delay.samples == 2
+    assert (report / 'report.html').is_file()
+    (check,) = data['validation']
+    assert check['record'] == 'sine.csv'
+    assert check['sines'][0]['frequency'] == 5
+    assert check['sines'][0]['percent'] < check['sines'][0]['static_percent']
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith('.')] == []
+
+
+@pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3', 'bag'])
+def test_convert_round_trip(capsys, tmp_path, made, name):
+    record = read_record(made / 'record.npz')
+    there, back = tmp_path / name, tmp_path / 'back.npz'
+    data = json.loads(succeed(capsys, 'convert', '--json', made / 'record.npz', there))
+    assert (data['faults'], data['not_kept']) == ([], [])
+    succeed(capsys, 'convert', there, back)
+    again = read_record(back)
+    np.testing.assert_array_equal(again.pieces[0].y, record.pieces[0].y)
+    assert again.labels == record.labels
+
+
+def test_convert_refuses_to_replace_unless_told(capsys, tmp_path, made):
+    out = tmp_path / 'r.csv'
+    out.write_text('precious')
+    argv = ['convert', made / 'record.npz', out]
+    refuse(capsys, tmp_path, argv, out, '--overwrite')
+    assert out.read_text() == 'precious'
+    succeed(capsys, *argv, '--overwrite')
+    assert read_record(out).n == read_record(made / 'record.npz').n
+
+
+# --- measured data as they come -------------------------------------------------------------
+
+
+def table(n: int = 1000) -> dict[str, np.ndarray]:
+    v = 5 - 5 * np.cos(np.arange(n) / 50)
+    return {'t': np.arange(n) / 1000, 'v': v, 'y': 7.5e-6 * v}
+
+
+def csv_text(**columns: object) -> str:
+    c = {**table(), **columns}
+    rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
+    return '\n'.join([','.join(c), *rows]) + '\n'
+
+
+def with_values(column: str, rows: range, value: object) -> str:
+    x = table()[column].tolist()
+    for i in rows:
+        x[i] = value
+    return csv_text(**{column: x})
+
+
+def without(column: str) -> str:
+    c = table()
+    del c[column]
+    rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
+    return '\n'.join([','.join(c), *rows]) + '\n'
+
+
+BAD_FILES: dict[str, tuple[Callable[[], str], list[object], str]] = {
+    'missing column': (lambda: without('y'), [], 'name the columns'),
+    'text in numbers': (lambda: with_values('v', range(40, 41), 'off'), [], 'line 42'),
+    'many NaN': (lambda: with_values('y', range(0, 1000, 50), 'nan'), [], 'cut the bad stretch'),
+    'constant input': (
+        lambda: csv_text(v=np.ones(1000), y=1e-6 * np.sin(np.arange(1000) / 9)),
+        [],
+        'while it is driven',
+    ),
+    'constant output': (lambda: csv_text(y=np.full(1000, 1e-6)), [], '--displacement-unit'),
+    'empty file': (lambda: '', [], 'header line'),
+    'header alone': (lambda: 't,v,y\n', [], 'record some samples'),
+    'one sample': (lambda: 't,v,y\n0,0,0\n', [], 'at least two'),
+    'wrong unit': (lambda: csv_text(y=7.5 * table()['v']), [], '--displacement-unit'),
+    'unsorted time': (lambda: with_values('t', range(500, 501), 0.1234), [], ';'),
+    'voltage limits': (csv_text, ['--voltage-limits', 0, 8], 'check the limits'),
+    'limits turned round': (csv_text, ['--voltage-limits', 8, 0], '--voltage-limits'),
+    'garbage': (lambda: '\x00\x01\x02\n\x03', [], ';'),
+}
+
+
+@pytest.mark.parametrize('case', BAD_FILES)
+def test_bad_data_end_in_one_line(capsys, tmp_path, case):
+    text, options, cure = BAD_FILES[case]
+    path = tmp_path / 'bad.csv'
+    path.write_text(text())
+    argv = ['identify', path, '--model', tmp_path / 'm.yaml', '--report', tmp_path / 'r', *options]
+    named = '--voltage-limits' if case == 'limits turned round' else path.name
+    refuse(capsys, tmp_path, argv, named, cure)
+
+
+def test_few_nan_are_met_and_reported(capsys, tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text(with_values('y', range(300, 303), 'nan'))
+    text = succeed(capsys, 'convert', path, tmp_path / 'r.npz')
+    assert 'not_finite (3)' in text
+    assert 'split' in text
+
+
+def test_a_unit_converts(capsys, tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text(csv_text(y=7.5 * table()['v']))
+    succeed(capsys, 'convert', '--displacement-unit', 'µm', path, tmp_path / 'r.npz')
+    assert read_record(tmp_path / 'r.npz').stroke == pytest.approx(75e-6, rel=1e-3)
+
+
+def cut_in_half(path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_truncated_bag(capsys, tmp_path, made, storage):
+    bag = tmp_path / 'bag'
+    succeed(capsys, 'convert', '--storage', storage, made / 'record.npz', bag)
+    (data,) = (p for p in bag.iterdir() if p.suffix in ('.mcap', '.db3'))
+    cut_in_half(data)
+    refuse(capsys, tmp_path, ['convert', bag, tmp_path / 'r.csv'], bag)
+    refuse(capsys, tmp_path, ['identify', bag], bag)
+
+
+def test_bag_without_the_topics(capsys, tmp_path, made):
+    bag = tmp_path / 'bag'
+    succeed(capsys, 'convert', '--storage', 'sqlite3', made / 'record.npz', bag)
+    (data,) = bag.glob('*.db3')
+    with contextlib.closing(sqlite3.connect(data)) as connection, connection:
+        connection.execute('delete from messages')
+    refuse(capsys, tmp_path, ['identify', bag], bag, 'record the stage')
+    refuse(
+        capsys,
+        tmp_path,
+        ['identify', made / 'record.npz', '--namespace', 'other', '--model', 'x/m.yaml'],
+        'x/m.yaml',
+        'make it first',
+    )
+
+
+def test_folder_without_records(capsys, tmp_path):
+    (tmp_path / 'empty').mkdir()
+    refuse(capsys, tmp_path, ['identify', tmp_path / 'empty'], tmp_path / 'empty', 'give a bag')
+
+
+def test_missing_record(capsys, tmp_path):
+    refuse(capsys, tmp_path, ['identify', tmp_path / 'no.csv'], 'no.csv', 'check the name')
+    refuse(capsys, tmp_path, ['convert', tmp_path / 'no', tmp_path / 'r.csv'], 'no', ';')
+
+
+# --- models and configurations --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('text', 'cure'),
+    [
+        ('schema_version: 99\n', 'update piezo_ident'),
+        (': : :\n\t{', 'write it again'),
+        ('- 1\n', 'mapping'),
+        ('', 'mapping'),
+        ('schema_version: 1\n', 'is this a model file'),
+    ],
+)
+def test_bad_model(capsys, tmp_path, made, text, cure):
+    path = tmp_path / 'model.yaml'
+    path.write_text(text)
+    argv = ['predict', path, made / 'sine.csv', '--out', tmp_path / 'y.csv']
+    refuse(capsys, tmp_path, argv, path, cure)
+
+
+def test_model_of_another_rate(capsys, tmp_path, made):
+    path = tmp_path / 'slow.csv'
+    path.write_text(csv_text())
+    argv = ['predict', made / 'model.yaml', path, '--out', tmp_path / 'y.csv']
+    refuse(capsys, tmp_path, argv, 'slow.csv', '1000 Hz', 'identify a model')
+
+
+def test_misspelt_names(capsys, tmp_path, made):
+    out = tmp_path / 'r.csv'
+    refuse(capsys, tmp_path, ['simulate', '--program', 'validaton', out], 'mean validation?')
+    refuse(capsys, tmp_path, ['simulate', '--config', 'stage_papper', out], 'mean paper?')
+    refuse(capsys, tmp_path, ['convert', '--displacement-unit', 'ym', out, out], 'nm')
+    stage = tmp_path / 'stage.yaml'
+    stage.write_text(
+        yaml.safe_dump({**yaml.safe_load(STAGE), 'effects': [{'name': 'crep', 'parameters': {}}]})
+    )
+    refuse(capsys, tmp_path, ['simulate', '--config', stage, out], stage, 'crep', 'creep')
+    program = tmp_path / 'program.yaml'
+    program.write_text('limits: [0, 10]\nsegments: [{signal: sinus}]\n')
+    refuse(capsys, tmp_path, ['simulate', '--program', program, out], program, 'sine')
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--thresholds', 'many'], '--thresholds'),
+        (['--thresholds', 1], 'thresholds'),
+        (['--order', '3'], '--order'),
+        (['--order', '3,0'], 'order'),
+        (['--solver', 'magic'], '--solver'),
+        (['--seed', -1], '--seed'),
+        (['--hold-out', -1], 'hold_out'),
+        (['--model', 'm.csv'], 'm.csv'),
+        (['--mdoel', 'm.yaml'], '--mdoel'),
+    ],
+)
+def test_bad_options(capsys, tmp_path, made, options, word):
+    refuse(capsys, tmp_path, ['identify', made / 'record.npz', *options], word)
+
+
+def test_stage_of_another_rate(capsys, tmp_path):
+    argv = ['simulate', '--sample-rate', 1000, tmp_path / 'r.csv']
+    refuse(capsys, tmp_path, argv, 'stage_paper.yaml', 'leave out --sample-rate')
+
+
+def test_shipped_files_are_found_by_name_and_by_path(capsys, tmp_path, monkeypatch, made):
+    assert {'identification', 'validation', 'survey'} <= set(shipped_names('program_'))
+    assert find_config('paper', 'stage').name == 'stage_paper.yaml'
+    assert find_config('stage_paper', 'stage').name == 'stage_paper.yaml'
+    # elsewhere, the path of the contract still works, and it is said what was taken
+    monkeypatch.chdir(tmp_path)
+    argv = ['--config', 'config/stage_paper.yaml', '--program', made / 'sine.yaml', 'r.npz']
+    code, _, err = run(capsys, 'simulate', *argv)
+    assert code == 0
+    assert 'taking the shipped' in err
+    # a workspace comes first
+    share = tmp_path / 'share' / 'piezo_ident' / 'config'
+    share.mkdir(parents=True)
+    (share / 'program_own.yaml').write_text(SINE)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{os.pathsep}{tmp_path}')
+    assert find_config('own', 'program') == share / 'program_own.yaml'
+    with pytest.raises(ConfigError, match='own'):
+        find_config('owner', 'program')
+
+
+# --- outputs --------------------------------------------------------------------------------
+
+
+def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, monkeypatch):
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise AssertionError('the work began')
+
+    monkeypatch.setattr('piezo_ident.cli.model_commands.identify', forbidden)
+    monkeypatch.setattr('piezo_ident.cli.model_commands.predict_record', forbidden)
+    monkeypatch.setattr('piezo_ident.cli.commands.simulate', forbidden)
+    (tmp_path / 'file').write_text('')
+    below, record = tmp_path / 'file' / 'm.yaml', made / 'record.npz'
+    for argv in (
+        ['identify', record, '--model', below],
+        ['identify', record, '--model', '/proc/m.yaml'],
+        ['identify', record, '--model', tmp_path],
+        ['identify', record, '--model', tmp_path / 'no' / 'm.yaml'],
+        ['identify', record, '--report', below],
+        ['identify', record, '--report', tmp_path / 'file'],
+        ['identify', record, '--report', '/proc/report'],
+        ['predict', made / 'model.yaml', record, '--out', below.with_suffix('.csv')],
+        ['predict', made / 'model.yaml', record, '--plot', below.with_suffix('.png')],
+        ['predict', made / 'model.yaml', record, '--out', record],
+        ['predict', made / 'model.yaml', record, '--out', tmp_path / 'y.mat'],
+        ['simulate', below.with_suffix('.csv')],
+        ['simulate', '/dev/null'],
+        ['simulate', '--overwrite', '/dev/null'],
+        ['convert', record, below.with_suffix('.csv')],
+        ['demo', '--out', tmp_path / 'file'],
+    ):
+        refuse(capsys, tmp_path, argv, argv[-1], ';')
+
+
+def test_long_names_and_devices(tmp_path):
+    with pytest.raises(DataError, match='cannot be written'):
+        check_file(tmp_path / ('x' * 300), overwrite=True)
+    with pytest.raises(DataError, match='device'):
+        check_file(Path('/dev/null'), overwrite=True)
+    check_folder(tmp_path / 'a' / 'b')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_demo_names_a_measured_record_that_is_not_there(capsys, tmp_path, monkeypatch):
+    argv = ['demo', '--out', tmp_path / 'out', '--measured', tmp_path / 'no.csv']
+    refuse(capsys, tmp_path, argv, 'no.csv', '--measured')
+    monkeypatch.setenv('PIEZO_IDENT_DATA', str(tmp_path))
+    assert find_measured(None) is None
+    (tmp_path / 'piezo_1hz.csv').write_text('')
+    assert find_measured(None) == tmp_path / 'piezo_1hz.csv'
+
+
+# --- interrupted ----------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def on_a_terminal(argv: list[object]) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run a command whose standard error is a terminal; yield it and the terminal's other end."""
+    here, there = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'piezo_ident', *map(str, argv)],
+        stdout=subprocess.PIPE,
+        stderr=there,
+        # a shell that runs the tests in the background has them ignore Ctrl-C
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    os.close(there)
+    try:
+        yield process, here
+    finally:
+        process.kill()
+        process.communicate()
+        os.close(here)
+
+
+def read_terminal(terminal: int) -> bytes:
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # the other end is closed
+        return b''
+
+
+def test_interrupt_leaves_nothing(capsys, tmp_path):
+    record = tmp_path / 'r.npz'
+    succeed(capsys, 'simulate', record)
+    argv = ['identify', record, '--model', tmp_path / 'm.yaml', '--report', tmp_path / 'report']
+    with on_a_terminal(argv) as (process, terminal):
+        seen = b''
+        # the bar of the second step: the work is under way
+        while b'dynamics' not in seen:
+            chunk = read_terminal(terminal)
+            assert chunk, seen
+            seen += chunk
+        process.send_signal(signal.SIGINT)
+        after = b''
+        while chunk := read_terminal(terminal):
+            after += chunk
+        assert process.wait() == 130
+        assert process.stdout.read() == b''
+    assert b'Traceback' not in after
+    assert b'piezo_ident: interrupted' in after
+    assert after.count(b'\n') == 1
+    assert list(tmp_path.iterdir()) == [record]
+
+
+def test_a_reader_that_leaves_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, '-m', 'piezo_ident', 'effects'], stdout=write, stderr=subprocess.PIPE
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, b'')
