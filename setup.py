@@ -44,7 +44,7 @@ setup(
         # 0.58.1 is the first that takes NumPy 1.26
         'numba>=0.58.1,<1',
         'numpy>=1.26,<3',
-        # 0.10.9 writes mcap, 0.10.11 also the statistics that other readers of it look for
+        # 0.11 reads a lone .mcap or .db3 and keeps QoS profiles in the channels
         'rosbags>=0.11,<0.12',
         'scipy>=1.11,<2',
         'tqdm>=4.60,<5',

@@ -30,8 +30,6 @@ import time
 
 from numba import njit
 import numpy as np
-from scipy.signal import lfilter
-
 from piezo_ident.identification import identify
 from piezo_ident.model import StageModel
 from piezo_ident.program import load_program
@@ -39,6 +37,7 @@ from piezo_ident.record import Piece
 from piezo_ident.results import Settings
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import load_stage, simulate
+from scipy.signal import lfilter
 
 RUNS = 7
 

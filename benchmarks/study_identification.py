@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How well simulated stages are identified: 20 seeds, three noise levels, and thresholds off the grid.
+How well simulated stages are identified: seeds, noise levels, thresholds off the grid.
 
     .venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
@@ -29,9 +29,6 @@ import platform
 import sys
 
 import numpy as np
-import scipy
-from tqdm import tqdm
-
 from piezo_ident import __version__
 from piezo_ident.identification import identify
 from piezo_ident.metrics import percent_of_stroke
@@ -40,8 +37,10 @@ from piezo_ident.program import load_program
 from piezo_ident.record import Record
 from piezo_ident.results import Identification, Settings
 from piezo_ident.shipped import find_config
-from piezo_ident.simulation import SimulatedStage, load_stage, simulate, simulate_truth
+from piezo_ident.simulation import load_stage, simulate, simulate_truth, SimulatedStage
 from piezo_ident.validation import sine_errors
+import scipy
+from tqdm import tqdm
 
 SEEDS = 20
 NOISES = (1e-5, 1e-4, 5e-4)
@@ -102,7 +101,9 @@ def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
     """Compare ten with refined thresholds on both stages."""
     frequencies = (1, 10, 50, 80, 100, 120)
     lines = [
-        '| stage | thresholds | ' + ' | '.join(f'{f} Hz' for f in frequencies) + ' | minor loops |',
+        '| stage | thresholds | '
+        + ' | '.join(f'{f} Hz' for f in frequencies)
+        + ' | minor loops |',
         '|---|---|' + '---|' * (len(frequencies) + 1),
     ]
     for name, stage in stages.items():
@@ -138,9 +139,9 @@ def main() -> None:
         f'piezo_ident {__version__}, Python {platform.python_version()}, '
         f'numpy {np.__version__}, scipy {scipy.__version__}',
         '',
-        '## Twenty seeds and three noise levels, the paper\'s stage',
+        "## Twenty seeds and three noise levels, the paper's stage",
         '',
-        'The flattering case: the truth lies on the model\'s own thresholds. 16-bit converters.',
+        "The flattering case: the truth lies on the model's own thresholds. 16-bit converters.",
         '"Worst error" is the largest over the six sines and all seeds; "swarm" counts the seeds',
         'whose loss before polishing was within 1 % of bounded least squares.',
         '',
@@ -148,7 +149,7 @@ def main() -> None:
         '',
         f'## On and off the grid, noise {noise:g} of stroke',
         '',
-        'The second stage has 40 thresholds that are none of the model\'s. % of stroke.',
+        "The second stage has 40 thresholds that are none of the model's. % of stroke.",
         '',
         *thresholds_table({'paper (flattering)': paper, '40 thresholds off the grid': dense}),
         '',

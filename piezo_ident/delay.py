@@ -70,8 +70,8 @@ def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.in
     """
     Return the samples at which v jumps out of a quiet stretch.
 
-    A jump is a difference that exceeds a quarter of the largest one and twenty times the slope
-    found otherwise, with no other such difference within `before` samples ahead of it.
+    A jump is a difference that exceeds a quarter of the largest one, and twenty times every
+    difference within `before` samples ahead of it.
 
     Parameters
     ----------
@@ -88,13 +88,14 @@ def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.in
     dv = np.abs(np.diff(v))
     if dv.size == 0 or dv.max() == 0.0:
         return np.empty(0, dtype=np.int64)
-    usual = float(np.quantile(dv, 0.99))
-    large = np.flatnonzero((dv > 0.25 * dv.max()) & (dv > 20.0 * usual)) + 1
-    if large.size == 0:
-        return np.empty(0, dtype=np.int64)
-    quiet = np.diff(large, prepend=-before - 1) > before
-    inside = (large >= before) & (large + after <= v.size)
-    return np.asarray(large[quiet & inside], dtype=np.int64)
+    large = np.flatnonzero(dv > 0.25 * dv.max()) + 1
+    large = large[(large >= before) & (large + after <= v.size)]
+    if large.size == 0 or before < 2:
+        return np.asarray(large, dtype=np.int64)
+    # ahead[k] is the largest difference between the samples k - before .. k - 1
+    ahead = np.lib.stride_tricks.sliding_window_view(dv, before - 1).max(axis=1)
+    quiet = ahead[large - before] < 0.05 * dv[large - 1]
+    return np.asarray(large[quiet], dtype=np.int64)
 
 
 def _responses(

@@ -54,6 +54,8 @@ Solver = Literal['swarm', 'least_squares']
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
+#: a play that moves less than this share of what it is cannot be told from the offset
+STILL = 1e-8
 #: how far the voltage may move within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
 
@@ -88,11 +90,18 @@ class Excerpt:
     @property
     def row(self) -> int:
         """Samples that one row of the fit may average."""
+        if not self.use.any():
+            return 1
         speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
         span = ROW_SPAN * float(np.ptp(self.u[self.use]))
         return max(
             1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
         )
+
+    @property
+    def rows(self) -> int:
+        """Rows that these samples become; white noise is independent from row to row."""
+        return sum((stop - start) // self.row for start, stop in _stretches(self.use))
 
 
 def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
@@ -120,11 +129,15 @@ def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
     return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
 
 
+def _stretches(use: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def _binned(x: NDArray[np.float64], use: NDArray[np.bool_], row: int) -> NDArray[np.float64]:
     # averages never reach across a hole in the mask; the last incomplete row is left out
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
     parts = []
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+    for start, stop in _stretches(use):
         n = (stop - start) // row
         parts.append(x[start : start + n * row].reshape(n, row).mean(axis=1))
     return np.concatenate(parts) * np.sqrt(row) if parts else np.empty(0)
@@ -194,7 +207,8 @@ class HysteresisFit:
     n : int
         Samples fitted.
     std : ndarray, shape (m + 2,)
-        Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound.
+        Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound, and
+        where the data do not excite the play.
     swarm : scipy.optimize.OptimizeResult or None
     """
 
@@ -210,7 +224,7 @@ class HysteresisFit:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residual, normalised."""
+        """Root mean square of the residual, averaged over the rows of the fit, normalised."""
         return float(np.sqrt(self.loss / self.n))
 
 
@@ -220,6 +234,7 @@ def fit_hysteresis(
     n: int,
     *,
     solver: Solver = 'least_squares',
+    rows: int | None = None,
     rng: np.random.Generator | None = None,
     swarm_size: int = 40,
     maxiter: int = 20_000,
@@ -237,6 +252,8 @@ def fit_hysteresis(
         Number of samples behind R.
     solver : {'least_squares', 'swarm'}
         The swarm is polished by bounded least squares; both losses are kept.
+    rows : int, optional
+        Number of rows that the samples were averaged to (`Excerpt.rows`); `n` when absent.
     rng : numpy.random.Generator
         Needed by the swarm.
     swarm_size, maxiter, callback
@@ -249,11 +266,15 @@ def fit_hysteresis(
     """
     m = thresholds.size
     k = R.shape[0] - m - 3
-    inner = R[k:, k:]
+    inner = R[k:, k:].copy()
+    # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
+    still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
+    inner[:, :m][:, still] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
     lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
     x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
+    x[:m][still] = 0.0
     swarm = None
     swarm_loss = None
     if solver == 'swarm':
@@ -276,7 +297,8 @@ def fit_hysteresis(
     free = x > lower
     std = np.zeros(m + 2)
     gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
-    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum / max(n - m - 2, 1)
+    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum
+    variance /= max((n if rows is None else rows) - m - 2, 1)
     std[free] = np.sqrt(np.maximum(variance, 0.0))
     h = Hysteresis(thresholds, x[:m], float(x[m]), float(x[m + 1]))
     return HysteresisFit(

@@ -38,7 +38,7 @@ from piezo_ident.hysteresis_fit import (
     fit_hysteresis,
     HysteresisFit,
 )
-from piezo_ident.memory import fit_memory
+from piezo_ident.memory import fit_memory, start_memory
 from piezo_ident.metrics import fit_percent, FORMULA, percent_of_stroke
 from piezo_ident.model import Scaling, StageModel
 from piezo_ident.record import Record
@@ -57,6 +57,7 @@ from piezo_ident.runs import (
     refuse_closed_loop,
     Run,
     runs_of,
+    same_rate,
     scaling_of,
 )
 from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
@@ -106,7 +107,7 @@ def identify(
     for record in records:
         refuse_closed_loop(record)
     rate, left = common_rate(records)
-    pieces = [p for record in records for p in record if p.sample_rate == rate]
+    pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
     scaling = scaling_of(pieces)
     runs = runs_of(records, rate, scaling)
     floor, source = noise_floor(pieces)
@@ -116,7 +117,7 @@ def identify(
         found = _labelled(runs, rate, scaling, settings, progress)
     else:
         found = _unlabelled(runs, rate, scaling, settings, progress)
-    model, delay, dynamics, fit, rows, said, missing = found
+    model, delay, dynamics, fit, rows, said, missing, memories = found
     warnings += [*said, *_check(delay, dynamics, fit, floor, scaling)]
     stroke = abs(scaling.Y)
     result = Identification(
@@ -131,11 +132,13 @@ def identify(
         warnings=tuple(warnings),
         not_identified=tuple(missing),
         settings=settings,
+        memories=memories,
     )
     story = _story(result, [record.name for record in records])
     return replace(result, model=replace(model, identification=story))
 
 
+Memories = dict[tuple[str, float], NDArray[np.float64]]
 Found = tuple[
     StageModel,
     DelayResult,
@@ -144,6 +147,7 @@ Found = tuple[
     list[ErrorRow],
     list[str],
     list[tuple[str, str]],
+    Memories,
 ]
 
 
@@ -174,11 +178,11 @@ def _third_step(
 ) -> HysteresisFit:
     progress('hysteresis', 0.0)
     swing = max(float(np.ptp(e.u[e.use])) for e in fit)
-    n = int(sum(e.use.sum() for e in fit))
+    n, rows = int(sum(e.use.sum() for e in fit)), sum(e.rows for e in fit)
     if settings.refine:
         # thresholds and weights are found together, by least squares alone
         r = choose_thresholds(fit, held, swing, G, delay)
-        return fit_hysteresis(factorise(fit, r, G, delay), r, n)
+        return fit_hysteresis(factorise(fit, r, G, delay), r, n, rows=rows)
     r = even_thresholds(swing, settings.thresholds)
     R = factorise(fit, r, G, delay)
     progress('hysteresis', 0.3)
@@ -187,6 +191,7 @@ def _third_step(
         R,
         r,
         n,
+        rows=rows,
         solver=settings.solver,
         rng=np.random.default_rng(settings.seed),
         swarm_size=settings.swarm_size,
@@ -231,7 +236,7 @@ def _labelled(
         fitted = run.mask('triangle', 'noise', 'settle', 'step') & ~held
         masks.append((fitted, held))
     rows = errors_of(model, runs, masks)
-    return model, delay_result, dynamics, result, rows, said, []
+    return model, delay_result, dynamics, result, rows, said, [], {}
 
 
 def _unlabelled(
@@ -258,39 +263,42 @@ def _unlabelled(
     late[n_fit - int(0.25 * use.sum()) :] = True
     fit_part = [Excerpt(u, x, use & ~late, joint.memory)]
     late_part = [Excerpt(u, x, use & late, joint.memory)]
+    whole = [Excerpt(u, x, use, joint.memory)]
     if settings.refine:
         r = choose_thresholds(fit_part, late_part, float(np.ptp(u[use])), joint.G, delay)
-        R = factorise([Excerpt(u, x, use, joint.memory)], r, joint.G, delay)
-        result = fit_hysteresis(R, r, int(use.sum()))
+        result = fit_hysteresis(
+            factorise(whole, r, joint.G, delay), r, int(use.sum()), rows=whole[0].rows
+        )
     else:
-        whole = [Excerpt(u, x, use, joint.memory)]
         result = _third_step(whole, [], joint.G, delay, settings, progress)
     model = _model(rate, scaling, result, joint.G, delay)
     low, high = float(u.min()), float(u.max())
     span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
     model = replace(model, scaling=replace(model.scaling, range=span))
     # the start of these very thresholds; the rule carried over from other ones is an approximation
-    start = None if joint.memory is None else fit_memory(model, piece.cut(0, n_fit))
+    memories = {_key(run): fit_memory(model, piece.cut(0, n_fit))}
     masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
     for other in runs:
         fitted = np.zeros(other.piece.n, dtype=bool)
         if other is run:
             fitted[:n_fit] = True
         masks.append((fitted, np.zeros(other.piece.n, dtype=bool)))
-    rows = errors_of(model, runs, masks, {id(run): start})
+    rows = errors_of(model, runs, masks, memories)
     said = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
         f'together on the first {n_fit / rate:.4g} s of {run.record}'
     ]
-    fitted_error = [row.percent for row in rows if row.data == 'fitted']
-    held_error = [row.percent for row in rows if row.data == 'held out']
-    if fitted_error and held_error and held_error[0] > 3.0 * fitted_error[0]:
+    fitted_error = [row for row in rows if row.data == 'fitted' and row.record == run.record]
+    held_error = [row for row in rows if row.data == 'held out' and row.record == run.record]
+    ratio = _rms(held_error) / _rms(fitted_error) if fitted_error and held_error else 0.0
+    if ratio > 3.0:
         said.append(
-            f'the held-out error is {held_error[0] / fitted_error[0]:.1f} times the fitted one: '
+            f'the held-out error is {ratio:.1f} times the fitted one: '
             'this record does not pin the model down; drive the range more than once'
         )
     progress('hysteresis', 1.0)
-    return model, joint.delay, joint.dynamics, result, rows, said, list(joint.not_identified)
+    missing = list(joint.not_identified)
+    return model, joint.delay, joint.dynamics, result, rows, said, missing, memories
 
 
 def _model(
@@ -300,11 +308,20 @@ def _model(
     return StageModel(rate, moved, fit.hysteresis, G, delay)
 
 
+def _key(run: Run) -> tuple[str, float]:
+    return run.record, run.piece.start_time
+
+
+def _rms(rows: Sequence[ErrorRow]) -> float:
+    n = sum(row.n for row in rows)
+    return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / n))
+
+
 def errors_of(
     model: StageModel,
     runs: Sequence[Run],
     masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
-    memories: dict[int, NDArray[np.float64] | None] | None = None,
+    memories: Memories | None = None,
 ) -> list[ErrorRow]:
     """
     Return the free-run error of every segment, split into what was fitted and what was not.
@@ -316,12 +333,15 @@ def errors_of(
     masks : sequence of (fitted, selection)
         For each run, the samples that were fitted and those that only chose between models.
     memories : dict, optional
-        Known memory at the start of a run, by its ``id``.
+        Memory at the start of a run, by record name and start time; that of other runs which do
+        not start at rest is estimated.
     """
     static = model.without_dynamics()
     rows = []
     for run, (fitted, selection) in zip(runs, masks, strict=True):
-        memory = (memories or {}).get(id(run))
+        memory = (memories or {}).get(_key(run))
+        if memory is None:
+            memory = start_memory(model, run.piece)
         y = run.piece.y
         y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
         stroke = float(np.ptp(y))

@@ -29,11 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.dynamics import filter_arx
 from piezo_ident.model import StageModel
-from piezo_ident.play import play_columns
 from piezo_ident.record import Piece
 from scipy.optimize import lsq_linear
 
-__all__ = ['fit_memory', 'forgotten', 'is_at_rest']
+__all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'start_memory']
 
 #: pull towards the memory of a stage that came down to zero, as a share of the data's weight
 PULL = 1e-4
@@ -57,6 +56,11 @@ def forgotten(u: NDArray[np.float64], share: float = 0.98) -> int:
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
     """Return whether a piece starts near the lowest voltage, where the memory is known."""
     return abs(float(model.scaling.u(piece.v[0]))) < 0.01
+
+
+def start_memory(model: StageModel, piece: Piece) -> NDArray[np.float64] | None:
+    """Return the estimated memory at the start of a piece; None where it is known."""
+    return None if is_at_rest(model, piece) else fit_memory(model, piece)
 
 
 def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDArray[np.float64]:
@@ -107,10 +111,3 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
         if np.abs(step).max() < 1e-6:
             break
     return memory
-
-
-def play_memory(
-    u: NDArray[np.float64], thresholds: NDArray[np.float64], memory: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the play outputs after a stretch of voltage, shape (m,)."""
-    return play_columns(u, thresholds, memory)[:, -1]

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import os
 from pathlib import Path
+import reprlib
 import tempfile
 from typing import Any
 
@@ -42,6 +43,8 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+#: more entries, or deeper nesting, under one key of a model file are refused
+MOST_NODES, DEEPEST = 100_000, 20
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
@@ -101,7 +104,16 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     """
     try:
         data = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (
+        # the loader lets through what its own constructors trip over
+        yaml.YAMLError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         mark = getattr(error, 'problem_mark', None)
         where = f' at line {mark.line + 1}' if mark is not None else ''
         raise ConfigError(f'{name}: not valid YAML{where}; correct it or write it again') from None
@@ -128,18 +140,33 @@ def _number(data: Mapping[str, Any], key: str, name: str, default: float | None 
         raise ModelError(f'{name}: {key} is missing or not a number')
     try:
         return float(value)
-    except (TypeError, ValueError):
-        raise ModelError(f'{name}: {key} is not a number: {value!r}') from None
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f'{name}: {key} is not a number: {reprlib.repr(value)}') from None
 
 
 def _numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
     value = data.get(key)
-    if not isinstance(value, list):
+    if not isinstance(value, list) or any(isinstance(x, bool) for x in value):
         raise ModelError(f'{name}: {key} must be a list of numbers')
     try:
         return np.array([float(x) for x in value], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ModelError(f'{name}: {key} must be a list of numbers') from None
+
+
+def _refuse_endless(data: Mapping[str, Any], name: str) -> None:
+    # an alias may stand for a tree of any size in a few bytes, or for the list that holds it
+    for key, value in data.items():
+        left, todo = MOST_NODES, [(value, 0)]
+        while todo:
+            node, depth = todo.pop()
+            inner = list(node.values()) if isinstance(node, Mapping) else node
+            if not isinstance(inner, (list, tuple)):
+                continue
+            left -= len(inner)
+            if left < 0 or depth > DEEPEST:
+                raise ModelError(f'{name}: {key} is nested too deeply, or too large')
+            todo += [(x, depth + 1) for x in inner]
 
 
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
@@ -158,12 +185,15 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     ModelError
         When the schema is later than this package knows, or a part is missing or wrong.
     """
+    _refuse_endless(data, name)
     version = data.get('schema_version', SCHEMA_VERSION)
-    if not isinstance(version, int) or version < 1:
-        raise ModelError(f'{name}: schema_version must be a whole number, got {version!r}')
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise ModelError(
+            f'{name}: schema_version must be a whole number, got {reprlib.repr(version)}'
+        )
     if version > SCHEMA_VERSION:
         raise ModelError(
-            f'{name}: written with model schema {version}, this package reads up to '
+            f'{name}: written with model schema {reprlib.repr(version)}, this package reads up to '
             f'{SCHEMA_VERSION}; update piezo_ident'
         )
     missing = [key for key in _REQUIRED if key not in data]
@@ -186,7 +216,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     if not isinstance(identification, Mapping):
         raise ModelError(f'{name}: identification must be a mapping')
     samples = _number(delay, 'samples', name)
-    if samples != int(samples):
+    if not samples.is_integer():
         raise ModelError(f'{name}: delay.samples must be a whole number, got {samples}')
     try:
         return StageModel(
@@ -207,7 +237,11 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
             dynamics=Dynamics(a=_numbers(g, 'a', name), b=_numbers(g, 'b', name)),
             delay=Delay(int(samples), _number(delay, 'fraction', name, 0.0)),
             effects=tuple(
-                EffectSetting(str(e.get('name')), _mapping(e, 'parameters', name)) for e in effects
+                EffectSetting(
+                    str(e.get('name')),
+                    {str(k): v for k, v in _mapping(e, 'parameters', name).items()},
+                )
+                for e in effects
             ),
             identification=dict(identification),
         )

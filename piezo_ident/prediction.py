@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import ModelError
-from piezo_ident.memory import fit_memory, forgotten, is_at_rest
+from piezo_ident.memory import forgotten, start_memory
 from piezo_ident.metrics import fit_percent, percent_of_stroke
 from piezo_ident.model import Prediction, StageModel
 from piezo_ident.record import Record
@@ -96,11 +96,8 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
             model.check_rate(piece)
         except ModelError as error:
             raise ModelError(f'{record.name}: {error}') from None
-    estimated = tuple(not is_at_rest(model, piece) for piece in record)
-    memories = tuple(
-        fit_memory(model, piece) if unknown else None
-        for piece, unknown in zip(record, estimated, strict=True)
-    )
+    memories = tuple(start_memory(model, piece) for piece in record)
+    estimated = tuple(memory is not None for memory in memories)
     prediction = model.predict(record, memories)
     if any(estimated):
         said = (

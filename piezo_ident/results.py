@@ -16,8 +16,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,10 +98,16 @@ class Settings:
             raise ConfigError(f'solver must be swarm or least_squares, got {self.solver!r}')
         if not 1 <= self.max_order <= 50:
             raise ConfigError(f'max_order must be 1 to 50, got {self.max_order}')
-        if self.order is not None and not all(1 <= n <= 50 for n in self.order):
+        if self.order is not None and not (
+            len(self.order) == 2 and all(1 <= n <= 50 for n in self.order)
+        ):
             raise ConfigError(f'order must be two numbers of 1 to 50, got {self.order}')
         if self.delay is not None and not 0 <= self.delay <= 10_000:
             raise ConfigError(f'delay must be 0 to 10000 samples, got {self.delay}')
+        if self.swarm_size < 2:
+            raise ConfigError(f'swarm_size must be at least 2, got {self.swarm_size}')
+        if self.swarm_iterations < 1:
+            raise ConfigError(f'swarm_iterations must be positive, got {self.swarm_iterations}')
         if self.hold_out is not None and not self.hold_out > 0.0:
             raise ConfigError(f'hold_out must be a positive time, got {self.hold_out} s')
         if self.seed < 0:
@@ -229,6 +235,8 @@ class Identification:
     not_identified : tuple of (str, str)
         What these data could not tell, and why.
     settings : Settings
+    memories : mapping of (str, float) to ndarray
+        Fitted play outputs at the start of a piece, by record name and start time.
     """
 
     model: StageModel
@@ -242,6 +250,7 @@ class Identification:
     warnings: tuple[str, ...]
     not_identified: tuple[tuple[str, str], ...]
     settings: Settings
+    memories: Mapping[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def swarm(self) -> OptimizeResult | None:
@@ -249,8 +258,17 @@ class Identification:
         return self.hysteresis.swarm
 
     def error(self, data: str) -> float:
-        """Return the error over all rows of a kind of data, weighted by samples; NaN if none."""
-        rows = [row for row in self.errors if row.data == data]
+        """
+        Return the error over all rows of a kind of data, weighted by samples; NaN if none.
+
+        Ramps and rests do not count: they are easy, and would flatter.
+        """
+        easy = ('idle', 'ramp')
+        rows = [
+            row
+            for row in self.errors
+            if row.data == data and row.segment.partition(':')[0] not in easy
+        ]
         if not rows:
             return float('nan')
         total = sum(row.n for row in rows)

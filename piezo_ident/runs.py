@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,15 @@ from piezo_ident.memory import forgotten
 from piezo_ident.model import Scaling
 from piezo_ident.record import Piece, Record
 
-__all__ = ['Run', 'common_rate', 'noise_floor', 'refuse_closed_loop', 'runs_of', 'scaling_of']
+__all__ = [
+    'Run',
+    'common_rate',
+    'noise_floor',
+    'refuse_closed_loop',
+    'runs_of',
+    'same_rate',
+    'scaling_of',
+]
 
 #: share of a triangle that is one block of held-out data, and how many blocks share one
 BLOCKS, EVERY = 60, 5
@@ -86,6 +93,11 @@ class Run:
         return held
 
 
+def same_rate(one: float, other: float) -> bool:
+    """Return whether two sampling rates differ by no more than rounding (1e-6)."""
+    return abs(one / other - 1.0) < 1e-6
+
+
 def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
     """
     Return the sampling rate that carries the most voltage travel, and what is left out.
@@ -99,7 +111,7 @@ def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
     time: dict[float, float] = {}
     for record in records:
         for piece in record:
-            rate = piece.sample_rate
+            rate = next((r for r in travel if same_rate(r, piece.sample_rate)), piece.sample_rate)
             travel[rate] = travel.get(rate, 0.0) + float(np.abs(np.diff(piece.v)).sum())
             time[rate] = time.get(rate, 0.0) + piece.duration
     best = max(travel, key=lambda rate: travel[rate])
@@ -145,7 +157,7 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
     runs = []
     for record in records:
         for piece in record:
-            if piece.sample_rate != rate:
+            if not same_rate(piece.sample_rate, rate):
                 continue
             u = scaling.u(piece.v)
             known = np.ones(piece.n, dtype=bool)
@@ -166,11 +178,10 @@ def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
     for piece in pieces:
         moves = np.flatnonzero(np.diff(piece.v) != 0.0) + 1
         edges = np.concatenate([[0], moves, [piece.n]])
-        for start, stop in itertools.pairwise(edges):
-            middle = (start + stop) // 2
-            if stop - middle < max(100, 0.025 * piece.sample_rate):
-                continue
-            y = piece.y[middle:stop]
+        middles = (edges[:-1] + edges[1:]) // 2
+        long = np.flatnonzero(edges[1:] - middles >= max(100, 0.025 * piece.sample_rate))
+        for i in long:
+            y = piece.y[middles[i] : edges[i + 1]]
             k = np.arange(y.size)
             rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
             total += float(rest @ rest)

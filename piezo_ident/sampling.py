@@ -206,6 +206,8 @@ def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float]
             )
     stroke = float(y.max() - y.min())
     idle = v.max() == v.min()  # a stage at rest has no stroke, whatever the unit
+    if stroke == 0.0 and not idle:
+        raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
     if stroke > STROKE[1] or (stroke < STROKE[0] and not idle):
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '

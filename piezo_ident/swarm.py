@@ -177,7 +177,9 @@ def particle_swarm(
     X = low + (high - low) * rng.random((swarm_size, n))
     V = (high - low) * (rng.random((swarm_size, n)) - 0.5) * 0.5
     own = X.copy()
-    own_f = np.array(fun(X), dtype=np.float64)
+    own_f = np.array(fun(X.copy()), dtype=np.float64)
+    # no number is no candidate; a comparison with NaN would keep it for ever
+    own_f[np.isnan(own_f)] = np.inf
     history = [float(own_f.min())]
     nit, status, message = 0, 1, 'the number of iterations was reached'
 

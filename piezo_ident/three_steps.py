@@ -24,7 +24,7 @@ for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,9 @@ MAX_DELAY = 30
 #: na and nb of the scan
 SCAN_ORDER = 8
 #: orders within this share of the best held-out error count as equal; the smaller one wins
-SLACK = 0.05
+SLACK = 0.01
+#: samples of simulation ahead of the first that counts
+WARM_UP = 2000
 #: candidates that are refined and judged again
 CANDIDATES = 3
 
@@ -183,7 +185,11 @@ def _factor(noise: _Noise, settings: Settings, delay: int) -> ArxFactor:
 
 
 def _orders(
-    noise: _Noise, settings: Settings, delay: int, progress: Progress, low: float, high: float
+    noise: _Noise,
+    settings: Settings,
+    delay: int,
+    candidates: int,
+    progress: Callable[[float], None],
 ) -> tuple[DynamicsResult, Dynamics]:
     """Search the orders, refine the best few, and take the one with the least held-out error."""
     factor = _factor(noise, settings, delay)
@@ -193,9 +199,9 @@ def _orders(
         settings.max_order,
         noise.u[noise.n_fit :],
         noise.y[noise.n_fit :],
-        lambda share: progress('dynamics', low + 0.5 * share * (high - low)),
+        lambda share: progress(0.5 * share),
     )
-    orders = [settings.order] if settings.order else table.ranked(SLACK)[:CANDIDATES]
+    orders = [settings.order] if settings.order else table.ranked(SLACK)[:candidates]
     if not orders:
         raise IdentificationError(
             'dynamics: no order up to '
@@ -218,9 +224,9 @@ def _orders(
         result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
         score = errors['output error']
         # a larger model must earn its size
-        if best is None or score < best[0] / (1.0 + SLACK / 5):
+        if best is None or score < best[0] / (1.0 + SLACK / 2):
             best = (score, result, fit.dynamics)
-        progress('dynamics', low + (0.5 + 0.5 * (i + 1) / len(orders)) * (high - low))
+        progress(0.5 + 0.5 * (i + 1) / len(orders))
     if best is None or not np.isfinite(best[0]):
         raise IdentificationError('dynamics: no stable model was found; set --order')
     return best[1], best[2]
@@ -255,7 +261,8 @@ def second_step(
     run, start, stop = _longest_noise(runs)
     progress('dynamics', 0.0)
     raw = _noise(run, run.u, start, stop)
-    _, first = _orders(raw, settings, d, progress, 0.0, 0.3)
+    # only good enough to undo the hysteresis
+    _, first = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
     G = first.normalised()
 
     excerpts = triangle_excerpts(runs)
@@ -269,7 +276,10 @@ def second_step(
 
     H = undo(G)
     progress('dynamics', 0.45)
-    result, G = _orders(_noise(run, H(run.u), start, stop), settings, d, progress, 0.45, 0.75)
+    undone = _noise(run, H(run.u), start, stop)
+    result, G = _orders(
+        undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.3 * share)
+    )
     G = G.normalised()
     covariance = result.covariance
     for i in range(2):
@@ -314,5 +324,8 @@ def _stretches(runs: Sequence[Run], H: Hysteresis, delay: Delay) -> list[Stretch
     for run in runs:
         use = run.mask('step', 'settle', 'noise') & ~run.held_out()
         if use.any():
-            stretches.append(Stretch(delay.apply(H(run.u)), run.x, use))
+            # what lies before the first sample used only has to let the start die away
+            first, last = np.flatnonzero(use)[[0, -1]]
+            part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
+            stretches.append(Stretch(delay.apply(H(run.u))[part], run.x[part], use[part]))
     return stretches

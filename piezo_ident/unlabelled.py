@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 from piezo_ident.arx import arx_factor, excited_band, instrumental_variables, stabilised
 from piezo_ident.delay import delay_from_steps, find_jumps
 from piezo_ident.dynamics import Delay, Dynamics
@@ -38,6 +37,7 @@ from piezo_ident.model import Scaling, StageModel
 from piezo_ident.output_error import output_error, OutputErrorFit, Stretch
 from piezo_ident.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.runs import Run
+from scipy import ndimage, signal
 
 __all__ = ['JointFit', 'joint_fit']
 
@@ -52,6 +52,8 @@ HIGH_PASS = 30.0
 FAST = 2e-3
 #: samples of such a record that the search uses
 MOST = 40_000
+#: how often H and G are fitted in turn
+TURNS = 4
 #: dynamics must lower the loss in their windows by this share to be believed
 GAIN = 0.2
 
@@ -121,6 +123,25 @@ def _find_delay(run: Run, n_fit: int, settings: Settings) -> tuple[DelayResult, 
 def _high_passed(x: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
     sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
     return np.asarray(signal.sosfilt(sos, x - x[0]))
+
+
+def _fast_rms(u: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
+    """Return the rms above `HIGH_PASS` around each sample."""
+    if 4 * HIGH_PASS > rate:
+        return np.zeros(u.size)
+    width = max(1, int(WINDOW * rate))
+    power = ndimage.uniform_filter1d(_high_passed(u, rate) ** 2, width)
+    return np.asarray(np.sqrt(np.maximum(power, 0.0)))
+
+
+def _busiest(fast: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which `MOST` samples in a row have the most fast power."""
+    width = min(MOST, fast.size)
+    total = np.cumsum(np.concatenate([[0.0], fast**2]))
+    start = int(np.argmax(total[width:] - total[:-width]))
+    chosen = np.zeros(fast.size, dtype=bool)
+    chosen[start : start + width] = True
+    return chosen
 
 
 def _search_order(
@@ -206,24 +227,28 @@ def joint_fit(
     rule: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     windows = _windows(run, n_fit)
     band = excited_band(u[known] - u[known].mean(), rate, depth=1e-4)
-    fast = _high_passed(u, rate) if 4 * HIGH_PASS < rate else np.zeros(n_fit)
+    fast = _fast_rms(u, rate)
     quiet = known & ~windows
     broad = bool(quiet.any() and np.sqrt(np.mean(fast[quiet] ** 2)) > FAST)
+    slow = known
     if broad:
-        windows |= known & (np.arange(n_fit) < np.flatnonzero(known)[0] + MOST)
+        windows |= known & _busiest(fast)
+        # where the stage lags behind a fast drive, H alone would take the lag for hysteresis
+        calm = known & (fast < FAST)
+        if calm.sum() > n_fit // 20 and np.ptp(u[calm]) > 0.8 * swing:
+            slow = calm
 
-    def view(*signals: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        if broad or 4 * HIGH_PASS > rate:
-            return signals
-        return tuple(_high_passed(z, rate) for z in signals)
+    def view(z: NDArray[np.float64]) -> NDArray[np.float64]:
+        return z if broad or 4 * HIGH_PASS > rate else _high_passed(z, rate)
 
     order: tuple[int, int] = (0, 1)
     fit: OutputErrorFit | None = None
     H = Hysteresis(r, np.zeros(r.size), 0.0, 1.0)
-    for turn in range(3):
-        progress('dynamics', turn / 3 if turn != 1 else 0.2)
-        R = factorise([Excerpt(u, x, known, rule)], r, G, delay)
-        result = fit_hysteresis(R, r, int(known.sum()))
+    for turn in range(TURNS):
+        progress('dynamics', turn / TURNS)
+        use = known if turn else slow
+        R = factorise([Excerpt(u, x, use, rule)], r, G, delay)
+        result = fit_hysteresis(R, r, int(use.sum()))
         H, offset = result.hysteresis, float(result.offsets[0])
         # even at its lowest voltage a stage may not have come down from the top: it relaxes
         shifted = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
@@ -234,12 +259,12 @@ def joint_fit(
             break
         w = delay.apply(H(u, memory))
         if fit is None:
-            searched = _search_order(*view(w, x - offset), windows, settings, progress)
+            searched = _search_order(view(w), view(x - offset), windows, settings, progress)
             if searched is None:
                 break
             order, fit = searched
         else:
-            fit = output_error([Stretch(*view(w, x - offset), windows)], G, maxiter=20)
+            fit = output_error([Stretch(view(w), view(x - offset), windows)], G, maxiter=20)
         G = fit.dynamics.normalised()
     if fit is None:
         missing.append(('dynamics', _why_static(windows, band)))

@@ -16,14 +16,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import re
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.errors import ModelError
-from piezo_ident.memory import fit_memory, is_at_rest
+from piezo_ident.memory import start_memory
 from piezo_ident.metrics import percent_of_stroke
 from piezo_ident.model import StageModel
 from piezo_ident.record import Piece, Record
@@ -78,14 +78,11 @@ class SineError:
     n: int
 
 
-def start_memory(model: StageModel, piece: Piece) -> ArrayLike | None:
-    """Return the play outputs at the start of a piece; None where it starts at rest."""
-    if is_at_rest(model, piece):
-        return None
-    return fit_memory(model, piece)
-
-
-def free_runs(model: StageModel, records: Iterable[Record] | Record) -> list[FreeRun]:
+def free_runs(
+    model: StageModel,
+    records: Iterable[Record] | Record,
+    memories: Mapping[tuple[str, float], ArrayLike] | None = None,
+) -> list[FreeRun]:
     """
     Run a model over all pieces that have its sampling rate.
 
@@ -93,6 +90,8 @@ def free_runs(model: StageModel, records: Iterable[Record] | Record) -> list[Fre
     ----------
     model : StageModel
     records : iterable of Record, or Record
+    memories : mapping, optional
+        Play outputs at the start of a piece, by the record's name and the piece's start time.
 
     Returns
     -------
@@ -107,7 +106,9 @@ def free_runs(model: StageModel, records: Iterable[Record] | Record) -> list[Fre
                 model.check_rate(piece)
             except ModelError:
                 continue
-            memory = start_memory(model, piece)
+            memory: ArrayLike | None = (memories or {}).get((record.name, piece.start_time))
+            if memory is None:
+                memory = start_memory(model, piece)
             y_hat, y_static = (m.predict_piece(piece, memory) for m in (model, static))
             runs.append(FreeRun(record.name, piece, y_hat, y_static))
     return runs

@@ -45,8 +45,6 @@ def inside(effect) -> dict:
             # a hundredth of what is declared, but never far out
             to = high if p.neutral < high else low
             x = p.neutral + np.sign(to - p.neutral) * min(0.01, 0.01 * abs(to - p.neutral))
-            if not np.isfinite(p.neutral) or not np.isfinite(x):
-                x = max(low, min(high, 0.5))
         else:
             x = max(low, min(high, 1.0))
         values[p.name] = [x] if p.vector else x

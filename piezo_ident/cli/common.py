@@ -34,14 +34,14 @@ RECORD_FILES = ('.csv', '.npz', '.mat', '.mcap', '.db3')
 
 
 @contextmanager
-def naming(name: str) -> Iterator[None]:
-    """Put a name before messages that do not say what they are about."""
+def naming(*names: str) -> Iterator[None]:
+    """Put the names of the inputs before messages that do not say which of them they mean."""
     try:
         yield
     except PiezoIdentError as error:
-        if name in str(error):
+        if any(name in str(error) for name in names):
             raise
-        raise type(error)(f'{name}: {error}') from None
+        raise type(error)(f'{", ".join(names)}: {error}') from None
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:

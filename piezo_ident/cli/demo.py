@@ -100,7 +100,7 @@ def _paper_stage(out: Path, console: Console) -> None:
     stage = load_stage(find_config('stage_paper', 'stage'))
     console.say("1. The paper's stage, simulated, identified from voltage and displacement alone")
     record = _play(stage, 'identification', 1)
-    found = _identify(record, Settings(), console)
+    found = _identify('ten thresholds', record, Settings(), console)
     played = _play(stage, 'validation', 2)
     _keep(found, out / 'stage_paper', console, record, played)
     sines = sine_errors(found.model, played)
@@ -125,10 +125,10 @@ def _dense_stage(out: Path, console: Console) -> None:
     console.say('2. A harder stage: forty thresholds, none of them where the fit puts its own')
     record = _play(stage, 'identification', 3)
     sines, loops = _play(stage, 'validation', 4), _play(stage, 'minor_loops', 5)
-    ten = _identify(record, Settings(), console)
+    ten = _identify('ten thresholds', record, Settings(), console)
     # delay and order are those just found; only the hysteresis is fitted in another way
     same = Settings(refine=True, order=ten.dynamics.order, delay=ten.delay.samples)
-    refined = _identify(record, same, console)
+    refined = _identify('refined thresholds', record, same, console)
     _keep(refined, out / 'stage_dense', console, record, sines, loops)
     console.say(f'Not fitted: {FORMULA}, in %')
     console.say(_heads(FREQUENCIES, 'minor loops'))
@@ -149,7 +149,7 @@ def _measured(out: Path, path: Path | None, console: Console) -> None:
         )
         return
     record = read_record(path)
-    found = _identify(record, Settings(), console)
+    found = _identify('ten thresholds', record, Settings(), console)
     _keep(found, out / 'measured', console, record)
     console.say(text_summary(found))
     console.say()
@@ -160,12 +160,12 @@ def _play(stage: SimulatedStage, program: str, seed: int) -> Record:
     return simulate(stage, sequence, np.random.default_rng([stage.seed, seed]), name=program)
 
 
-def _identify(record: Record, settings: Settings, console: Console) -> Identification:
+def _identify(title: str, record: Record, settings: Settings, console: Console) -> Identification:
     began = time.monotonic()
     with console.progress() as progress:
         found = identify(record, settings, progress=progress)
     console.say(
-        f'   {record.name}: {record.duration:.1f} s of data, {record.n} samples, identified in '
+        f'   {title}: identified from {record.duration:.1f} s of data ({record.n} samples) in '
         f'{time.monotonic() - began:.1f} s'
     )
     return found

@@ -66,7 +66,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         check_folder(args.report)
     records = [read(path, args) for path in paths]
     validation = [read(path, args) for path in further]
-    with naming(', '.join(record.name for record in records)), console.progress() as progress:
+    with naming(*(record.name for record in records)), console.progress() as progress:
         result = identify(records, settings, progress=progress)
     checks = [_validate(result.model, record) for record in validation]
 
@@ -179,7 +179,7 @@ def _error_lines(free_run: RecordPrediction) -> list[str]:
         else:
             rows.append(('start forgotten', free_run.after))
     table = [
-        f'  {name:16s} {e.percent:8.3f} % of stroke   fit {e.fit:7.2f} %   {e.n} samples'
+        f'  {name:16s} {e.percent:8.3g} % of stroke   fit {e.fit:8.3f} %   {e.n} samples'
         for name, e in rows
     ]
     return [

@@ -116,7 +116,7 @@ class Effect:
         for name, p in known.items():
             try:
                 number = np.asarray(values[name], dtype=np.float64)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise ModelError(f'effect {cls.name}: {name} is not a number') from None
             if number.ndim != int(p.vector):
                 shape = 'a list of numbers' if p.vector else 'one number'

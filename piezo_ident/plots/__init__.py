@@ -107,6 +107,16 @@ def held_out_from(identification: Identification, run: FreeRun) -> int | None:
     return fitted if fitted < run.piece.n else None
 
 
+def response_caption(identification: Identification) -> str:
+    """Return what the picture of the frequency response shows."""
+    if identification.dynamics.response is None:
+        return 'G(z) z^-d of the model; without a noise segment none was measured. Dotted: modes.'
+    return (
+        'Welch estimate from the noise segment with its standard deviation, and the slope of H at '
+        'the bias times G(z) z^-d. Dotted: modes of G.'
+    )
+
+
 def draw(identification: Identification, runs: Sequence[FreeRun]) -> Drawn:
     """
     Draw everything that the data of an identification allow.
@@ -172,8 +182,7 @@ def draw(identification: Identification, runs: Sequence[FreeRun]) -> Drawn:
         (
             'response',
             'Frequency response',
-            'Welch estimate from the noise segment with its standard deviation, and the slope of '
-            'H at the bias times G(z) z^-d. Dotted: modes of G.',
+            response_caption(identification),
             lambda: response_figure(identification),
         ),
         (

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -100,7 +101,7 @@ def loops_figure(runs: Sequence[FreeRun], edges: Sequence[int | None] = ()) -> F
     limit, largest = _limit(error)
     _symmetric(errors, limit)
     if largest > limit:
-        note(errors, f'cut; up to {largest:.3g} {unit}')
+        note(errors, f'axis cut; largest {largest:.3g} {unit}')
     name = ', '.join(filter(None, (safe(run.record), safe(s.label))))
     tidy(loops, '', 'displacement / µm', name)
     tidy(errors, 'voltage / V', f'error / {unit}')
@@ -177,7 +178,7 @@ def _draw_error(
     """
     unit, scale = _error_unit(e)
     limit, largest = _limit(scale * e)
-    said = [f'cut; up to {largest:.3g} {unit}'] if largest > limit else []
+    said = [f'axis cut; largest {largest:.3g} {unit}'] if largest > limit else []
     if not np.array_equal(e, e_static):
         static_limit, static_largest = _limit(scale * e_static)
         if static_limit <= READABLE * limit:
@@ -205,9 +206,14 @@ def _percent_axis(axes: Axes, stroke: float) -> None:
     """Add a right-hand axis in % of stroke; `stroke` in the unit of the left one."""
     if stroke <= 0.0:
         return
-    right = axes.secondary_yaxis(
-        'right', functions=(lambda e: 100.0 * e / stroke, lambda p: p * stroke / 100.0)
-    )
+
+    def percent(e: Any) -> Any:
+        return 100.0 * e / stroke
+
+    def error(p: Any) -> Any:
+        return p * stroke / 100.0
+
+    right = axes.secondary_yaxis('right', functions=(percent, error))
     right.set_ylabel('% of stroke', fontsize=NORMAL)
     right.tick_params(labelsize=SMALL)
 

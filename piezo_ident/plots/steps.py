@@ -18,19 +18,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.delay import delay_from_steps, StepDelay
+from piezo_ident.frequency_response import FrequencyResponse
 from piezo_ident.plots.style import (
     COLOURS,
     figure,
     GREY,
     legend,
+    lightness,
     NORMAL,
     NothingToDraw,
     plain_log,
@@ -123,11 +126,10 @@ def _draw_step(
             floor if size else -level,
             level,
             color=COLOURS['band'],
-            label='noise threshold',
             zorder=1,
             linewidth=0,
         )
-        axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2, label=f'd = {d}')
+        axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2)
         if modelled is not None:
             axes.plot(lag, traces[1], color=COLOURS['model'], linewidth=1.2, label='model')
         axes.plot(lag, traces[0], 'o', color=COLOURS['measured'], markersize=2.8, label='measured')
@@ -141,6 +143,16 @@ def _draw_step(
     tidy(panels[0], 'samples after the step', 'response / nm V$^{-1}$', steps)
     tidy(panels[1], 'samples after the step', '', f'its size; d = {_time(d / rate)}')
     panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[1].annotate(
+        'noise threshold',
+        (1.0, level),
+        xycoords=('axes fraction', 'data'),
+        xytext=(-2, -3),
+        textcoords='offset points',
+        ha='right',
+        va='top',
+        fontsize=SMALL,
+    )
     legend(panels[0], loc='best')
 
 
@@ -190,47 +202,54 @@ def response_figure(identification: Identification) -> Figure:
 
     def modelled(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         lag = np.exp(-2j * np.pi * frequency * model.delay.total / rate)
-        return slope * model.dynamics.response(frequency, rate) * lag
+        return np.asarray(slope * model.dynamics.response(frequency, rate) * lag)
 
     G = modelled(f)
     phase = np.degrees(np.unwrap(np.angle(G)))
-    fig = figure(4.9 if measured is not None else 3.6)
-    heights = [2.0, 1.5, 0.9] if measured is not None else [2.0, 1.5]
-    axes = fig.subplots(
-        len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights}, squeeze=False
-    )[:, 0]
-    if measured is not None:
-        size = 1e6 * abs(model.scaling.Y) / model.scaling.V
-        R, std = size * measured.response, np.minimum(measured.std, 0.99)
-        # the turn that lies nearest to the model: noise cannot make it slip by a whole one
-        at = modelled(measured.frequency)
-        turns = np.degrees(np.angle(R / at)) + np.interp(measured.frequency, f, phase)
-        band = {'color': COLOURS['band'], 'linewidth': 0, 'zorder': 1}
-        x = measured.frequency
-        axes[0].fill_between(
-            x, np.abs(R) * (1 - std), np.abs(R) * (1 + std), label='± 1 standard dev.', **band
-        )
-        axes[1].fill_between(x, turns - np.degrees(std), turns + np.degrees(std), **band)
-        dots = {'color': COLOURS['measured'], 'markersize': 1.8, 'linestyle': 'none'}
-        axes[0].plot(x, np.abs(R), marker='o', label='measured', **dots)
-        axes[1].plot(x, turns, marker='o', **dots)
-        axes[2].plot(x, measured.coherence, color=COLOURS['measured'], linewidth=0.9)
-        axes[2].set_ylim(-0.02, 1.05)
-    axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model')
-    axes[1].plot(f, phase, color=COLOURS['model'], linewidth=1.4)
+    heights = [2.0, 1.5] if measured is None else [2.0, 1.5, 0.9]
+    fig = figure(1.1 * sum(heights))
+    axes: list[Axes] = list(
+        fig.subplots(
+            len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights}, squeeze=False
+        )[:, 0]
+    )
+    axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model', zorder=3)
+    axes[1].plot(f, phase, color=COLOURS['model'], linewidth=1.4, zorder=3)
     tidy(axes[0], '', f'magnitude {unit}')
     tidy(axes[1], '', 'phase / °')
     if measured is not None:
-        tidy(axes[2], '', 'coherence')
-        axes[2].yaxis.set_major_locator(MaxNLocator(3))
+        scale = 1e6 * abs(model.scaling.Y) / model.scaling.V
+        x, R = measured.frequency, scale * measured.response
+        # the turn that lies nearest to the model: noise cannot make it slip by a whole one
+        turns = np.degrees(np.angle(R / modelled(x))) + np.interp(x, f, phase)
+        _draw_measured(axes, measured, R, turns)
     plain_log(axes[0].yaxis, *axes[0].get_ylim())
     plain_log(axes[-1].xaxis, low, top)
     axes[-1].set_xlabel('frequency / Hz', fontsize=NORMAL)
     axes[-1].set_xlim(0.9 * low, 1.05 * top)
     legend(axes[0], loc='lower left')
     _mark_modes(axes, [m for m in model.dynamics.modes(rate) if low < m[0] < top])
-    fig.align_ylabels(list(axes))
+    fig.align_ylabels(axes)
     return fig
+
+
+def _draw_measured(
+    axes: Sequence[Axes],
+    measured: FrequencyResponse,
+    R: NDArray[np.complex128],
+    turns: NDArray[np.float64],
+) -> None:
+    x, size, std = measured.frequency, np.abs(R), np.minimum(measured.std, 0.99)
+    band: dict[str, Any] = {'color': COLOURS['band'], 'linewidth': 0, 'zorder': 1}
+    axes[0].fill_between(x, size * (1 - std), size * (1 + std), label='± 1 standard dev.', **band)
+    axes[1].fill_between(x, turns - np.degrees(std), turns + np.degrees(std), **band)
+    dots: dict[str, Any] = {'color': COLOURS['measured'], 'markersize': 1.8, 'zorder': 2}
+    axes[0].plot(x, size, 'o', label='measured', **dots)
+    axes[1].plot(x, turns, 'o', **dots)
+    axes[2].plot(x, measured.coherence, color=COLOURS['measured'], linewidth=0.9)
+    axes[2].set_ylim(-0.02, 1.05)
+    tidy(axes[2], '', 'coherence')
+    axes[2].yaxis.set_major_locator(MaxNLocator(3))
 
 
 def _mark_modes(axes: Sequence[Axes], modes: list[tuple[float, float]]) -> None:
@@ -280,7 +299,7 @@ def orders_figure(identification: Identification) -> Figure:
         np.ma.masked_invalid(ratio),
         origin='lower',
         norm=LogNorm(1.0, WORST),
-        cmap=_lightness(),
+        cmap=lightness(),
         extent=(0.5, ratio.shape[1] + 0.5, 0.5, ratio.shape[0] + 0.5),
         interpolation='nearest',
         aspect='auto',
@@ -326,13 +345,6 @@ def orders_figure(identification: Identification) -> Figure:
         columnspacing=1.2,
     )
     return fig
-
-
-def _lightness() -> ListedColormap:
-    """Return a map of one hue, light where the error is small, so that marks are seen on it."""
-    share = np.linspace(0.0, 1.0, 256)[:, None]
-    light, dark = np.array([[0.97, 0.98, 1.0]]), np.array([[0.03, 0.19, 0.42]])
-    return ListedColormap(np.clip(light + (dark - light) * share**0.8, 0.0, 1.0), 'lightness')
 
 
 def weights_figure(identification: Identification) -> Figure:

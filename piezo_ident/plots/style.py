@@ -26,6 +26,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
@@ -39,6 +40,7 @@ __all__ = [
     'figure',
     'legend',
     'legend_above',
+    'lightness',
     'line',
     'note',
     'plain_log',
@@ -172,8 +174,8 @@ def line(
 
 def plain_log(axis: Axis, low: float, high: float) -> None:
     """Write plain numbers on a logarithmic axis, as many as its range [low, high] has room for."""
-    decades = np.log10(high / low)
-    subs = (1.0,) if decades > 3.0 else (1.0, 2.0, 5.0)
+    decades = float(np.log10(high / low))
+    subs: tuple[float, ...] = (1.0,) if decades > 3.0 else (1.0, 2.0, 5.0)
     if decades < 0.5:
         subs = tuple(float(k) for k in range(1, 10))
     axis.set_major_locator(LogLocator(subs=subs, numticks=20))
@@ -198,3 +200,10 @@ def legend_above(axes: Axes) -> None:
         handlelength=1.6,
         columnspacing=1.4,
     )
+
+
+def lightness() -> ListedColormap:
+    """Return a map of one hue, light where the error is small, so that marks are seen on it."""
+    share = np.linspace(0.0, 1.0, 256)[:, None]
+    light, dark = np.array([[0.97, 0.98, 1.0]]), np.array([[0.03, 0.19, 0.42]])
+    return ListedColormap(np.clip(light + (dark - light) * share**0.8, 0.0, 1.0), 'lightness')

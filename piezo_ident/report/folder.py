@@ -68,7 +68,7 @@ def write_report(
     from piezo_ident.plots import DPI, draw, NAMES
 
     records = [records] if isinstance(records, Record) else list(records)
-    runs = free_runs(identification.model, records)
+    runs = free_runs(identification.model, records, identification.memories)
     drawn = draw(identification, runs)
     shown = []
     for picture in drawn.pictures:

@@ -31,7 +31,18 @@ from piezo_ident.record import Record
 from piezo_ident.results import Identification
 from piezo_ident.validation import FreeRun, sines_of
 
-__all__ = ['JSON_VERSION', 'Mode', 'modes', 'number', 'to_json', 'verdict']
+__all__ = [
+    'JSON_VERSION',
+    'KINDS',
+    'Mode',
+    'length',
+    'modes',
+    'moves',
+    'number',
+    'share',
+    'to_json',
+    'verdict',
+]
 
 JSON_VERSION = 1
 #: what is compared, in the order in which it is shown
@@ -111,6 +122,12 @@ def number(value: float | None, digits: int = 3) -> str:
     return f'{value:.{max(0, places)}f}' if value else '0'
 
 
+def share(percent: float) -> str:
+    """Return a percentage for people, to two decimals."""
+    # adding zero turns a negative zero into a plain one
+    return f'{round(percent, 2) + 0.0:.2f}' if math.isfinite(percent) else number(percent)
+
+
 def length(metres: float) -> str:
     """Return a length in the unit in which it is read best."""
     for limit, factor, unit in ((1e-3, 1e3, 'mm'), (1e-6, 1e6, 'µm'), (0.0, 1e9, 'nm')):
@@ -121,19 +138,25 @@ def length(metres: float) -> str:
 
 def verdict(identification: Identification) -> str:
     """Return what was found, in one sentence."""
-    held, fitted = identification.error('held out'), identification.error('fitted')
-    if math.isfinite(held):
-        first = f'On data it did not fit, the model errs by {number(held)} % of stroke'
-        static = _static_error(identification, 'held out')
+    held = math.isfinite(identification.error('held out'))
+    selection = [row for row in identification.errors if row.data == 'selection']
+    if held:
+        kind, said = 'held out', 'On data it did not fit'
+    elif selection:
+        # rest and ramps flatter: they are no test of a model
+        kind, said = 'selection', 'On the parts of noise and triangle that were kept from the fit'
     else:
-        first = (
-            f'Nothing was held out; on the data it was fitted to, the model errs by '
-            f'{number(fitted)} % of stroke'
-        )
-        static = _static_error(identification, 'fitted')
+        kind, said = 'fitted', 'Nothing was held out; on the data it was fitted to'
+    said += f', the model errs by {number(identification.error(kind))} % of stroke'
+    static = _static_error(identification, kind)
     if not identification.model.is_static and math.isfinite(static):
-        first += f', its hysteresis alone by {number(static)} %'
-    return f'{first} ({FORMULA}).'
+        said += f', its hysteresis alone by {number(static)} %'
+    return f'{said} ({FORMULA}).'
+
+
+def moves(label: str) -> bool:
+    """Return whether a segment drives the stage to test it, rather than rests or moves over."""
+    return label.partition(':')[0] not in ('idle', 'ramp')
 
 
 def _static_error(identification: Identification, data: str) -> float:

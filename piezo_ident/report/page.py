@@ -39,6 +39,9 @@ __all__ = ['Shown', 'page']
 #: name, title, caption and PNG of a picture
 Shown = tuple[str, str, str, bytes]
 
+#: size on the screen of a pixel of a picture: the letters of both then have one size
+SHOWN = 0.72
+
 STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif;
@@ -107,9 +110,11 @@ def _table(table: Table) -> str:
 def _figure(shown: Shown) -> str:
     name, title, caption, png = shown
     data = base64.b64encode(png).decode('ascii')
+    # the width in pixels stands at bytes 16 to 19 of every PNG
+    width = round(SHOWN * int.from_bytes(png[16:20], 'big'))
     return (
         f'<figure id="{escape(name)}"><img src="data:image/png;base64,{data}" '
-        f'alt="{escape(title)}">\n'
+        f'width="{width}" alt="{escape(title)}">\n'
         f'<figcaption><b>{escape(title)}.</b> {escape(caption)}</figcaption></figure>\n'
     )
 

@@ -24,7 +24,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.metrics import FORMULA
 from piezo_ident.record import Record
-from piezo_ident.report.numbers import KINDS, length, modes, number
+from piezo_ident.report.numbers import KINDS, length, modes, moves, number, share
 from piezo_ident.results import Identification
 from piezo_ident.validation import SineError
 
@@ -73,7 +73,7 @@ def facts(identification: Identification) -> list[tuple[str, str]]:
         'stroke': length(identification.stroke),
         'voltage': f'{low:g} .. {high:g} V',
         'sampling rate': f'{model.sample_rate:g} Hz',
-        'delay': f'{delay.samples} ± {number(delay.std, 2)} samples = {number(lag, 4)} µs',
+        'delay': f'{delay.samples} ± {number(delay.std, 2)} samples = {lag:.4g} µs',
         'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
         'hysteresis': f'{model.hysteresis.thresholds.size} thresholds, p1, p2',
         'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
@@ -88,7 +88,13 @@ def facts(identification: Identification) -> list[tuple[str, str]]:
 def error_tables(identification: Identification, sines: Sequence[SineError]) -> list[Table]:
     """Return the errors by segment, and in the layout of the paper's Table I."""
     order = {kind: i for i, kind in enumerate(KINDS)}
-    rows = sorted(identification.errors, key=lambda row: order.get(row.data, len(order)))
+    rows = sorted(
+        identification.errors,
+        key=lambda row: (order.get(row.data, len(order)), not moves(row.segment)),
+    )
+    source = identification.noise_source
+    if identification.noise_floor is not None:
+        source = f'from {source}'
     tables = [
         Table(
             'Errors',
@@ -96,8 +102,8 @@ def error_tables(identification: Identification, sines: Sequence[SineError]) -> 
                 'record',
                 'segment',
                 'data',
-                'model',
-                'hysteresis alone',
+                'model / %',
+                'hysteresis alone / %',
                 'NRMSE fit / %',
                 'samples',
             ),
@@ -108,7 +114,7 @@ def error_tables(identification: Identification, sines: Sequence[SineError]) -> 
                     row.data,
                     number(row.percent),
                     number(row.static_percent),
-                    number(row.fit, 4),
+                    share(row.fit),
                     str(row.n),
                 )
                 for row in rows
@@ -117,7 +123,7 @@ def error_tables(identification: Identification, sines: Sequence[SineError]) -> 
             '100 (1 - |y - y_hat| / |y - mean y|) over the samples of the row; it says nothing '
             'where the stage rests. "held out": neither fitted nor looked at before; '
             '"selection": not fitted, but chose between models. '
-            f'Sensor noise: {identification.noise_source}.',
+            f'Sensor noise: {source}.',
         )
     ]
     if sines:
@@ -175,8 +181,8 @@ def dynamics_tables(identification: Identification) -> list[Table]:
             f'leaves a static gain of {PAPER_GAIN} in G; the last column is b in its split.',
         )
     )
-    found = modes(G, model.sample_rate, dynamics.covariance)
-    if found:
+    poles = modes(G, model.sample_rate, dynamics.covariance)
+    if poles:
         tables.append(
             Table(
                 'Poles of G as modes',
@@ -189,10 +195,11 @@ def dynamics_tables(identification: Identification) -> list[Table]:
                         number(mode.damping) if mode.oscillates else '–',
                         number(mode.damping_std, 2) if mode.oscillates else '–',
                     )
-                    for mode in found
+                    for mode in poles
                 ),
                 'Real: corner frequency. A mode whose uncertainty is as large as itself only '
-                'helps the others to fit.',
+                f'helps the others to fit. The input has power up to {number(dynamics.band, 4)} '
+                'Hz; what lies above is an extrapolation.',
             )
         )
     if dynamics.methods:

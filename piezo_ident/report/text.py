@@ -21,7 +21,7 @@ import textwrap
 
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
-from piezo_ident.report.numbers import KINDS, length, number, verdict
+from piezo_ident.report.numbers import KINDS, length, moves, number, share, verdict
 from piezo_ident.results import Identification
 from piezo_ident.validation import sine_errors, SineError
 
@@ -117,7 +117,8 @@ def text_summary(identification: Identification) -> str:
     lines += [f'{what:<14}{said}' for what, said in facts]
     table = [['error / % of stroke', 'model', 'hysteresis alone', 'NRMSE fit / %', 'samples']]
     for kind in KINDS:
-        for row in identification.errors:
+        # what rests or only moves over comes last
+        for row in sorted(identification.errors, key=lambda row: not moves(row.segment)):
             if row.data == kind:
                 name = printable(' '.join(filter(None, (row.record, row.segment))))
                 table.append(
@@ -125,7 +126,7 @@ def text_summary(identification: Identification) -> str:
                         f'{name}, {kind}',
                         number(row.percent),
                         number(row.static_percent),
-                        number(row.fit, 4),
+                        share(row.fit),
                         str(row.n),
                     ]
                 )
