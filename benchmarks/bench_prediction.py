@@ -24,6 +24,11 @@ Every figure is the median over paired runs; only ratios are worth comparing bet
 
 from __future__ import annotations
 
+import os
+
+# tall, narrow factorisations only get slower on more threads
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 from collections.abc import Callable
 import platform
 import time

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.dynamics import Dynamics, filter_arx
 
-__all__ = ['OutputErrorFit', 'Stretch', 'output_error']
+__all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
@@ -118,6 +118,11 @@ class _Problem:
             H += J @ J.T
             g += J @ (e - e.mean())
         return H, g
+
+
+def simulation_error(stretches: Sequence[Stretch], model: Dynamics) -> float:
+    """Return the rms of the free-run error, an offset taken out of each stretch."""
+    return float(np.sqrt(_Problem(stretches, model.a.size, model.b.size).loss(model)[0]))
 
 
 def output_error(

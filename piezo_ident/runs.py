@@ -38,8 +38,8 @@ __all__ = [
 
 #: share of a triangle that is one block of held-out data, and how many blocks share one
 BLOCKS, EVERY = 60, 5
-#: share at the end of every noise segment that is not fitted
-NOISE_HELD = 0.2
+#: share at the end of every noise and step segment that is not fitted
+END_HELD = 0.2
 #: a record starts from a known memory when its voltage starts within this share of the lowest
 REST = 0.01
 
@@ -76,14 +76,14 @@ class Run:
 
     def held_out(self) -> NDArray[np.bool_]:
         """
-        Return which samples of the triangle and the noise are kept from every fit.
+        Return which samples of triangle, noise and steps are kept from every fit.
 
-        Of a triangle every fifth block that holds no turning point, of the noise the end.
+        Of a triangle every fifth block that holds no turning point, of the others the end.
         """
         held = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
-            if s.kind == 'noise':
-                held[s.stop - int(NOISE_HELD * s.n) : s.stop] = True
+            if s.kind in ('noise', 'step'):
+                held[s.stop - int(END_HELD * s.n) : s.stop] = True
             elif s.kind == 'triangle':
                 edges = np.linspace(s.start, s.stop, BLOCKS + 1).astype(int)
                 for start, stop in zip(edges[2::EVERY], edges[3::EVERY], strict=False):

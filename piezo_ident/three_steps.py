@@ -45,9 +45,9 @@ from piezo_ident.frequency_response import frequency_response
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.hysteresis_fit import Excerpt, factorise, fine_thresholds, fit_hysteresis
 from piezo_ident.least_squares import triangular_factor
-from piezo_ident.output_error import output_error, OutputErrorFit, Stretch
+from piezo_ident.output_error import output_error, OutputErrorFit, simulation_error, Stretch
 from piezo_ident.results import DelayResult, DynamicsResult, Progress, Settings
-from piezo_ident.runs import NOISE_HELD, Run
+from piezo_ident.runs import END_HELD, Run
 from scipy import signal
 
 __all__ = ['first_step', 'second_step', 'triangle_excerpts']
@@ -56,12 +56,14 @@ __all__ = ['first_step', 'second_step', 'triangle_excerpts']
 MAX_DELAY = 30
 #: na and nb of the scan
 SCAN_ORDER = 8
-#: orders within this share of the best held-out error count as equal; the smaller one wins
-SLACK = 0.01
+#: orders within this share of the best held-out error count as equal; smaller ones go first
+SLACK = 0.05
+#: share by which a larger order must lower the held-out error
+GAIN = 0.005
 #: samples of simulation ahead of the first that counts
 WARM_UP = 2000
 #: candidates that are refined and judged again
-CANDIDATES = 3
+CANDIDATES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,7 @@ def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noi
     u = prefilter(signal[start:stop], rate, band)
     y = prefilter(run.x[start:stop], rate, band)
     settle = min(500, u.size // 20)
-    n_fit = u.size - int(NOISE_HELD * u.size) - settle
+    n_fit = u.size - int(END_HELD * u.size) - settle
     return _Noise(u[settle:], y[settle:], n_fit, band)
 
 
@@ -190,8 +192,8 @@ def _orders(
     delay: int,
     candidates: int,
     progress: Callable[[float], None],
-) -> tuple[DynamicsResult, Dynamics]:
-    """Search the orders, refine the best few, and take the one with the least held-out error."""
+) -> list[tuple[DynamicsResult, Dynamics]]:
+    """Search the orders and refine the best few."""
     factor = _factor(noise, settings, delay)
     table = scan_orders(
         factor,
@@ -208,7 +210,7 @@ def _orders(
             f'({settings.max_order}, {settings.max_order}) gave a stable model; '
             'is the noise segment really noise, and is the displacement its answer?'
         )
-    best: tuple[float, DynamicsResult, Dynamics] | None = None
+    found = []
     for i, (na, nb) in enumerate(orders):
         theta, _ = factor.fit(na, nb, delay)
         ls = Dynamics(a=theta[:na], b=theta[na:])
@@ -221,15 +223,13 @@ def _orders(
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls
         fit = _refined_on_noise(noise, stabilised(start), delay, maxiter=10)
         errors['output error'] = _held_error(noise, fit.dynamics, delay)
-        result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
-        score = errors['output error']
-        # a larger model must earn its size
-        if best is None or score < best[0] / (1.0 + SLACK / 2):
-            best = (score, result, fit.dynamics)
+        if np.isfinite(errors['output error']):
+            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
+            found.append((result, fit.dynamics))
         progress(0.5 + 0.5 * (i + 1) / len(orders))
-    if best is None or not np.isfinite(best[0]):
+    if not found:
         raise IdentificationError('dynamics: no stable model was found; set --order')
-    return best[1], best[2]
+    return found
 
 
 def second_step(
@@ -262,7 +262,7 @@ def second_step(
     progress('dynamics', 0.0)
     raw = _noise(run, run.u, start, stop)
     # only good enough to undo the hysteresis
-    _, first = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
+    [(_, first)] = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
     G = first.normalised()
 
     excerpts = triangle_excerpts(runs)
@@ -277,20 +277,26 @@ def second_step(
     H = undo(G)
     progress('dynamics', 0.45)
     undone = _noise(run, H(run.u), start, stop)
-    result, G = _orders(
-        undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.3 * share)
+    found = _orders(
+        undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.2 * share)
     )
-    G = G.normalised()
-    covariance = result.covariance
-    for i in range(2):
-        fit = output_error(_stretches(runs, H, delay), G, maxiter=8)
-        gain = fit.dynamics.gain
-        G = fit.dynamics.normalised()
-        scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
-        covariance = fit.covariance * np.outer(scale, scale)
-        progress('dynamics', 0.75 + 0.1 * (i + 1))
-        if i == 0:
-            H = undo(G)
+    # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
+    stretches = _stretches(runs, H, delay)
+    held = _stretches(runs, H, delay, held=True)
+    best, result = float('inf'), found[0][0]
+    for i, (candidate, start_G) in enumerate(found):
+        fit = output_error(stretches, start_G.normalised(), maxiter=6)
+        score = simulation_error(held, fit.dynamics)
+        # a larger model comes later, and must earn its size
+        if score < best / (1.0 + GAIN):
+            best, result, G = score, candidate, fit.dynamics.normalised()
+        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
+    H = undo(G)
+    fit = output_error(_stretches(runs, H, delay), G, maxiter=8)
+    G, gain = fit.dynamics.normalised(), fit.dynamics.gain
+    scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
+    covariance = fit.covariance * np.outer(scale, scale)
+    progress('dynamics', 0.95)
     # the same regression on the measured and on the modelled answer: the plays that the noise
     # drags along count in both
     noise = slice(start, stop)
@@ -319,10 +325,13 @@ def second_step(
     )
 
 
-def _stretches(runs: Sequence[Run], H: Hysteresis, delay: Delay) -> list[Stretch]:
+def _stretches(
+    runs: Sequence[Run], H: Hysteresis, delay: Delay, held: bool = False
+) -> list[Stretch]:
     stretches = []
     for run in runs:
-        use = run.mask('step', 'settle', 'noise') & ~run.held_out()
+        out = run.held_out()
+        use = run.mask('step', 'settle', 'noise') & (out if held else ~out)
         if use.any():
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]

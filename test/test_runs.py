@@ -24,7 +24,7 @@ from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.runs import (
     common_rate,
     noise_floor,
-    NOISE_HELD,
+    END_HELD,
     refuse_closed_loop,
     runs_of,
     scaling_of,
@@ -106,7 +106,7 @@ def test_masks_are_those_of_the_kinds():
 
 def test_end_of_the_noise_is_held_out():
     run = run_of(RAMP, ('noise', 100, 600))
-    first = 600 - int(NOISE_HELD * 500)
+    first = 600 - int(END_HELD * 500)
     assert_array_equal(np.flatnonzero(run.held_out()), np.arange(first, 600))
 
 
