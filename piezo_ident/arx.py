@@ -284,6 +284,7 @@ def instrumental_variables(
         phi = np.hstack([-lags(yf, na, 1), lags(uf, nb, 0)])
         z = np.hstack([-lags(sf, na, 1), lags(uf, nb, 0)])
         scale = np.linalg.norm(z, axis=0)
+        scale[scale == 0.0] = 1.0
         theta = np.linalg.lstsq((z / scale).T @ phi, (z / scale).T @ yf[first:], rcond=None)[0]
         candidate = Dynamics(a=theta[:na], b=theta[na:])
         if not candidate.is_stable:

@@ -186,7 +186,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 
-def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int:
+def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int | None:
     """
     Return the delay that a scan of the ARX loss points to.
 
@@ -199,6 +199,11 @@ def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int:
         One-step loss for d = 0, 1, ...
     tolerance : float, optional
         Rise over the smallest loss that counts as none.
+
+    Returns
+    -------
+    int or None
+        None when the loss has not risen at the largest delay tried: then it tells nothing.
     """
     low = np.flatnonzero(loss <= (1.0 + tolerance) * loss.min())
-    return int(low[-1])
+    return int(low[-1]) if low[-1] < loss.size - 1 else None

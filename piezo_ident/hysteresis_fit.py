@@ -187,6 +187,29 @@ def factorise(
     return triangular_factor(rows(), k + m + 3)
 
 
+def _independent(A: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """
+    Return which columns of ``[F_r | v^3 | v]`` the data tell apart.
+
+    A voltage that only takes two levels makes every play and the cubic a multiple of v: then the
+    linear term is kept, and weights of any size cannot cancel each other.
+    """
+    m = A.shape[1] - 2
+    keep, basis = np.zeros(m + 2, dtype=bool), np.empty((A.shape[0], 0))
+    for j in (m + 1, m, *range(m)):
+        size = np.linalg.norm(A[:, j])
+        if size == 0.0:
+            continue
+        rest = A[:, j] / size
+        for _ in range(2):
+            rest = rest - basis @ (basis.T @ rest)
+        size = np.linalg.norm(rest)
+        if size > STILL:
+            keep[j] = True
+            basis = np.column_stack([basis, rest / size])
+    return keep
+
+
 @dataclass(frozen=True, eq=False)
 class HysteresisFit:
     """
@@ -270,11 +293,12 @@ def fit_hysteresis(
     # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
     still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
     inner[:, :m][:, still] = 0.0
+    inner[:, :-1][:, ~_independent(inner[:, :-1])] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
     lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
     x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
-    x[:m][still] = 0.0
+    x[np.linalg.norm(inner[:, :-1], axis=0) == 0.0] = 0.0
     swarm = None
     swarm_loss = None
     if solver == 'swarm':
@@ -294,7 +318,7 @@ def fit_hysteresis(
         # from the factor, not from the Gram matrix: the difference of large squares loses digits
         swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
     offsets = np.linalg.solve(R[:k, :k], R[:k, -1] - R[:k, k:-1] @ x)
-    free = x > lower
+    free = (x > lower) & inner[:, :-1].any(axis=0)
     std = np.zeros(m + 2)
     gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
     variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum

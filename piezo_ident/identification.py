@@ -179,9 +179,12 @@ def _third_step(
     progress('hysteresis', 0.0)
     swing = max(float(np.ptp(e.u[e.use])) for e in fit)
     n, rows = int(sum(e.use.sum() for e in fit)), sum(e.rows for e in fit)
-    if settings.refine:
+    if settings.refine and any(e.use.any() for e in held):
         # thresholds and weights are found together, by least squares alone
-        r = choose_thresholds(fit, held, swing, G, delay)
+        r = choose_thresholds(
+            fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.9 * share)
+        )
+        progress('hysteresis', 1.0)
         return fit_hysteresis(factorise(fit, r, G, delay), r, n, rows=rows)
     r = even_thresholds(swing, settings.thresholds)
     R = factorise(fit, r, G, delay)
@@ -216,9 +219,15 @@ def _labelled(
     delay_result = first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
     dynamics, G = second_step(runs, delay, settings, progress)
-    result = _third_step(fit, triangle_excerpts(runs, held=True), G, delay, settings, progress)
+    held = triangle_excerpts(runs, held=True)
+    result = _third_step(fit, held, G, delay, settings, progress)
     model = _model(rate, scaling, result, G, delay)
     said = []
+    if settings.refine and not any(e.use.any() for e in held):
+        said.append(
+            'the triangle turns too often to hold a part of it out; the thresholds were not '
+            'refined, use a slower triangle'
+        )
     if delay_result.source == 'scan':
         said.append('no step rises above the noise; the delay was read from the ARX loss alone')
     lowest = min(float(e.u[e.use].min()) for e in fit)
@@ -265,7 +274,14 @@ def _unlabelled(
     late_part = [Excerpt(u, x, use & late, joint.memory)]
     whole = [Excerpt(u, x, use, joint.memory)]
     if settings.refine:
-        r = choose_thresholds(fit_part, late_part, float(np.ptp(u[use])), joint.G, delay)
+        r = choose_thresholds(
+            fit_part,
+            late_part,
+            float(np.ptp(u[use])),
+            joint.G,
+            delay,
+            lambda share: progress('hysteresis', 0.9 * share),
+        )
         result = fit_hysteresis(
             factorise(whole, r, joint.G, delay), r, int(use.sum()), rows=whole[0].rows
         )
@@ -290,7 +306,8 @@ def _unlabelled(
     ]
     fitted_error = [row for row in rows if row.data == 'fitted' and row.record == run.record]
     held_error = [row for row in rows if row.data == 'held out' and row.record == run.record]
-    ratio = _rms(held_error) / _rms(fitted_error) if fitted_error and held_error else 0.0
+    # a record without noise may be fitted exactly
+    ratio = _rms(held_error) / max(_rms(fitted_error), 1e-9) if fitted_error and held_error else 0
     if ratio > 3.0:
         said.append(
             f'the held-out error is {ratio:.1f} times the fitted one: '

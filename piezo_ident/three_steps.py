@@ -78,6 +78,10 @@ class _Noise:
 
 def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
     rate = run.piece.sample_rate
+    if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
+        raise IdentificationError(
+            f'{run.record}: voltage or displacement is constant in the noise segment'
+        )
     band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
     u = prefilter(signal[start:stop], rate, band)
     y = prefilter(run.x[start:stop], rate, band)
@@ -125,7 +129,11 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     if step is not None and step.samples is not None:
         return DelayResult(step.samples, step.std, 'steps', step, loss, scan)
     if scan is None:
-        raise IdentificationError('delay: no step, and noise too short to scan; set --delay')
+        what = 'too short to scan' if loss is None else 'that hides it below 30 samples'
+        raise IdentificationError(
+            f'delay: no step rises above the sensor noise, and a drive {what}; add larger steps, '
+            'or set --delay'
+        )
     run, start, stop = _longest_noise(runs)
     rate = run.piece.sample_rate
     band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
@@ -156,9 +164,10 @@ def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
     excerpts = []
     for run in runs:
         out = run.held_out()
-        use = run.mask('triangle') & run.known & (out if held else ~out)
-        if use.any():
-            excerpts.append(Excerpt(run.u, run.x, use))
+        triangle = run.mask('triangle') & run.known
+        # the same runs either way, so that each keeps its offset
+        if np.any(triangle & ~out):
+            excerpts.append(Excerpt(run.u, run.x, triangle & (out if held else ~out)))
     return excerpts
 
 

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,7 @@ def choose_thresholds(
     swing: float,
     dynamics: Dynamics,
     delay: Delay,
+    tick: Callable[[float], None] | None = None,
 ) -> NDArray[np.float64]:
     """
     Refine the thresholds until the held-out error stops falling.
@@ -73,6 +74,8 @@ def choose_thresholds(
         Excited range of the normalised voltage.
     dynamics : Dynamics
     delay : Delay
+    tick : callable, optional
+        Called with the share of the work done; may raise to stop it.
 
     Returns
     -------
@@ -82,7 +85,9 @@ def choose_thresholds(
     best = even_thresholds(swing, COUNTS[0])
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)
     misses = 0
-    for count in COUNTS[1:]:
+    for i, count in enumerate(COUNTS[1:]):
+        if tick is not None:
+            tick(i / len(COUNTS))
         even = even_thresholds(swing, count)
         loss, places = _held_loss(fit, held, even, dynamics, delay)
         candidates = [(loss, even)]

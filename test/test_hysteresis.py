@@ -14,6 +14,8 @@
 
 """H: eqs. (3) and (6), its slope, and what it refuses."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.block import Block
@@ -56,7 +58,7 @@ def test_slope_is_that_of_a_settled_loop(bias, excursion):
     # chord of the second small loop: up from the lower to the upper turning point
     low, high = bias - excursion / 2, bias + excursion / 2
     path = [0, bias, low, high, low, high]
-    v = np.concatenate([np.linspace(a, b, 200) for a, b in zip(path[:-1], path[1:], strict=True)])
+    v = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(path)])
     w = PAPER(v)
     chord = (w[-1] - w[-200]) / (high - low)
     # the cubic's chord differs from its tangent by p1 (excursion/2)^2

@@ -120,7 +120,6 @@ def test_std_is_what_repeats_scatter_by(rate):
         claimed.append(fit.std)
         rms.append(fit.rms)
     ratio = np.std(found, axis=0, ddof=1) / np.mean(claimed, axis=0)
-    print('scatter over claimed', ratio)
     assert_allclose(ratio, 1.0, atol=0.35)
     # the residual is seen after averaging over the rows of the fit
     row = Excerpt(u, x, use).row
@@ -168,6 +167,20 @@ def test_threshold_that_stands_still_where_it_is_fitted_gets_no_weight(seed):
     assert_array_equal(fit.hysteresis.weights[2:], [0.0, 0.0])
     assert_array_equal(fit.std[2:4], [0.0, 0.0])
     assert abs(fit.offsets[0]) < 1.0
+
+
+@pytest.mark.parametrize('noise', [0.0, 1e-12, 1e-3])
+def test_voltage_of_two_levels_does_not_explode(noise):
+    # every play and the cubic are then multiples of v: weights of 1e13 fit as well as any
+    u = np.repeat(np.tile([0.25, 0.75], 8), 500)
+    x = filter_arx(G.a, G.b, D.apply(H(u))) + noise * np.random.default_rng(0).standard_normal(
+        u.size
+    )
+    fit = fitted(Excerpt(u, x, np.ones(u.size, dtype=bool)))
+    h = fit.hysteresis
+    assert h.p1 == 0.0
+    assert np.abs([*h.weights, h.p2]).max() < 3.0
+    assert fit.rms < 2 * noise + 1e-6
 
 
 def test_known_memory_at_the_start_is_used():

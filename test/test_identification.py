@@ -104,19 +104,17 @@ def test_paper_stage_is_found(paper):
     assert result.warnings == ()
     assert result.not_identified == ()
     errors = sine_errors(PAPER.model, result.model)
-    print('sines, % of stroke:', np.round(errors, 5))
     assert max(errors) <= 0.02
     assert loop_error(PAPER.model, result.model) <= 0.02
     # the noise of the sensor and of its converter, 1.5 nm and 2.3 nm / sqrt(12)
     assert result.noise_floor == pytest.approx(100 * 1.64e-9 / result.stroke, rel=0.1)
-    assert result.error('held out') == pytest.approx(result.noise_floor, rel=0.1)
+    assert result.error('selection') == pytest.approx(result.noise_floor, rel=0.1)
 
 
 def test_hysteresis_alone_misses_as_in_the_paper(paper):
     # worked out from the printed coefficients for a stage that hides nothing
     errors = sine_errors(PAPER.model, paper[1].model.without_dynamics())
     expected = [0.09, 0.85, 4.3, 6.8, 8.5, 10.2]
-    print('hysteresis alone, % of stroke:', np.round(errors, 3))
     assert errors == pytest.approx(expected, rel=0.06)
 
 
@@ -169,19 +167,22 @@ def test_seeds_and_noise(seed, noise):
     assert result.delay.samples == 3
     assert result.model.dynamics.is_stable
     errors = sine_errors(PAPER.model, result.model)
-    print(noise, seed, np.round(errors, 4))
     assert max(errors) <= max(0.02, 200 * noise)
 
 
 def test_dense_truth_that_no_ten_thresholds_can_hit():
-    ten = identify(short(DENSE), QUICK)
-    fine = identify(short(DENSE), replace(QUICK, refine=True))
-    at_ten, refined = (sine_errors(DENSE.model, r.model) for r in (ten, fine))
-    loops = [loop_error(DENSE.model, r.model) for r in (ten, fine)]
-    print('ten', np.round(at_ten, 4), 'refined', np.round(refined, 4), 'loops', loops)
-    assert max(*at_ten, loops[0]) <= 0.25
-    assert max(*refined, loops[1]) <= 0.05
-    assert any(row.data == 'selection' for row in fine.errors) or fine.error('held out') > 0
+    record = simulate(DENSE, FULL.build(), np.random.default_rng(1), 'dense')
+    for refine, limit in ((False, 0.25), (True, 0.05)):
+        model = identify(record, Settings(refine=refine)).model
+        sines, loops = sine_errors(DENSE.model, model), loop_error(DENSE.model, model)
+        assert max(*sines, loops) <= limit
+
+
+def test_dense_truth_from_a_short_programme():
+    # 1.5 s of noise leave 0.09 % above 10 Hz, whatever the thresholds
+    model = identify(short(DENSE), replace(QUICK, refine=True)).model
+    assert max(sine_errors(DENSE.model, model)) <= 0.12
+    assert loop_error(DENSE.model, model) <= 0.05
 
 
 def test_retracting_stage():
@@ -264,7 +265,6 @@ def test_measured_one_hertz_record(refine, limit):
     result = identify(measured('piezo_1hz.csv'), Settings(refine=refine, hold_out=1.5))
     (held,) = [row for row in result.errors if row.data == 'held out']
     modes = result.model.dynamics.modes(result.model.sample_rate)
-    print('held out', held.percent, 'delay', result.delay.samples, 'modes', modes)
     assert held.n == 7500
     assert held.percent <= limit
     assert result.delay.samples == 1
@@ -399,7 +399,6 @@ AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
         (Piece(np.arange(2000) // 1000, 1e-6 * (np.arange(2000) // 1000), 1e3),)
     ),
     'noise unlabelled': lambda: relabelled(part('noise')),
-    'ends in a rest': lambda: relabelled(part('triangle', 'idle')),
 }
 
 
@@ -413,9 +412,7 @@ def test_awkward_records_give_a_result_or_a_reason(case, refine):
         assert isinstance(error, IdentificationError)
         assert len(str(error)) > 20
         assert '\n' not in str(error)
-        print(case, '->', error)
         return
-    print(case, '->', result.warnings, result.not_identified, result.error('held out'))
     assert result.model.dynamics.is_stable
     # a result is told of, and is no nonsense: it can be written, and does not explode
     model_from_dict(model_to_dict(result.model))
@@ -444,17 +441,18 @@ def test_scale_does_not_matter(scale):
     one = identify(short(), QUICK)
     two = identify(changed(lambda v, y: (v * scale, y * scale)), QUICK)
     assert two.delay.samples == one.delay.samples
-    assert two.error('held out') == pytest.approx(one.error('held out'), rel=1e-3)
+    assert two.error('selection') == pytest.approx(one.error('selection'), rel=1e-3)
     assert two.hysteresis.hysteresis.weights == pytest.approx(
         one.hysteresis.hysteresis.weights, abs=1e-6
     )
 
 
-def test_noise_of_a_tenth_is_said_and_the_rest_still_found():
-    result = identify(short(noise=0.1), Settings(max_order=4))
+def test_noise_of_a_tenth_hides_the_delay_and_leaves_the_hysteresis():
+    with pytest.raises(IdentificationError, match='delay'):
+        identify(short(noise=0.1), Settings(max_order=4))
+    result = identify(short(noise=0.1), Settings(max_order=4, delay=3))
     assert any('noise' in w for w in result.warnings)
     errors = sine_errors(PAPER.model, result.model)
-    print('sines at 10 % noise', errors, 'delay', result.delay.samples)
     assert max(errors) < 10.0
 
 

@@ -101,7 +101,6 @@ def test_covariance_is_what_repeats_scatter_by():
         theta.append(np.concatenate([fit.dynamics.a, fit.dynamics.b]))
         predicted.append(np.sqrt(np.diag(fit.covariance)))
     scatter, claimed = np.std(theta, axis=0, ddof=1), np.mean(predicted, axis=0)
-    print('scatter over claimed', scatter / claimed)
     # sixty runs know a standard deviation to 9 %
     assert_allclose(scatter / claimed, 1.0, atol=0.35)
     # unbiased within three standard errors

@@ -23,8 +23,8 @@ from piezo_ident.excitation import triangle
 from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.runs import (
     common_rate,
-    noise_floor,
     END_HELD,
+    noise_floor,
     refuse_closed_loop,
     runs_of,
     scaling_of,

@@ -164,7 +164,7 @@ def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: 
         axes.axvline(
             scan, color=COLOURS['static'], linestyle='--', linewidth=1.2, label=f'scan: {scan}'
         )
-    tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the noise')
+    tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the ARX loss')
     plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend(axes, loc='best')

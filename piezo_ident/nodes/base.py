@@ -1,0 +1,254 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What all nodes share: parameters, status, diagnostics, services that answer at once, a clean end.
+
+rclpy's own signal handlers shut the context down before a node can ramp its drive to rest, so
+the signals are taken here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+# before numpy is loaded: tall, narrow factorisations only get slower on more threads
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from piezo_ident.errors import PiezoIdentError
+from piezo_ident.nodes.parameters import Declaration, NODES
+from piezo_ident.nodes.wire import LATCHED, PREVIEW
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+
+__all__ = ['LabNode', 'run']
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class LabNode(Node):
+    """
+    A node of the graph.
+
+    A subclass names its executable, offers services with `offer`, reports with `report_status`,
+    fills `diagnose`, applies parameters in `apply`, and gives way in `close`.
+    """
+
+    executable: str
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(self.executable, **kwargs)
+        self._declared: dict[str, Declaration] = {}
+        self._status_lock = threading.Lock()
+        self._last_status: tuple[Any, ...] = ()
+        self.values: dict[str, Any] = {}
+        self._status = self.create_publisher(DiagnosticStatus, '~/status', LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', PREVIEW)
+        for declaration in NODES[self.executable]:
+            self._declare(declaration)
+        self.add_on_set_parameters_callback(self._validate)
+        self.add_post_set_parameters_callback(self._take_over)
+        self.create_timer(1.0, self._publish_diagnostics)
+        self.report_status('idle', 0.0, 'ready')
+
+    # parameters
+
+    def _declare(self, declaration: Declaration) -> None:
+        default = declaration.default
+        unit = f' [{declaration.unit}]' if declaration.unit else ''
+        choices = f' ({" or ".join(declaration.choices)})' if declaration.choices else ''
+        descriptor = ParameterDescriptor(
+            description=f'{declaration.description}{unit}{choices}',
+            read_only=declaration.read_only,
+        )
+        if declaration.low is not None and declaration.high is not None:
+            low, high = declaration.low, declaration.high
+            if isinstance(default, float):
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=low, to_value=high)
+                ]
+            else:
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(low), to_value=int(high), step=1)
+                ]
+        value = list(default) if isinstance(default, tuple) else default
+        parameter = self.declare_parameter(declaration.name, value, descriptor)
+        self._declared[declaration.name] = declaration
+        problem = self._problem(declaration.name, parameter.value)
+        if problem:
+            raise PiezoIdentError(f'{self.get_name()}: {problem}')
+        self.values[declaration.name] = parameter.value
+
+    def _problem(self, name: str, value: Any) -> str | None:
+        """Return what is wrong with a value, None when nothing is."""
+        declaration = self._declared.get(name)
+        if declaration is None:
+            return None
+        if declaration.choices and value not in declaration.choices:
+            return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
+        if isinstance(value, float) and value != value:
+            return f'{name} must be a number, got NaN'
+        return self.refuse(name, value)
+
+    def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            problem = self._problem(parameter.name, parameter.value)
+            if problem:
+                return SetParametersResult(successful=False, reason=problem)
+        return SetParametersResult(successful=True)
+
+    def _take_over(self, parameters: Sequence[Parameter]) -> None:
+        changed = {p.name: p.value for p in parameters if p.name in self._declared}
+        self.values.update(changed)
+        if changed:
+            self.apply(changed)
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Return why a value of a parameter cannot be taken, None when it can."""
+        return None
+
+    def apply(self, changed: Mapping[str, Any]) -> None:
+        """Act on parameters that were set."""
+
+    # status, diagnostics, services
+
+    def report_status(
+        self, state: str, progress: float, message: str, level: bytes = OK, **values: object
+    ) -> None:
+        """
+        Publish the latched status.
+
+        Parameters
+        ----------
+        state : str
+            One word.
+        progress : float
+            Percent.
+        message : str
+            For people.
+        level : bytes, optional
+            As in diagnostic_msgs/DiagnosticStatus.
+        **values
+            Further numbers.
+        """
+        key = (state, round(progress), message, level, tuple(values.items()))
+        with self._status_lock:
+            if key == self._last_status:
+                return
+            self._last_status = key
+            pairs = {'state': state, 'progress': f'{progress:.0f}', **values}
+            self._status.publish(self._diagnostic(level, message, pairs))
+
+    def _diagnostic(
+        self, level: bytes, message: str, values: Mapping[str, object]
+    ) -> DiagnosticStatus:
+        return DiagnosticStatus(
+            level=level,
+            name=self.get_fully_qualified_name(),
+            message=message,
+            hardware_id=self.get_namespace(),
+            values=[KeyValue(key=k, value=str(v)) for k, v in values.items()],
+        )
+
+    def _publish_diagnostics(self) -> None:
+        level, message, values = self.diagnose()
+        array = DiagnosticArray(status=[self._diagnostic(level, message, values)])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return level, message and values for /diagnostics, once a second."""
+        return OK, 'ready', {}
+
+    def offer(self, name: str, handler: Callable[[], str]) -> None:
+        """
+        Offer a Trigger service.
+
+        Parameters
+        ----------
+        name : str
+            Without the ``~/``.
+        handler : callable
+            Starts the work and returns what to say; raises `PiezoIdentError` to refuse.
+        """
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.message, response.success = handler(), True
+            except PiezoIdentError as error:
+                response.message, response.success = str(error), False
+            return response
+
+        self.create_service(Trigger, f'~/{name}', answer)
+
+    def close(self) -> None:
+        """Give way: ramp to rest, close files, stop threads; called once, before the end."""
+
+
+def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
+    """
+    Run a node until SIGINT or SIGTERM, and let it close before the context goes.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after a clean end, 2 when the node could not start.
+    """
+    stop = threading.Event()
+    rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    executor = SingleThreadedExecutor()
+    guard = executor.create_task  # woken below, so that a silent node hears the signal at once
+
+    def on_signal(*_: object) -> None:
+        stop.set()
+        guard(lambda: None)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    node: LabNode | None = None
+    try:
+        node = make()
+        executor.add_node(node)
+        while rclpy.ok() and not stop.is_set():
+            executor.spin_once(timeout_sec=0.2)
+    except ExternalShutdownException:
+        pass
+    except (PiezoIdentError, ParameterException) as error:
+        sys.stderr.write(f'piezo_ident: error: {error}\n')
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+            executor.remove_node(node)
+            node.destroy_node()
+        executor.shutdown(timeout_sec=0.5)
+        rclpy.try_shutdown()
+    return 0

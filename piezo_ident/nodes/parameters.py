@@ -1,0 +1,212 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Every parameter of every node, in one place: value, unit, range, and what it means.
+
+The nodes declare them from here, the tables of the documentation are made from here, and the
+YAML files in ``config/`` are tested against here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ['NODES', 'Declaration']
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """
+    One parameter.
+
+    Attributes
+    ----------
+    name : str
+    default : bool, int, float, str or tuple of str
+        Its type is the parameter's type.
+    description : str
+        Without the unit.
+    unit : str
+        Empty when there is none.
+    low, high : float, optional
+        Range of a number, both ends included.
+    choices : tuple of str
+        What a text may be; anything when empty.
+    read_only : bool
+        Whether it can only be set when the node starts.
+    """
+
+    name: str
+    default: bool | int | float | str | tuple[str, ...]
+    description: str
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+
+def _rate() -> Declaration:
+    return Declaration(
+        'sample_rate',
+        20000.0,
+        'rate of the sample clock that starts with the excitation',
+        'Hz',
+        1.0,
+        10e6,
+        read_only=True,
+    )
+
+
+EXCITATION = (
+    _rate(),
+    Declaration('program', 'identification', 'programme to play: a name, a path, or YAML text'),
+    Declaration('block_size', 100, 'samples in a block', '1', 1, 100_000),
+    Declaration(
+        'rate_factor',
+        1.0,
+        'how many times faster than real time blocks are sent; 0: as fast as the stage answers',
+        '1',
+        0.0,
+        100.0,
+    ),
+    Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
+    Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),
+    Declaration('rest', 0.0, 'voltage to which a stop ramps', 'V', -1000.0, 1000.0),
+    Declaration('ramp_slew', 20.0, 'top speed of the ramp of a stop', 'V/s', 0.001, 1e6),
+    Declaration(
+        'subscribers', 1, 'how many must listen to voltage before the first block', '1', 0, 100
+    ),
+    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    Declaration(
+        'in_flight', 40, 'blocks sent ahead of the answer when rate_factor is not 1', '1', 1, 90
+    ),
+)
+
+STAGE = (
+    Declaration('stage', 'paper', 'the stage to simulate: a name or a path', read_only=True),
+    Declaration(
+        'seed',
+        -1,
+        'of the sensor noise; -1: that of the stage file',
+        '1',
+        -1,
+        2**31 - 1,
+        read_only=True,
+    ),
+    Declaration('voltage_low', 0.0, 'lowest voltage that is ever applied', 'V', -1000.0, 1000.0),
+    Declaration(
+        'voltage_high', 10.0, 'highest voltage that is ever applied', 'V', -1000.0, 1000.0
+    ),
+    Declaration('slew', 40000.0, 'steepest voltage that is ever applied', 'V/s', 1.0, 1e9),
+    Declaration('rest', 0.0, 'voltage to which a silent drive is ramped', 'V', -1000.0, 1000.0),
+    Declaration(
+        'ramp_slew', 20.0, 'speed of the ramps to rest and into a new stream', 'V/s', 0.001, 1e6
+    ),
+    Declaration(
+        'silence',
+        0.5,
+        'time without a block after which the stage is ramped to rest',
+        's',
+        0.01,
+        3600.0,
+    ),
+)
+
+IDENTIFIER = (
+    Declaration('program', 'identification', 'programme that ~/run asks the excitation for'),
+    Declaration('thresholds', '10', 'number of plays of H, or: refined'),
+    Declaration(
+        'solver', 'swarm', 'how the weights of H are found', choices=('swarm', 'least_squares')
+    ),
+    Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
+    Declaration('seed', 0, 'of everything that is drawn by chance', '1', 0, 2**31 - 1),
+    Declaration('swarm_size', 40, 'particles', '1', 2, 10_000),
+    Declaration('swarm_iterations', 20_000, 'most iterations of the swarm', '1', 1, 10_000_000),
+    Declaration('output', '', 'folder into which ~/save writes; empty: none'),
+    Declaration('capture_limit', 600.0, 'longest capture that is kept', 's', 1.0, 86_400.0),
+    Declaration(
+        'excitation_limit',
+        20.0,
+        'how long ~/run waits for a sign of the excitation',
+        's',
+        0.5,
+        3600.0,
+    ),
+    Declaration(
+        'nice', 5, 'by how much the work gives way to the capture', '1', 0, 19, read_only=True
+    ),
+)
+
+MODEL = (
+    Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    Declaration(
+        'warn_ratio',
+        3.0,
+        'live error over that at identification from which to identify again',
+        '1',
+        1.0,
+        1000.0,
+    ),
+    Declaration('window', 2.0, 'time over which the live error is taken', 's', 0.1, 600.0),
+    Declaration('preview_rate', 50.0, 'rate of the preview', 'Hz', 1.0, 200.0, read_only=True),
+)
+
+RECORDER = (
+    Declaration('output', 'recording', 'bag to write; a number is added when it is there'),
+    Declaration(
+        'storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3'), read_only=True
+    ),
+    Declaration(
+        'topics',
+        (
+            'voltage',
+            'displacement',
+            'applied_voltage',
+            'prediction',
+            'residual',
+            'model',
+            'report',
+        ),
+        'topics to record',
+        read_only=True,
+    ),
+    Declaration('flush', 0.4, 'longest time that a message waits to be on disk', 's', 0.05, 0.5),
+    _rate(),
+    Declaration('autostart', False, 'start to record at once', read_only=True),
+)
+
+PLAYER = (
+    Declaration('bag', '', 'bag to replay'),
+    Declaration('rate', 1.0, 'how many times faster than it was recorded', '1', 0.01, 100.0),
+    Declaration(
+        'topics',
+        ('voltage', 'displacement'),
+        'topics to replay; a recorded model would overwrite the live one',
+    ),
+    Declaration('subscribers', 1, 'how many must listen before the first message', '1', 0, 100),
+    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    Declaration('autostart', False, 'start to replay at once', read_only=True),
+)
+
+#: the declarations of each node by its executable
+NODES: dict[str, tuple[Declaration, ...]] = {
+    'excitation': EXCITATION,
+    'stage': STAGE,
+    'identifier': IDENTIFIER,
+    'model': MODEL,
+    'recorder': RECORDER,
+    'player': PLAYER,
+}

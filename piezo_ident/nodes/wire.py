@@ -1,0 +1,67 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Between messages and blocks of samples: `piezo_ident.wire_format` on std_msgs, and the QoS."""
+
+from __future__ import annotations
+
+from array import array
+
+from piezo_ident.wire_format import decode, encode, Samples
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+__all__ = ['LATCHED', 'PREVIEW', 'STREAM', 'from_message', 'to_message']
+
+#: samples: reliable, the last hundred blocks
+STREAM = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+#: what a node that comes late must still hear: model, report, status
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+#: what people look at, and diagnostics
+PREVIEW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
+
+
+def to_message(samples: Samples) -> Float64MultiArray:
+    """Return the message of a block."""
+    data, dims = encode(samples)
+    # array('d', ndarray) goes through Python floats and takes 13 times as long
+    return Float64MultiArray(
+        layout=MultiArrayLayout(
+            dim=[MultiArrayDimension(label=d.label, size=d.size, stride=d.stride) for d in dims],
+            data_offset=0,
+        ),
+        data=array('d', data.tobytes()),
+    )
+
+
+def from_message(message: Float64MultiArray) -> Samples:
+    """
+    Return the block in a message.
+
+    Raises
+    ------
+    DataError
+        When the layout is not that of a block, or does not fit the data.
+    """
+    return decode(message.data, message.layout.dim, message.layout.data_offset)

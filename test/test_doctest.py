@@ -1,0 +1,39 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The examples in the docstrings of every module that needs no ROS."""
+
+import doctest
+import importlib
+import pkgutil
+
+import piezo_ident
+import pytest
+
+MODULES = [
+    info.name
+    for info in pkgutil.walk_packages(piezo_ident.__path__, 'piezo_ident.')
+    if '.nodes' not in info.name and not info.name.endswith('__main__')
+]
+
+
+def test_there_are_modules():
+    assert 'piezo_ident.swarm' in MODULES
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_examples(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testmod(importlib.import_module(name))
+    assert result.failed == 0
