@@ -9,7 +9,7 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
-.PHONY: demo test lint pytest test-jazzy bench colcon clean distclean
+.PHONY: demo test lint pytest test-jazzy bench study-identification colcon clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -31,6 +31,10 @@ test-jazzy: .venv-jazzy/.test
 
 bench: .venv/.demo
 	.venv/bin/python benchmarks/bench_prediction.py
+
+# twenty seeds, three noise levels, stages on and off the grid: about five minutes
+study-identification: .venv/.demo
+	.venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
 # what a ROS workspace would do, without ROS
 colcon: .venv/.colcon

@@ -250,9 +250,8 @@ def instrumental_variables(
     Refine an ARX model by instrumental variables.
 
     Instruments are the lags of the input and of the simulated output; data and instruments are
-    filtered by 1/A of the model before (simplified refined instrumental variables, Young, 1976,
-    doi:10.1016/0005-1098(76)90020-3), which removes the bias that output noise gives to least
-    squares.
+    filtered by 1/A of the model before, which removes the bias that output noise gives to least
+    squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
 
     Parameters
     ----------

@@ -38,8 +38,8 @@ class Creep(Effect):
 
     Notes
     -----
-    Logarithmic law: Jung, Shim and Gweon, "An open-loop method of reducing creep of piezoelectric
-    actuators", 2000.  Operator form: Krejci and Kuhnen, "Inverse control of systems with
+    Logarithmic law: Jung and Gweon, "Creep characteristics of piezoelectric actuators", Rev. Sci.
+    Instrum. 71(4), 2000.  Operator form: Krejci and Kuhnen, "Inverse control of systems with
     hysteresis and creep", IEE Proc. Control Theory Appl. 148(3), 2001,
     doi:10.1049/ip-cta:20010375.
     """
