@@ -241,9 +241,8 @@ def _labelled(
         model = replace(model, scaling=replace(model.scaling, range=span))
     masks = []
     for run in runs:
-        held = run.held_out()
-        fitted = run.mask('triangle', 'noise', 'settle', 'step') & ~held
-        masks.append((fitted, held))
+        kept = run.held_out()
+        masks.append((run.mask('triangle', 'noise', 'settle', 'step') & ~kept, kept))
     rows = errors_of(model, runs, masks)
     return model, delay_result, dynamics, result, rows, said, [], {}
 

@@ -98,9 +98,8 @@ class Settings:
             raise ConfigError(f'solver must be swarm or least_squares, got {self.solver!r}')
         if not 1 <= self.max_order <= 50:
             raise ConfigError(f'max_order must be 1 to 50, got {self.max_order}')
-        if self.order is not None and not (
-            len(self.order) == 2 and all(1 <= n <= 50 for n in self.order)
-        ):
+        sizes = list(self.order or (1, 1))
+        if len(sizes) != 2 or not all(1 <= n <= 50 for n in sizes):
             raise ConfigError(f'order must be two numbers of 1 to 50, got {self.order}')
         if self.delay is not None and not 0 <= self.delay <= 10_000:
             raise ConfigError(f'delay must be 0 to 10000 samples, got {self.delay}')

@@ -307,7 +307,7 @@ BAD_FILES: dict[str, tuple[Callable[[], str], list[object], str]] = {
         [],
         'while it is driven',
     ),
-    'constant output': (lambda: csv_text(y=np.full(1000, 1e-6)), [], '--displacement-unit'),
+    'constant output': (lambda: csv_text(y=np.full(1000, 1e-6)), [], 'sensor'),
     'empty file': (lambda: '', [], 'header line'),
     'header alone': (lambda: 't,v,y\n', [], 'record some samples'),
     'one sample': (lambda: 't,v,y\n0,0,0\n', [], 'at least two'),
