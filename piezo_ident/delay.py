@@ -133,10 +133,12 @@ def average_step(
     return _responses(pieces, before, after)
 
 
-def _first_rise(mean: NDArray[np.float64], before: int) -> tuple[int | None, float, float]:
+def _first_rise(
+    mean: NDArray[np.float64], before: int, rounding: float
+) -> tuple[int | None, float, float]:
     noise = float(np.std(mean[:before], ddof=2))
     # a quantised, noise-free record still has its last digit
-    threshold = THRESHOLD * max(noise, 1e-6 * float(np.abs(mean[before:]).max()))
+    threshold = THRESHOLD * max(noise, rounding, 1e-6 * float(np.abs(mean[before:]).max()))
     sign = np.sign(mean[before:].sum())
     risen = sign * mean[before:] > threshold
     # one sample may be chance, two in a row are not
@@ -169,14 +171,19 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     # the noise of a response in m/V falls with its height, so weights go with the square of it
     weight = heights**2 / np.sum(heights**2)
     mean = weight @ responses
-    samples, noise, threshold = _first_rise(mean, before)
+    # what taking out a line leaves of a displacement that never moves
+    largest = max(float(np.abs(piece.y).max()) for piece in pieces)
+    rounding = 1e-12 * largest / float(heights.max())
+    samples, noise, threshold = _first_rise(mean, before, rounding)
     std = 1.0 / np.sqrt(12.0)
     if samples is None:
         std = float('inf')
     elif n > 2:
         left_out = [
             _first_rise(
-                np.delete(weight, i) @ np.delete(responses, i, 0) / (1 - weight[i]), before
+                np.delete(weight, i) @ np.delete(responses, i, 0) / (1 - weight[i]),
+                before,
+                rounding,
             )
             for i in range(n)
         ]

@@ -1,0 +1,61 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The whole graph with the simulated stage and a recorder; then call the identifier.
+
+    ros2 launch piezo_ident demo.launch.py
+    ros2 service call /identifier/run std_srvs/srv/Trigger
+"""
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+
+def generate_launch_description():
+    share = get_package_share_directory('piezo_ident')
+    namespace = LaunchConfiguration('namespace')
+    config = LaunchConfiguration('config')
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('namespace', default_value='', description='where it all lives'),
+            DeclareLaunchArgument(
+                'config', default_value=f'{share}/config', description='one YAML file a node'
+            ),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(f'{share}/launch/stage.launch.py'),
+                launch_arguments={
+                    'namespace': namespace,
+                    'config': config,
+                    'use_simulated_stage': 'true',
+                }.items(),
+            ),
+            Node(
+                package='piezo_ident',
+                executable='recorder',
+                name='recorder',
+                namespace=namespace,
+                parameters=[
+                    PathJoinSubstitution([config, 'recorder.yaml']),
+                    {'autostart': True},
+                ],
+                output='screen',
+            ),
+        ]
+    )
