@@ -243,7 +243,24 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
                 low, high = tight
                 break
     clocks = [Clock(r, _start(start, r, resolution), jitter) for r in _nice(low, high)]
-    return next((c for c in clocks if not jitter and _reproduces(c, t)), clocks[0])
+    exact = next((c for c in clocks if not jitter and _reproduces(c, t)), None)
+    return exact or _settled(clocks[0], t.size)
+
+
+def _settled(clock: Clock, n: int) -> Clock:
+    """Return the clock that its own stamps are read as, so that a file written reads the same."""
+    for _ in range(5):
+        t = time_stamps(clock, 0, n)
+        resolution = Resolution.of(t)
+        low, high = _rates(t, _last_bit)
+        if not low <= high:
+            return clock
+        again = [Clock(r, _start(float(t[0]), r, resolution), 0.0) for r in _nice(low, high)]
+        exact = next((c for c in again if _reproduces(c, t)), again[0])
+        if exact.sample_rate == clock.sample_rate and exact.start_time == clock.start_time:
+            return clock
+        clock = Clock(exact.sample_rate, exact.start_time, clock.jitter)
+    return clock
 
 
 def _last_bit(t: Vector) -> Vector:

@@ -34,15 +34,17 @@ from piezo_ident.wire_format import Samples
 
 __all__ = ['Joined', 'Stream', 'join']
 
+#: numbers in a chunk of a stream
+CHUNK = 1 << 17
 #: rows of a stream no further apart than this are of the same run of the sample clock
 NEARBY = 300
 
 
 class Stream:
-    """All blocks of one topic so far, in flat buffers that grow."""
+    """All blocks of one topic so far, in flat buffers that grow chunk by chunk."""
 
     def __init__(self) -> None:
-        self._rows = array('d')
+        self._chunks = [array('d')]  # only the last one grows, so that copies share the others
         self._sizes = array('q')
         self._arrivals = array('q')
         self._segments: list[str] = []
@@ -50,22 +52,41 @@ class Stream:
     def append(self, samples: Samples, arrival: int) -> None:
         """Add a block that arrived at a time [ns] of a clock that all streams share."""
         rows = np.column_stack([samples.t, samples.values])
-        self._rows.frombytes(rows.tobytes())
+        if len(self._chunks[-1]) >= CHUNK:
+            self._chunks.append(array('d'))
+        self._chunks[-1].frombytes(rows.tobytes())
         self._sizes.append(samples.t.size)
         self._arrivals.append(arrival)
         # one string for all blocks of a segment, not one a block
         last = self._segments[-1] if self._segments else ''
         self._segments.append(last if last == samples.segment else samples.segment)
 
+    def copy(self) -> Stream:
+        """Return the stream as it is now, without copying what no longer changes."""
+        other = Stream()
+        other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
+        other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
+        other._segments = self._segments[:]
+        return other
+
+    def drop(self, blocks: int) -> None:
+        """Forget the oldest blocks."""
+        left = 2 * sum(self._sizes[:blocks])
+        while left and len(self._chunks) > 1 and left >= len(self._chunks[0]):
+            left -= len(self._chunks.pop(0))
+        self._chunks[0] = self._chunks[0][left:]
+        del self._sizes[:blocks], self._arrivals[:blocks], self._segments[:blocks]
+
     @property
     def n(self) -> int:
         """Number of samples."""
-        return len(self._rows) // 2
+        return sum(len(chunk) for chunk in self._chunks) // 2
 
     @property
     def rows(self) -> NDArray[np.float64]:
         """Time [s] and value of each sample, a copy of shape (n, 2)."""
-        return np.array(self._rows, dtype=np.float64).reshape(-1, 2)
+        chunks = [np.frombuffer(chunk, dtype=np.float64) for chunk in self._chunks if chunk]
+        return np.concatenate([np.empty(0), *chunks]).reshape(-1, 2)
 
     @property
     def arrivals(self) -> NDArray[np.int64]:
@@ -94,7 +115,7 @@ class Joined:
     faults: tuple[Fault, ...]
 
 
-def join(streams: Mapping[str, Stream]) -> Joined:
+def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = None) -> Joined:
     """
     Join streams on their time stamps.
 
@@ -102,6 +123,8 @@ def join(streams: Mapping[str, Stream]) -> Joined:
     ----------
     streams : mapping of str to Stream
         By quantity; the first gives the order and the segments.
+    beside : mapping of str to Stream, optional
+        Streams that are looked up where they have a value, and leave NaN where they have none.
 
     Returns
     -------
@@ -132,9 +155,14 @@ def join(streams: Mapping[str, Stream]) -> Joined:
     faults: list[Fault] = []
     for name, (table, _) in tables.items():
         faults.extend(_left_over(name, table, used[name]))
+    columns = {name: tables[name][0][used[name], 1] for name in streams}
+    for name, stream in (beside or {}).items():
+        table = stream.rows
+        row = _partners(rows[:, 0], arrivals, table[:, 0], stream.arrivals)[keep]
+        columns[name] = np.where(row >= 0, table[row, 1] if stream.n else np.nan, np.nan)
     return Joined(
         t=rows[keep, 0],
-        columns={name: tables[name][0][used[name], 1] for name in streams},
+        columns=columns,
         segments=lead.labels(keep),
         faults=tuple(faults),
     )

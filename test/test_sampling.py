@@ -16,7 +16,7 @@
 
 from collections.abc import Iterator
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 from piezo_ident.clock import fit_clock, Resolution, split_uniform
@@ -356,6 +356,7 @@ def test_other_ways_to_count_time(clock):
     st.integers(2, 3000),
     st.integers(0, 10**6),
 )
+@example(23.166468355528195, 17, 373)
 def test_stamps_of_a_sampling_clock_are_a_fixpoint(rate, n, first):
     t = (first + np.arange(n)) / rate
     assert split_uniform(t, Resolution.of(t)) == [(0, n)]

@@ -1,0 +1,383 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Blocks as they come to a record: bounded, checked, and by the same path as a bag of these blocks.
+
+What is wrong is met where it is met for a bag, in `piezo_ident.join` and `piezo_ident.sampling`.
+Beside them a capture knows what no bag tells: which blocks could not be read, and what was
+forgotten to make room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import DataError
+from piezo_ident.join import join, Stream
+from piezo_ident.ordering import at_times
+from piezo_ident.record import Fault, Record
+from piezo_ident.sampling import assemble
+from piezo_ident.wire_format import Samples
+
+__all__ = ['APPLIED', 'Capture', 'Snapshot', 'record_of_streams', 'refuse_incomplete']
+
+#: key of what the amplifier got, which carries the quantity voltage
+APPLIED = 'applied_voltage'
+#: commanded and applied voltage may differ by this share of the range
+TOLERANCE = 1e-3
+#: most of a segment, by time, that may be missing before it is no longer used
+MAX_MISSING = 0.05
+#: segments that the three steps stand on
+NEEDED = ('step', 'noise', 'triangle')
+#: time that jumps back by more samples than this is a restart, not a late block
+JUMP_BACK = 1000
+
+
+def record_of_streams(
+    streams: Mapping[str, Stream],
+    *,
+    name: str,
+    tolerance: float | None = None,
+    displacement_unit: str = 'm',
+    voltage_limits: tuple[float, float] | None = None,
+    sample_rate: float | None = None,
+    faults: Iterable[Fault] = (),
+) -> Record:
+    """
+    Make a record of streams of blocks.
+
+    Parameters
+    ----------
+    streams : mapping of str to Stream
+        Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
+        command and applied voltage differ, the amplifier's guard was at work: the stage did not
+        get the command, so these samples are cut out.
+    name : str
+        What errors call the data, and the record's name.
+    tolerance : float, optional
+        Difference of command and applied voltage that counts as none [V]; a thousandth of the
+        range when absent.
+    displacement_unit, voltage_limits, sample_rate, faults
+        As for `piezo_ident.sampling.assemble`.
+
+    Raises
+    ------
+    DataError
+        For data that cannot be used without a guess.
+    """
+    needed = {key: stream for key, stream in streams.items() if key != APPLIED}
+    try:
+        joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
+    except DataError as error:
+        raise DataError(f'{name}: {error}') from None
+    met, t, columns, segments = (
+        [*faults, *joined.faults],
+        joined.t,
+        joined.columns,
+        joined.segments,
+    )
+    if APPLIED in columns:
+        v, applied = columns['voltage'], columns.pop(APPLIED)
+        wrong = _guarded(v, applied, tolerance)
+        unknown = int(np.count_nonzero(np.isnan(applied)))
+        if unknown:
+            where = at_times(t[np.isnan(applied)][:1])
+            met.append(Fault('applied_unknown', where, unknown, 'taken as commanded'))
+        if wrong.any():
+            if wrong.all():
+                raise DataError(
+                    f'{name}: the applied voltage is nowhere the commanded one; look at the '
+                    "guards of the amplifier's driver"
+                )
+            worst = float(np.abs(v - applied)[wrong].max())
+            where = f'{at_times(t[_begins(wrong)])}, by up to {worst:.3g} V'
+            count = int(np.count_nonzero(wrong))
+            met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
+            keep = np.flatnonzero(~wrong)
+            names, starts = segments
+            t, columns = t[keep], {key: x[keep] for key, x in columns.items()}
+            segments = (names, np.searchsorted(keep, starts).tolist())
+    return assemble(
+        t,
+        columns.pop('voltage'),
+        columns.pop('displacement'),
+        segments,
+        {key[2:]: x for key, x in columns.items()},
+        name=name,
+        displacement_unit=displacement_unit,
+        voltage_limits=voltage_limits,
+        sample_rate=sample_rate,
+        faults=met,
+    )
+
+
+def _guarded(
+    v: NDArray[np.float64], applied: NDArray[np.float64], tolerance: float | None
+) -> NDArray[np.bool_]:
+    """Tell where another voltage was applied than commanded."""
+    finite = v[np.isfinite(v)]
+    if tolerance is None:
+        span = float(np.ptp(finite)) if finite.size else 0.0
+        tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
+    return np.asarray(np.abs(v - applied) > tolerance)  # False where either is NaN
+
+
+def _begins(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))
+
+
+def refuse_incomplete(record: Record, most: float = MAX_MISSING) -> None:
+    """
+    Refuse a record that lost too much of what the three steps stand on.
+
+    Time that is missing between two pieces is charged to the segments on both of its sides.
+
+    Parameters
+    ----------
+    record : Record
+    most : float, optional
+        Share of the segments of a kind that may be missing.
+
+    Raises
+    ------
+    DataError
+    """
+    present = {kind: sum(p.duration for p in record.find(kind)) for kind in NEEDED}
+    missing = dict.fromkeys(NEEDED, 0.0)
+    for one, other in itertools.pairwise(record.pieces):
+        gap = other.start_time - (one.start_time + one.duration)
+        if gap <= 0.0:
+            continue  # another run
+        sides = [s[i].kind for s, i in ((one.segments, -1), (other.segments, 0)) if s]
+        for kind in set(sides) & set(NEEDED):
+            missing[kind] += gap
+    for kind in NEEDED:
+        whole = present[kind] + missing[kind]
+        if missing[kind] > most * whole:
+            raise DataError(
+                f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
+                'are missing or not usable; find what loses samples, and run the programme again'
+            )
+
+
+@dataclass
+class _Watch:
+    """Where the sample clock of one topic stands, and what happened to it."""
+
+    last: float = float('nan')
+    begin: float = float('nan')
+    period: float = float('nan')
+    lost: int = 0
+    late: int = 0
+    restarts: int = 0
+    seconds: list[float] = field(default_factory=list)  # of each block that is kept
+    runs: list[int] = field(default_factory=list)  # blocks at which the clock restarted
+    total: float = 0.0
+
+    def add(self, t: NDArray[np.float64]) -> None:
+        """Take note of a block."""
+        n = t.size
+        first, last = (float(t[0]), float(t[-1])) if n else (self.last, self.last)
+        if n > 1 and last > first:
+            self.period = (last - first) / (n - 1)
+        seconds = n * self.period if np.isfinite(self.period) else 0.0
+        step = first - self.last
+        if np.isnan(self.begin):
+            self.begin = first
+        elif step > 1.5 * self.period:
+            self.lost += round(step / self.period) - 1
+        elif step <= 0.0:
+            if first <= self.begin or -step > JUMP_BACK * self.period:
+                self.restarts += 1
+                self.runs.append(len(self.seconds))
+                self.begin = first
+            else:
+                self.late += n
+        if np.isfinite(last):
+            self.last = last
+        self.seconds.append(seconds)
+        self.total += seconds
+
+    def drop(self, blocks: int) -> None:
+        """Forget the oldest blocks."""
+        self.total -= sum(self.seconds[:blocks])
+        del self.seconds[:blocks]
+        self.runs = [i - blocks for i in self.runs if i > blocks]
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A capture as it was at one moment; making a record of it can wait for a quiet hour."""
+
+    streams: Mapping[str, Stream]
+    faults: tuple[Fault, ...] = ()
+    tolerance: float | None = None
+
+    def record(self, name: str = 'capture') -> Record:
+        """
+        Return the record.
+
+        Raises
+        ------
+        DataError
+            For data that cannot be used without a guess; also when there are none.
+        """
+        for key, cure in (
+            ('voltage', 'start the excitation, or replay a bag'),
+            ('displacement', 'is the stage running, and does it publish on this topic?'),
+        ):
+            if key not in self.streams or not self.streams[key].n:
+                raise DataError(f'{name}: no {key} has been captured; {cure}')
+        order = ('voltage', 'displacement', *sorted(self.streams))
+        streams = {key: self.streams[key] for key in dict.fromkeys(order)}
+        if not streams.get(APPLIED, streams['voltage']).n:
+            del streams[APPLIED]
+        return record_of_streams(streams, name=name, tolerance=self.tolerance, faults=self.faults)
+
+
+class Capture:
+    """
+    All blocks of all topics so far.
+
+    Parameters
+    ----------
+    limit : float, optional
+        Longest measured time that is kept [s].  Beyond it the oldest whole run of the sample
+        clock is forgotten, or the oldest tenth where there is only one.
+    tolerance : float, optional
+        As for `record_of_streams`.
+    """
+
+    def __init__(self, limit: float = 600.0, tolerance: float | None = None) -> None:
+        self.limit = limit
+        self.tolerance = tolerance
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._streams: dict[str, Stream] = {}
+        self._watches: dict[str, _Watch] = {}
+        self._segments: dict[str, int] = {}
+        self._unreadable: dict[str, tuple[int, str]] = {}
+        self._forgotten = 0.0
+        self.segment = ''
+
+    def add(self, key: str, samples: Samples, arrival: int) -> None:
+        """
+        Take a block.
+
+        Parameters
+        ----------
+        key : str
+            ``voltage``, ``displacement``, ``applied_voltage`` or ``x_<name>``.
+        samples : Samples
+        arrival : int
+            When it came [ns], by a clock that all topics share.
+        """
+        self._streams.setdefault(key, Stream()).append(samples, arrival)
+        watch = self._watches.setdefault(key, _Watch())
+        watch.add(samples.t)
+        if key == 'voltage':
+            self.segment = samples.segment
+            label = samples.segment or 'unlabelled'
+            self._segments[label] = self._segments.get(label, 0) + samples.t.size
+        if watch.total > self.limit:
+            self._make_room(key)
+
+    def unreadable(self, key: str, reason: str) -> None:
+        """Take note of a message that is no block."""
+        self._unreadable[key] = (self._unreadable.get(key, (0, ''))[0] + 1, reason)
+
+    def _make_room(self, key: str) -> None:
+        watch = self._watches[key]
+        blocks = next(iter(watch.runs), 0)
+        if not blocks:
+            room = 0.0
+            while room < 0.1 * self.limit and blocks < len(watch.seconds) - 1:
+                room += watch.seconds[blocks]
+                blocks += 1
+        before = watch.total
+        watch.drop(blocks)
+        self._streams[key].drop(blocks)
+        if key == 'voltage':
+            self._forgotten += before - watch.total
+
+    def snapshot(self) -> Snapshot:
+        """Return all that was captured up to now, at little cost."""
+        faults = [
+            Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
+            for key, (count, reason) in self._unreadable.items()
+        ]
+        if self._forgotten:
+            where = f'the oldest {self._forgotten:.3g} s'
+            action = f'forgotten, {self.limit:g} s are kept'
+            faults.append(Fault('capture_limit', where, 1, action))
+        streams = {key: stream.copy() for key, stream in self._streams.items()}
+        return Snapshot(streams, tuple(faults), self.tolerance)
+
+    def record(self, name: str = 'capture') -> Record:
+        """Return what was captured as a record; see `Snapshot.record`."""
+        return self.snapshot().record(name)
+
+    @property
+    def n(self) -> int:
+        """Samples of the voltage."""
+        return self.count('voltage')
+
+    def count(self, key: str) -> int:
+        """Return the samples of a topic that are kept."""
+        return self._streams[key].n if key in self._streams else 0
+
+    def last_time(self, key: str) -> float:
+        """Return the time of the newest sample of a topic [s]; NaN before the first."""
+        return self._watches[key].last if key in self._watches else float('nan')
+
+    @property
+    def seconds(self) -> float:
+        """Measured time of the voltage that is kept [s]."""
+        return self._watches['voltage'].total if 'voltage' in self._watches else 0.0
+
+    @property
+    def segments(self) -> Mapping[str, int]:
+        """Samples of each label so far, in order of appearance."""
+        return dict(self._segments)
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Samples that never came, by topic, as its sample clock tells."""
+        return {key: watch.lost for key, watch in self._watches.items()}
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """Samples that came again or out of turn, by topic."""
+        return {key: watch.late for key, watch in self._watches.items()}
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong with the capture so far, one sentence a topic."""
+        said = []
+        for key, watch in self._watches.items():
+            if watch.lost:
+                said.append(f'{watch.lost} samples of {key} are missing')
+            if watch.late:
+                said.append(f'{watch.late} samples of {key} came twice or out of turn')
+        for key, (count, reason) in self._unreadable.items():
+            said.append(f'{count} messages on {key} are no blocks ({reason})')
+        return tuple(said)
