@@ -268,6 +268,15 @@ def joint_fit(
         G = fit.dynamics.normalised()
     if fit is None:
         missing.append(('dynamics', _why_static(windows, band)))
+    du = np.abs(np.diff(u))
+    if du[du > 0.02 * swing].sum() > 0.9 * du.sum():
+        missing.append(
+            (
+                'hysteresis',
+                'the voltage only jumps between levels, and what lies between them was never '
+                'seen; add a slow triangle',
+            )
+        )
     covariance = np.zeros((1, 1)) if fit is None else fit.covariance
     progress('dynamics', 1.0)
     return JointFit(

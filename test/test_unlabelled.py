@@ -21,10 +21,13 @@ import numpy as np
 from numpy.testing import assert_allclose
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import IdentificationError
+from piezo_ident.identification import identify
+from piezo_ident.program import parse_program
 from piezo_ident.record import Piece, Record
 from piezo_ident.results import Settings, silent
 from piezo_ident.runs import runs_of, scaling_of
-from piezo_ident.simulation import load_stage
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
 from piezo_ident.unlabelled import joint_fit
 import pytest
 
@@ -106,3 +109,13 @@ def test_given_delay_is_taken_and_too_little_is_refused():
     with pytest.raises(IdentificationError, match='moves by 0'):
         joint_fit(flat, 900, scaling, Settings(), silent)
     assert_allclose(flat.u[:900], 0.0)
+
+
+def test_steps_alone_do_not_identify_hysteresis():
+    stage = load_stage(find_config('paper', 'stage'))
+    text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.1, count: 40}'
+    played = simulate(stage, parse_program(text).build(20000.0), np.random.default_rng(1))
+    steps = played.find('step')[0]
+    record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
+    missing = dict(identify(record).not_identified)
+    assert 'triangle' in missing['hysteresis']
