@@ -17,16 +17,17 @@ Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
 
 A bag is read message by message into flat buffers, so its length is limited by the samples
 alone.  Topics are found by what their blocks say they carry, so remapped names are no obstacle.
+A bag whose recorder was killed is refused, or read as far as it goes when that is asked for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 import functools
 from pathlib import Path
 from typing import Any
 
+from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag
 from piezo_ident.errors import DataError
 from piezo_ident.join import join, Stream
 from piezo_ident.output import temporary_output
@@ -49,12 +50,19 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 import yaml
 
-__all__ = ['MESSAGE_TYPE', 'SAMPLE_QOS', 'read_bag', 'typestore', 'write_bag']
+__all__ = [
+    'MESSAGE_TYPE',
+    'SAMPLE_QOS',
+    'carried_quantities',
+    'read_bag',
+    'typestore',
+    'write_bag',
+]
 
 MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
 
@@ -87,6 +95,7 @@ def read_bag(
     displacement_topic: str | None = None,
     displacement_unit: str = 'm',
     voltage_limits: tuple[float, float] | None = None,
+    recover: bool = False,
 ) -> Record:
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file.
@@ -101,6 +110,9 @@ def read_bag(
         Take these topics, whatever else the bag holds.
     displacement_unit, voltage_limits
         As for `piezo_ident.sampling.assemble`.
+    recover : bool, optional
+        Read a bag whose recorder was killed as far as it goes, with a fault that says so, instead
+        of refusing it.
 
     Raises
     ------
@@ -110,10 +122,16 @@ def read_bag(
     """
     path = Path(path)
     asked = {'voltage': voltage_topic, 'displacement': displacement_topic}
-    with _opened(path) as reader:
-        carried = _carried(reader, path)
+    with opened_bag(path) as bag:
+        if bag.faults and not recover:
+            raise DataError(
+                f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
+                f"'piezo_ident convert {path} OUT' saves what is whole of it"
+            )
+        carried = carried_quantities(bag)
         topics = _choose(carried, asked, namespace, path)
-        streams = _collect(reader, topics, path)
+        streams = _collect(bag, topics, path)
+        faults = bag.faults
     try:
         joined = join(streams)
     except DataError as error:
@@ -128,45 +146,31 @@ def read_bag(
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
         sample_rate=_sample_rate(path),
-        faults=joined.faults,
+        faults=(*faults, *joined.faults),
     ).renamed(path.name)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Reader]:
-    if not path.exists():
-        raise DataError(f'{path}: does not exist; check the name')
-    if path.is_dir() and not (path / 'metadata.yaml').is_file():
-        raise DataError(
-            f'{path}: no bag, metadata.yaml is missing; name a bag folder, or restore it with '
-            "'ros2 bag reindex'"
-        )
-    try:
-        with Reader(path) as reader:
-            yield reader
-    except DataError:
-        raise
-    # damage surfaces in a reader as anything from an assertion to a zstd error
-    except Exception as error:  # noqa: BLE001
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise DataError(
-            f'{path}: damaged or unfinished bag ({reason[:200]}); record it again, or try '
-            "'ros2 bag reindex' and 'mcap recover'"
-        ) from None
+def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
+    for connection, stamp, raw in bag.messages(connections):
+        with damage_as_data_error(bag.path):
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+        yield connection.topic, stamp, message
 
 
-def _messages(reader: Reader, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
-    for connection, stamp, raw in reader.messages(connections=connections):
-        yield connection.topic, stamp, typestore().deserialize_cdr(raw, connection.msgtype)
+def carried_quantities(bag: Bag) -> dict[str, str]:
+    """
+    Return what each topic carries, as its first message says.
 
-
-def _carried(reader: Reader, path: Path) -> dict[str, str]:
-    """Return what each topic carries, as its first message says."""
+    Raises
+    ------
+    DataError
+        When no topic carries samples.
+    """
     found = {}
-    for connection in reader.connections:
+    for connection in bag.connections:
         if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
             continue
-        for topic, _, message in _messages(reader, [connection]):
+        for topic, _, message in _messages(bag, [connection]):
             base = topic.rpartition('/')[2]
             # a damaged layout must not hide a topic that is ours by name
             ours = base if base in ('voltage', 'displacement') else None
@@ -175,9 +179,9 @@ def _carried(reader: Reader, path: Path) -> dict[str, str]:
                 found[topic] = quantity
             break
     if not found:
-        topics = ', '.join(sorted({c.topic for c in reader.connections})) or 'none'
+        topics = ', '.join(sorted({c.topic for c in bag.connections})) or 'none'
         raise DataError(
-            f"{path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
+            f"{bag.path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
             f"(topics: {topics}); record the stage's voltage and displacement"
         )
     return found
@@ -230,12 +234,12 @@ def _choose(
     return chosen
 
 
-def _collect(reader: Reader, topics: Mapping[str, str], path: Path) -> dict[str, Stream]:
+def _collect(bag: Bag, topics: Mapping[str, str], path: Path) -> dict[str, Stream]:
     streams = {quantity: Stream() for quantity in topics}
     by_topic = {topic: streams[quantity] for quantity, topic in topics.items()}
     index = dict.fromkeys(by_topic, 0)
-    wanted = [c for c in reader.connections if c.topic in by_topic and c.msgtype == MESSAGE_TYPE]
-    for topic, stamp, message in _messages(reader, wanted):
+    wanted = [c for c in bag.connections if c.topic in by_topic and c.msgtype == MESSAGE_TYPE]
+    for topic, stamp, message in _messages(bag, wanted):
         layout = message.layout
         try:
             samples = decode(message.data, layout.dim, layout.data_offset)

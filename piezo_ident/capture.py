@@ -349,10 +349,14 @@ class Capture:
         """Return the time of the newest sample of a topic [s]; NaN before the first."""
         return self._watches[key].last if key in self._watches else float('nan')
 
+    def seconds_of(self, key: str) -> float:
+        """Return the measured time of a topic that is kept [s]."""
+        return self._watches[key].total if key in self._watches else 0.0
+
     @property
     def seconds(self) -> float:
         """Measured time of the voltage that is kept [s]."""
-        return self._watches['voltage'].total if 'voltage' in self._watches else 0.0
+        return self.seconds_of('voltage')
 
     @property
     def segments(self) -> Mapping[str, int]:

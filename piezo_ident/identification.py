@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.data_checks import line_error, misspelt
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import Cancelled, IdentificationError
 from piezo_ident.hysteresis_fit import (
@@ -41,7 +42,7 @@ from piezo_ident.hysteresis_fit import (
 from piezo_ident.memory import fit_memory, start_memory
 from piezo_ident.metrics import fit_percent, FORMULA, percent_of_stroke
 from piezo_ident.model import Scaling, StageModel
-from piezo_ident.record import Record
+from piezo_ident.record import Piece, Record
 from piezo_ident.results import (
     DelayResult,
     DynamicsResult,
@@ -50,16 +51,9 @@ from piezo_ident.results import (
     Progress,
     Settings,
     silent,
+    Steps,
 )
-from piezo_ident.runs import (
-    common_rate,
-    noise_floor,
-    refuse_closed_loop,
-    Run,
-    runs_of,
-    same_rate,
-    scaling_of,
-)
+from piezo_ident.runs import noise_floor, prepare, Run
 from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
 from piezo_ident.threshold_choice import choose_thresholds
 from piezo_ident.unlabelled import joint_fit
@@ -77,6 +71,7 @@ def identify(
     settings: Settings | None = None,
     *,
     progress: Progress = silent,
+    steps: Steps | None = None,
 ) -> Identification:
     """
     Learn a stage from its records.
@@ -90,6 +85,8 @@ def identify(
     settings : Settings, optional
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
+    steps : Steps, optional
+        Steps of the three that were taken already; see `piezo_ident.single_steps`.
 
     Returns
     -------
@@ -102,23 +99,19 @@ def identify(
     """
     settings = settings or Settings()
     records = [records] if isinstance(records, Record) else list(records)
-    if not records:
-        raise IdentificationError('no record was given')
-    for record in records:
-        refuse_closed_loop(record)
-    rate, left = common_rate(records)
-    pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
-    scaling = scaling_of(pieces)
-    runs = runs_of(records, rate, scaling)
-    floor, source = noise_floor(pieces)
-    warnings = [f'{record.name}: {fault}' for record in records for fault in record.faults] + left
-    kinds = {s.kind for p in pieces for s in p.segments}
-    if {'noise', 'triangle'} <= kinds:
-        found = _labelled(runs, rate, scaling, settings, progress)
+    data = prepare(records)
+    runs, rate, scaling = data.runs, data.rate, data.scaling
+    floor, source = noise_floor(data.pieces)
+    warnings = list(data.warnings)
+    if data.labelled:
+        found = _labelled(runs, rate, scaling, settings, progress, steps or Steps())
     else:
         found = _unlabelled(runs, rate, scaling, settings, progress)
     model, delay, dynamics, fit, rows, said, missing, memories = found
     warnings += [*said, *_check(delay, dynamics, fit, floor, scaling)]
+    wrong = misspelt([label for record in records for label in record.labels])
+    if wrong:
+        warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
     stroke = abs(scaling.Y)
     result = Identification(
         model=model,
@@ -134,6 +127,7 @@ def identify(
         settings=settings,
         memories=memories,
     )
+    result = replace(result, warnings=(*result.warnings, *_judged(result, data.pieces)))
     story = _story(result, [record.name for record in records])
     return replace(result, model=replace(model, identification=story))
 
@@ -208,7 +202,12 @@ def _third_step(
 
 
 def _labelled(
-    runs: list[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
+    runs: list[Run],
+    rate: float,
+    scaling: Scaling,
+    settings: Settings,
+    progress: Progress,
+    steps: Steps,
 ) -> Found:
     fit = triangle_excerpts(runs)
     if not fit:
@@ -216,9 +215,9 @@ def _labelled(
             'no triangle starts from a known memory or sweeps its range twice; start it from the '
             'lowest voltage'
         )
-    delay_result = first_step(runs, settings, progress)
+    delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
-    dynamics, G = second_step(runs, delay, settings, progress)
+    dynamics, G = steps.dynamics or second_step(runs, delay, settings, progress)
     held = triangle_excerpts(runs, held=True)
     result = _third_step(fit, held, G, delay, settings, progress)
     model = _model(rate, scaling, result, G, delay)
@@ -299,10 +298,13 @@ def _unlabelled(
             fitted[:n_fit] = True
         masks.append((fitted, np.zeros(other.piece.n, dtype=bool)))
     rows = errors_of(model, runs, masks, memories)
+    reach = _other_range(run, n_fit, scaling)
     said = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
         f'together on the first {n_fit / rate:.4g} s of {run.record}'
     ]
+    if reach:
+        said.append(reach)
     fitted_error = [row for row in rows if row.data == 'fitted' and row.record == run.record]
     held_error = [row for row in rows if row.data == 'held out' and row.record == run.record]
     # a record without noise may be fitted exactly
@@ -317,11 +319,51 @@ def _unlabelled(
     return model, joint.delay, joint.dynamics, result, rows, said, missing, memories
 
 
+def _other_range(run: Run, n_fit: int, scaling: Scaling) -> str:
+    """Return what to say when the held-out part leaves the voltages of the fitted one."""
+    fitted, held = run.u[:n_fit], run.u[n_fit:]
+    if held.min() > fitted.min() - 0.01 and held.max() < fitted.max() + 0.01:
+        return ''
+    spans = [
+        f'{scaling.v0 + scaling.V * u.min():.3g} .. {scaling.v0 + scaling.V * u.max():.3g} V'
+        for u in (fitted, held)
+    ]
+    return (
+        f'the fitted part covers {spans[0]}, the held-out part {spans[1]}: its error is partly '
+        'one of extrapolation'
+    )
+
+
 def _model(
     rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
 ) -> StageModel:
     moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
     return StageModel(rate, moved, fit.hysteresis, G, delay)
+
+
+def _judged(result: Identification, pieces: Sequence[Piece]) -> list[str]:
+    """Return what the errors themselves say about the trust that they deserve."""
+    said = []
+    chosen, held = result.error('selection'), result.error('held out')
+    error = held if np.isfinite(held) else chosen
+    line = line_error(pieces)
+    if np.isfinite(error) and error > 0.5 * line:
+        said.append(
+            f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
+            f'{line:.3g} %: it explains little of these data'
+        )
+    easy = [
+        row.percent
+        for row in result.errors
+        if row.data == 'held out' and row.segment.partition(':')[0] in ('idle', 'ramp')
+    ]
+    if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
+        said.append(
+            f'where the stage only rests or is moved over, the model errs by up to '
+            f'{max(easy):.3g} % of stroke, more than the {chosen:.3g} % on what chose it: the '
+            'stage does something that the model lacks; judge it on a record of another kind'
+        )
+    return said
 
 
 def _key(run: Run) -> tuple[str, float]:
@@ -364,7 +406,7 @@ def errors_of(
         names = [(s.label, s.start, s.stop) for s in run.piece.segments]
         for label, start, stop in names or [('', 0, run.piece.n)]:
             part = np.zeros(run.piece.n, dtype=bool)
-            part[start:stop] = True
+            part[start:stop] = run.sound[start:stop]
             for data, mask in (
                 ('fitted', part & fitted),
                 ('selection', part & selection),

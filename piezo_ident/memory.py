@@ -27,12 +27,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.bridging import follows
 from piezo_ident.dynamics import filter_arx
 from piezo_ident.model import StageModel
-from piezo_ident.record import Piece
+from piezo_ident.play import weighted_plays
+from piezo_ident.record import Piece, Record
 from scipy.optimize import lsq_linear
 
-__all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'start_memory']
+__all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'memories_of', 'start_memory']
 
 #: pull towards the memory of a stage that came down to zero, as a share of the data's weight
 PULL = 1e-4
@@ -56,6 +58,32 @@ def forgotten(u: NDArray[np.float64], share: float = 0.98) -> int:
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
     """Return whether a piece starts near the lowest voltage, where the memory is known."""
     return abs(float(model.scaling.u(piece.v[0]))) < 0.01
+
+
+def memories_of(model: StageModel, record: Record) -> list[NDArray[np.float64] | None]:
+    """
+    Return the memory at the start of every piece of a record.
+
+    A piece that follows the one before after a short gap goes on with its memory; that of others
+    is known at the lowest voltage, and estimated elsewhere.
+    """
+    memories: list[NDArray[np.float64] | None] = []
+    h = model.hysteresis
+    for i, piece in enumerate(record):
+        before = record.pieces[i - 1] if i else None
+        if not model.takes(piece):
+            memories.append(None)
+            continue
+        if before is None or follows(before, piece) is None:
+            memories.append(start_memory(model, piece))
+            continue
+        u = model.scaling.u(before.v)
+        start = memories[-1]
+        if start is None:
+            start = h.initial_memory(float(u[0]))
+        _, end = weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, start)
+        memories.append(end)
+    return memories
 
 
 def start_memory(model: StageModel, piece: Piece) -> NDArray[np.float64] | None:

@@ -258,6 +258,10 @@ class StageModel:
         pieces = tuple(self.predict_piece(p, m) for p, m in zip(record, starts, strict=True))
         return Prediction(pieces, self.extrapolation(record))
 
+    def takes(self, piece: Piece) -> bool:
+        """Return whether the model holds at the sampling rate of a piece."""
+        return self.is_static or abs(piece.sample_rate / self.sample_rate - 1.0) < 1e-6
+
     def check_rate(self, piece: Piece) -> None:
         """
         Refuse a piece whose sampling rate is not the model's.
@@ -266,7 +270,7 @@ class StageModel:
         ------
         ModelError
         """
-        if self.is_static or abs(piece.sample_rate / self.sample_rate - 1.0) < 1e-6:
+        if self.takes(piece):
             return
         raise ModelError(
             f'the record is sampled at {piece.sample_rate:g} Hz, the model at '

@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
+import difflib
+import errno
 import os
 from pathlib import Path
 import reprlib
@@ -33,6 +35,7 @@ import yaml
 
 __all__ = [
     'SCHEMA_VERSION',
+    'broken_link',
     'load_model',
     'load_yaml',
     'model_from_dict',
@@ -48,6 +51,14 @@ MOST_NODES, DEEPEST = 100_000, 20
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
+_INSIDE: Mapping[str, tuple[str, ...]] = {
+    'input': ('v0', 'V', 'range'),
+    'output': ('y0', 'Y'),
+    'delay': ('samples', 'fraction'),
+    'hysteresis': ('thresholds', 'weights', 'p1', 'p2'),
+    'dynamics': ('a', 'b'),
+}
+_EFFECT = ('name', 'slot', 'parameters')
 
 
 class _Dumper(yaml.SafeDumper):
@@ -75,6 +86,27 @@ def plain(value: Any) -> Any:
     return value
 
 
+def broken_link(path: str | os.PathLike[str]) -> str | None:
+    """
+    Return what is wrong with a symbolic link that leads nowhere, and the cure.
+
+    Returns
+    -------
+    str or None
+        None when it is no link, or leads somewhere.
+    """
+    if not os.path.islink(path):
+        return None
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        return f'is a link to {os.readlink(path)}, which does not exist; mend the link'
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return 'is a link that leads back to itself; mend the link'
+    return None
+
+
 def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     Read a YAML mapping with the safe loader.
@@ -84,10 +116,13 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     ConfigError
         When the file cannot be read, is not YAML, or is not a mapping.
     """
+    broken = broken_link(path)
+    if broken:
+        raise ConfigError(f'{path}: {broken}')
     try:
         text = Path(path).read_text(encoding='utf-8')
     except FileNotFoundError:
-        raise ConfigError(f'{path}: no such file') from None
+        raise ConfigError(f'{path}: no such file; check the name') from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f'{path}: cannot be read as text ({_reason(error)})') from None
     return parse_yaml(text, str(path))
@@ -118,7 +153,9 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
         where = f' at line {mark.line + 1}' if mark is not None else ''
         raise ConfigError(f'{name}: not valid YAML{where}; correct it or write it again') from None
     if not isinstance(data, dict):
-        raise ConfigError(f'{name}: expected a YAML mapping, got {type(data).__name__}')
+        raise ConfigError(
+            f'{name}: expected a YAML mapping, got {type(data).__name__}; is it the right file?'
+        )
     return data
 
 
@@ -169,6 +206,27 @@ def _refuse_endless(data: Mapping[str, Any], name: str) -> None:
             todo += [(x, depth + 1) for x in inner]
 
 
+def _unknown(data: Mapping[str, Any], known: Collection[str]) -> list[str]:
+    return sorted(set(map(str, data)) - set(known))
+
+
+def _meant(key: str, known: Iterable[str]) -> str | None:
+    """Return the known key that a misspelt one stands for."""
+    names = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(key.lower(), names, n=1)
+    return names[close[0]] if close else None
+
+
+def _refuse_unknown(unknown: list[str], known: Collection[str], where: str, name: str) -> None:
+    if not unknown:
+        return
+    meant = list(dict.fromkeys(filter(None, (_meant(key, known) for key in unknown))))
+    cure = f'did you mean {", ".join(meant)}?' if meant else f'it knows {", ".join(known)}'
+    plural = 's' if len(unknown) > 1 else ''
+    listed = ', '.join(key[:40] for key in unknown[:8])
+    raise ModelError(f'{name}: unknown key{plural} {listed}{where}; {cure}')
+
+
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     """
     Build a model from plain data.
@@ -197,11 +255,14 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
             f'{SCHEMA_VERSION}; update piezo_ident'
         )
     missing = [key for key in _REQUIRED if key not in data]
-    if missing:
+    unknown = _unknown(data, (*_REQUIRED, *_OPTIONAL))
+    # a misspelt part is there; anything else that lacks one is another file
+    if missing and not any(_meant(key, missing) for key in unknown):
         raise ModelError(f'{name}: missing {", ".join(missing)}; is this a model file?')
-    unknown = sorted(set(map(str, data)) - set(_REQUIRED) - set(_OPTIONAL))
-    if unknown:
-        raise ModelError(f'{name}: unknown keys {", ".join(unknown)}')
+    _refuse_unknown(unknown, (*_REQUIRED, *_OPTIONAL), '', name)
+    for part, known in _INSIDE.items():
+        inside = _mapping(data, part, name)
+        _refuse_unknown(_unknown(inside, known), known, f' in {part}', name)
 
     source, target = _mapping(data, 'input', name), _mapping(data, 'output', name)
     delay, h = _mapping(data, 'delay', name), _mapping(data, 'hysteresis', name)
@@ -212,6 +273,8 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     effects = data.get('effects') or []
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise ModelError(f'{name}: effects must be a list of mappings')
+    for effect in effects:
+        _refuse_unknown(_unknown(effect, _EFFECT), _EFFECT, ' in effects', name)
     identification = data.get('identification') or {}
     if not isinstance(identification, Mapping):
         raise ModelError(f'{name}: identification must be a mapping')

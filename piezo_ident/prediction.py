@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.bridging import follows
 from piezo_ident.errors import ModelError
-from piezo_ident.memory import forgotten, start_memory
+from piezo_ident.memory import forgotten, memories_of
 from piezo_ident.metrics import fit_percent, percent_of_stroke
 from piezo_ident.model import Prediction, StageModel
 from piezo_ident.record import Record
@@ -42,11 +43,22 @@ class RecordErrors:
         `piezo_ident.metrics.percent_of_stroke`, by the stroke of the whole record.
     fit : float
         `piezo_ident.metrics.fit_percent`.
+    offset : float
+        Mean of measured minus predicted [m]; a sensor that was set to zero anew shows here.
+    percent_without_offset : float
+        `percent` when `offset` is taken away.
     """
 
     n: int
     percent: float
     fit: float
+    offset: float
+    percent_without_offset: float
+
+    @property
+    def mostly_offset(self) -> bool:
+        """Whether taking the offset away at least halves the error."""
+        return self.percent_without_offset <= 0.5 * self.percent and self.percent > 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +108,12 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
             model.check_rate(piece)
         except ModelError as error:
             raise ModelError(f'{record.name}: {error}') from None
-    memories = tuple(start_memory(model, piece) for piece in record)
-    estimated = tuple(memory is not None for memory in memories)
+    memories = tuple(memories_of(model, record))
+    before = (None, *record.pieces[:-1])
+    estimated = tuple(
+        memory is not None and (last is None or follows(last, piece) is None)
+        for memory, last, piece in zip(memories, before, record, strict=True)
+    )
     prediction = model.predict(record, memories)
     if any(estimated):
         said = (
@@ -126,4 +142,11 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
 
 
 def _errors(y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float) -> RecordErrors:
-    return RecordErrors(y.size, percent_of_stroke(y, y_hat, stroke), fit_percent(y, y_hat))
+    offset = float(np.mean(y - y_hat))
+    return RecordErrors(
+        n=y.size,
+        percent=percent_of_stroke(y, y_hat, stroke),
+        fit=fit_percent(y, y_hat),
+        offset=offset,
+        percent_without_offset=percent_of_stroke(y, y_hat + offset, stroke),
+    )

@@ -23,6 +23,7 @@ import re
 import numpy as np
 from piezo_ident.bag_io import read_bag, write_bag
 from piezo_ident.errors import DataError
+from piezo_ident.model_io import broken_link
 from piezo_ident.output import temporary_output
 from piezo_ident.record import Fault, Record
 from piezo_ident.sampling import assemble
@@ -41,6 +42,7 @@ def read_record(
     namespace: str | None = None,
     voltage_topic: str | None = None,
     displacement_topic: str | None = None,
+    recover: bool = False,
 ) -> Record:
     """
     Read a record of any format.
@@ -55,6 +57,8 @@ def read_record(
         Smallest and largest voltage [V] that may occur.
     namespace, voltage_topic, displacement_topic : str, optional
         Which topics of a bag to take, when it holds several stages.
+    recover : bool, optional
+        Read an unfinished bag as far as it goes instead of refusing it.
 
     Returns
     -------
@@ -68,6 +72,9 @@ def read_record(
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    broken = broken_link(path)
+    if broken:
+        raise DataError(f'{path}: {broken}')
     if path.is_dir() or suffix in ('.mcap', '.db3'):
         return read_bag(
             path,
@@ -76,6 +83,7 @@ def read_record(
             displacement_topic=displacement_topic,
             displacement_unit=displacement_unit,
             voltage_limits=voltage_limits,
+            recover=recover,
         )
     if not path.exists():
         raise DataError(f'{path}: does not exist; check the name')

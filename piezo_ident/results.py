@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.arx import OrderTable
 from piezo_ident.delay import StepDelay
+from piezo_ident.dynamics import Dynamics
 from piezo_ident.errors import ConfigError
 from piezo_ident.frequency_response import FrequencyResponse
 from piezo_ident.hysteresis_fit import HysteresisFit, Solver
@@ -36,6 +37,7 @@ __all__ = [
     'Identification',
     'Progress',
     'Settings',
+    'Steps',
     'silent',
 ]
 
@@ -181,6 +183,21 @@ class DynamicsResult:
     slope_measured: float = float('nan')
     slope_model: float = float('nan')
     band: float = float('nan')
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """
+    What single steps have found so far.
+
+    Attributes
+    ----------
+    delay : DelayResult or None
+    dynamics : tuple of (DynamicsResult, Dynamics) or None
+    """
+
+    delay: DelayResult | None = None
+    dynamics: tuple[DynamicsResult, Dynamics] | None = None
 
 
 @dataclass(frozen=True)

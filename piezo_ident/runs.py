@@ -21,15 +21,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.bridging import bridged
+from piezo_ident.data_checks import suspicions
 from piezo_ident.errors import IdentificationError
 from piezo_ident.memory import forgotten
 from piezo_ident.model import Scaling
 from piezo_ident.record import Piece, Record
 
 __all__ = [
+    'Prepared',
     'Run',
     'common_rate',
     'noise_floor',
+    'prepare',
     'refuse_closed_loop',
     'runs_of',
     'same_rate',
@@ -57,7 +61,9 @@ class Run:
     u, x : ndarray, shape (n,)
         Normalised voltage and displacement.
     known : ndarray of bool, shape (n,)
-        Samples at which the memory of the start no longer matters, or was known.
+        Sound samples at which the memory of the start no longer matters, or was known.
+    sound : ndarray of bool, shape (n,)
+        Samples that were measured, away from a gap that was bridged.
     """
 
     record: str
@@ -65,6 +71,7 @@ class Run:
     u: NDArray[np.float64]
     x: NDArray[np.float64]
     known: NDArray[np.bool_]
+    sound: NDArray[np.bool_]
 
     def mask(self, *kinds: str) -> NDArray[np.bool_]:
         """Return which samples belong to segments of these kinds."""
@@ -73,6 +80,22 @@ class Run:
             if s.kind in kinds:
                 chosen[s.start : s.stop] = True
         return chosen
+
+    def unbroken(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """
+        Return the stretches between two samples that hold no long gap.
+
+        A sample or two that were bridged do no harm where a regression runs through them; a
+        straight line of many does.
+        """
+        unsound = np.concatenate([[0], (~self.sound[start:stop]).astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(unsound))
+        long = 0.0125 * self.piece.sample_rate
+        breaks = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > long]
+        ends = [0, *(int(x) for pair in breaks for x in pair), stop - start]
+        return [
+            (start + a, start + b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b > a
+        ]
 
     def held_out(self) -> NDArray[np.bool_]:
         """
@@ -91,6 +114,65 @@ class Run:
                     if dv.size and (np.all(dv >= 0) or np.all(dv <= 0)):
                         held[start:stop] = True
         return held
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """
+    Records ready for the steps.
+
+    Attributes
+    ----------
+    rate : float
+        [Hz]
+    scaling : Scaling
+    pieces : list of Piece
+        Of this rate.
+    runs : list of Run
+        The pieces, normalised.
+    warnings : list of str
+        Faults of the data, and what is left out.
+    """
+
+    rate: float
+    scaling: Scaling
+    pieces: list[Piece]
+    runs: list[Run]
+    warnings: list[str]
+
+    @property
+    def labelled(self) -> bool:
+        """Whether there are noise and a triangle, so that the three steps can be taken."""
+        return {'noise', 'triangle'} <= {s.kind for p in self.pieces for s in p.segments}
+
+
+def prepare(records: Sequence[Record]) -> Prepared:
+    """
+    Make records ready for the steps.
+
+    Raises
+    ------
+    IdentificationError
+        When they carry no response of a stage to a voltage.
+    """
+    if not records:
+        raise IdentificationError('no record was given')
+    for record in records:
+        refuse_closed_loop(record)
+    rate, left = common_rate(records)
+    pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
+    scaling = scaling_of(pieces)
+    faults = [f'{record.name}: {fault}' for record in records for fault in record.faults]
+    for record in records:
+        parts = bridged(record)
+        gaps, filled = sum(p.gaps for p in parts), sum(p.filled for p in parts)
+        if gaps:
+            faults.append(
+                f'{record.name}: {gaps} short gaps ({filled} samples) were bridged by straight '
+                'lines; neither they nor the moment after each were fitted or judged'
+            )
+    faults += [said for record in records for said in suspicions(record)]
+    return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
 
 
 def same_rate(one: float, other: float) -> bool:
@@ -153,17 +235,18 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
 
 
 def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Run]:
-    """Return the pieces of one rate, normalised."""
+    """Return the pieces of one rate, joined over short gaps and normalised."""
     runs = []
     for record in records:
-        for piece in record:
+        for part in bridged(record):
+            piece = part.piece
             if not same_rate(piece.sample_rate, rate):
                 continue
             u = scaling.u(piece.v)
-            known = np.ones(piece.n, dtype=bool)
+            known = part.sound.copy()
             if u[0] > REST:
                 known[: forgotten(u)] = False
-            runs.append(Run(record.name, piece, u, scaling.x(piece.y), known))
+            runs.append(Run(record.name, piece, u, scaling.x(piece.y), known, part.sound))
     return runs
 
 
@@ -172,9 +255,10 @@ def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
     Return the rms of the sensor noise [m] and where it was read.
 
     Stretches of constant voltage of at least 50 ms and 200 samples count, after half of each has
-    passed; a line is taken out of each.
+    passed; a line is taken out of each.  The quietest quarter of that time is taken: the rest may
+    still ring or creep.
     """
-    total, n = 0.0, 0
+    found: list[tuple[float, int]] = []
     for piece in pieces:
         moves = np.flatnonzero(np.diff(piece.v) != 0.0) + 1
         edges = np.concatenate([[0], moves, [piece.n]])
@@ -184,11 +268,14 @@ def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
             y = piece.y[middles[i] : edges[i + 1]]
             k = np.arange(y.size)
             rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
-            total += float(rest @ rest)
-            n += y.size - 2
-    if n == 0:
+            found.append((float(rest @ rest) / (y.size - 2), y.size))
+    if not found:
         return None, 'unknown: the voltage never rests'
-    return float(np.sqrt(total / n)), 'stretches of constant voltage'
+    found.sort()
+    variance, n = np.array([v for v, _ in found]), np.array([n for _, n in found])
+    quiet = np.cumsum(n) - n < 0.25 * n.sum()
+    floor = float(np.sqrt(np.average(variance[quiet], weights=n[quiet])))
+    return floor, 'the quietest stretches of constant voltage'
 
 
 def refuse_closed_loop(record: Record) -> None:

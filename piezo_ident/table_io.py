@@ -16,8 +16,9 @@
 Records in tables: CSV, NumPy's npz and MATLAB's mat, columns by name.
 
 ``t``, ``v`` and ``y`` must be there; ``x_<name>`` are further channels.  In CSV the column
-``segment`` labels each row; npz and mat carry ``segment_name`` and ``segment_start``, the sample
-(counted from 0) at which each segment begins.
+``segment`` labels each row, and comments, lines with ``#``, may stand above the header; npz and
+mat carry ``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment
+begins.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from dataclasses import dataclass, field
 import io
 import itertools
 from pathlib import Path
+import re
 from typing import Any, BinaryIO
 import zipfile
 
@@ -43,6 +45,10 @@ __all__ = ['READERS', 'WRITERS', 'Table']
 #: rows of a CSV file taken together
 _ROWS = 65536
 _REQUIRED = ('t', 'v', 'y')
+_POINTS = (
+    'these look like decimal commas: save it with decimal points (in a spreadsheet, with the '
+    'number format of English)'
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +79,42 @@ def _check_names(names: Iterable[str], path: Path) -> None:
 
 
 def read_csv(path: Path) -> Table:
-    """Read a CSV file with a header line."""
+    """Read a CSV file with a header line; comments may stand above it."""
     try:
         # newline='' leaves line ends to the csv module; utf-8-sig drops a byte order mark
         with path.open(encoding='utf-8-sig', newline='') as file:
-            return _parse_csv(csv.reader(file, strict=True), path)
+            return _parse_csv(csv.reader(_uncommented(file), strict=True), path)
     except UnicodeDecodeError:
         raise DataError(f'{path}: no text in UTF-8; save it as CSV in UTF-8') from None
     except csv.Error as error:
         raise DataError(f'{path}: no CSV file ({error}); save it as comma-separated CSV') from None
+
+
+def _uncommented(lines: Iterable[str]) -> Iterator[str]:
+    """
+    Yield as many lines as there are, with empty ones for the comments above the header.
+
+    Where numbers follow a comment that names the columns, as numpy.savetxt writes it, that is the
+    header.
+    """
+    rest = iter(lines)
+    comment: str | None = None
+    for line in rest:
+        bare = line.strip()
+        if bare.startswith('#'):
+            if comment is not None:
+                yield '\n'
+            comment = bare.lstrip('#').strip()
+        elif bare:
+            if comment is not None:
+                names = {c.strip() for c in comment.split(',')}
+                is_header = names.issuperset(_REQUIRED) and _is_number(bare.partition(',')[0])
+                yield f'{comment}\n' if is_header else '\n'
+            yield line
+            break
+        else:
+            yield '\n'
+    yield from rest
 
 
 def _parse_csv(reader: Any, path: Path) -> Table:
@@ -130,8 +163,15 @@ def _header(reader: Any, path: Path) -> list[str]:
     for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if len(header) == 1 and separator in header[0]:
             raise DataError(f'{path}: separated by {name}; save it with commas and decimal points')
-    if all(_is_number(c) for c in header):
-        raise DataError(f"{path}: no header line; put 't,v,y' on top of the numbers")
+    if not set(_REQUIRED).intersection(header) and _is_number(header[0]):
+        further = header[len(_REQUIRED) :]
+        # the only text that a row of ours has
+        names = ['segment'] if further and not _is_number(further[0]) else []
+        more = ', with a name for each further column,' if len(further) > len(names) else ''
+        raise DataError(
+            f"{path}: no header line; put '{','.join([*_REQUIRED, *names])}'{more} on top of the "
+            'numbers'
+        )
     twice = sorted({c for c in header if c and header.count(c) > 1})
     if twice:
         raise DataError(f'{path}: column {", ".join(twice)} stands there twice; keep one of them')
@@ -155,15 +195,23 @@ def _culprit(
         if row and len(row) != len(header):
             return DataError(
                 f'{path}: line {number} has {len(row)} columns, the header has {len(header)}; '
-                'mend or delete the line'
+                + (_POINTS if _torn_at_commas(row, header) else 'mend or delete the line')
             )
         for name, i in numeric.items():
             if row and not _is_number(row[i]):
+                comma = re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', row[i])
                 return DataError(
                     f'{path}: line {number}, column {name}: {row[i][:40]!r} is no number; '
-                    'mend or delete the line'
+                    + (_POINTS if comma else 'mend or delete the line')
                 )
     return DataError(f'{path}: unreadable rows from line {line}; save it again')
+
+
+def _torn_at_commas(row: list[str], header: list[str]) -> bool:
+    """Return whether a row looks as if its decimal commas were taken for separators."""
+    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
+    texts = sum(not _wanted(name) for name in header)
+    return len(header) < len(row) <= 2 * len(header) and len(row) - whole <= texts
 
 
 def write_csv(file: BinaryIO, table: Table) -> None:

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,13 +92,18 @@ def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noi
 
 
 def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
-    found = [(s.n, run, s) for run in runs for s in run.piece.find('noise')]
-    n, run, s = max(found, key=lambda item: item[0])
+    found = [
+        (stop - start, run, start, stop)
+        for run in runs
+        for s in run.piece.find('noise')
+        for start, stop in run.unbroken(s.start, s.stop)
+    ]
+    n, run, start, stop = max(found, key=lambda item: item[0])
     if n < 2000:
         raise IdentificationError(
             f'{run.record}: the noise segment has {n} samples; at least 2000 are needed'
         )
-    return run, s.start, s.stop
+    return run, start, stop
 
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
@@ -181,13 +187,15 @@ def _held_error(noise: _Noise, model: Dynamics, delay: int) -> float:
     return float(100.0 * e.std() / y.std())
 
 
-def _refined_on_noise(noise: _Noise, start: Dynamics, delay: int, maxiter: int) -> OutputErrorFit:
+def _refined_on_noise(
+    noise: _Noise, start: Dynamics, delay: int, maxiter: int, tick: Callable[[], None]
+) -> OutputErrorFit:
     use = np.ones(noise.n_fit, dtype=bool)
     use[: noise.n_fit // 50] = False
     u = noise.u[: noise.n_fit]
     delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
     stretch = Stretch(delayed, noise.y[: noise.n_fit], use)
-    return output_error([stretch], start, maxiter=maxiter)
+    return output_error([stretch], start, maxiter=maxiter, tick=tick)
 
 
 def _factor(noise: _Noise, settings: Settings, delay: int) -> ArxFactor:
@@ -230,7 +238,9 @@ def _orders(
             'instrumental variables': _held_error(noise, iv, delay),
         }
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls
-        fit = _refined_on_noise(noise, stabilised(start), delay, maxiter=10)
+        # ticks repeat the share, so that the work can be stopped within an iteration
+        tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
+        fit = _refined_on_noise(noise, stabilised(start), delay, 10, tick)
         errors['output error'] = _held_error(noise, fit.dynamics, delay)
         if np.isfinite(errors['output error']):
             result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
@@ -294,14 +304,16 @@ def second_step(
     held = _stretches(runs, H, delay, held=True)
     best, result = float('inf'), found[0][0]
     for i, (candidate, start_G) in enumerate(found):
-        fit = output_error(stretches, start_G.normalised(), maxiter=6)
+        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
+        fit = output_error(stretches, start_G.normalised(), maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
         # a larger model comes later, and must earn its size
         if score < best / (1.0 + GAIN):
             best, result, G = score, candidate, fit.dynamics.normalised()
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
     H = undo(G)
-    fit = output_error(_stretches(runs, H, delay), G, maxiter=8)
+    tick = functools.partial(progress, 'dynamics', 0.85)
+    fit = output_error(_stretches(runs, H, delay), G, maxiter=8, tick=tick)
     G, gain = fit.dynamics.normalised(), fit.dynamics.gain
     scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
     covariance = fit.covariance * np.outer(scale, scale)
@@ -340,7 +352,7 @@ def _stretches(
     stretches = []
     for run in runs:
         out = run.held_out()
-        use = run.mask('step', 'settle', 'noise') & (out if held else ~out)
+        use = run.mask('step', 'settle', 'noise') & run.sound & (out if held else ~out)
         if use.any():
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]

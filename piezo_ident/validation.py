@@ -23,7 +23,7 @@ import re
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.errors import ModelError
-from piezo_ident.memory import start_memory
+from piezo_ident.memory import memories_of
 from piezo_ident.metrics import percent_of_stroke
 from piezo_ident.model import StageModel
 from piezo_ident.record import Piece, Record
@@ -101,14 +101,15 @@ def free_runs(
     static = model.without_dynamics()
     runs = []
     for record in [records] if isinstance(records, Record) else records:
-        for piece in record:
+        starts = memories_of(model, record)
+        for piece, start in zip(record, starts, strict=True):
             try:
                 model.check_rate(piece)
             except ModelError:
                 continue
             memory: ArrayLike | None = (memories or {}).get((record.name, piece.start_time))
             if memory is None:
-                memory = start_memory(model, piece)
+                memory = start
             y_hat, y_static = (m.predict_piece(piece, memory) for m in (model, static))
             runs.append(FreeRun(record.name, piece, y_hat, y_static))
     return runs

@@ -355,8 +355,15 @@ def test_truncated_bag(capsys, tmp_path, made, storage):
     succeed(capsys, 'convert', '--storage', storage, made / 'record.npz', bag)
     (data,) = (p for p in bag.iterdir() if p.suffix in ('.mcap', '.db3'))
     cut_in_half(data)
-    refuse(capsys, tmp_path, ['convert', bag, tmp_path / 'r.csv'], bag)
     refuse(capsys, tmp_path, ['identify', bag], bag)
+    if storage == 'sqlite3':
+        # half a database has lost its pages, not its end
+        refuse(capsys, tmp_path, ['convert', bag, tmp_path / 'r.csv'], bag)
+        return
+    refuse(capsys, tmp_path, ['identify', bag], bag, 'piezo_ident convert')
+    out = succeed(capsys, 'convert', bag, tmp_path / 'r.csv')
+    assert 'truncated_bag' in out
+    assert 1000 < read_record(tmp_path / 'r.csv').n < read_record(made / 'record.npz').n
 
 
 def test_bag_without_the_topics(capsys, tmp_path, made):

@@ -258,7 +258,9 @@ def test_summary_for_a_terminal(found):
 
 def test_verdict_does_not_boast_with_rest_and_ramps(found):
     rows = tuple(row for row in found.errors if row.record == 'identification')
-    assert verdict(replace(found, errors=rows)).startswith('On the parts of noise and triangle')
+    assert verdict(replace(found, errors=rows)).startswith(
+        'On the parts of steps, noise and triangle'
+    )
     rows = tuple(row for row in rows if row.data == 'fitted')
     assert verdict(replace(found, errors=rows)).startswith('Nothing was held out')
 

@@ -25,16 +25,16 @@ import argparse
 from collections.abc import Sequence
 import os
 from pathlib import Path
-import signal
 import sys
 from typing import NoReturn
 
 from piezo_ident import __version__
+from piezo_ident.cli.interrupts import interrupts, MESSAGE, STATUS
 from piezo_ident.errors import PiezoIdentError
 
 __all__ = ['main']
 
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+DONE, BAD_INPUT = 0, 2
 
 
 class _Parser(argparse.ArgumentParser):
@@ -69,9 +69,23 @@ def _thresholds(text: str) -> int | None:
     if text == 'refined':
         return None
     try:
-        return _whole(text)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f'{text!r}: give a number, or refined') from None
+        number = int(text)
+    except ValueError:
+        number = -1
+    if not 2 <= number <= 400:
+        raise argparse.ArgumentTypeError(f'{text!r}: give 2 to 400, or refined')
+    return number
+
+
+def _name(text: str) -> str:
+    # an empty shell variable; as a path it would be the folder in which we are
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f'{text!r} is empty; give a name, or leave it out')
+    return text
+
+
+def _path(text: str) -> Path:
+    return Path(_name(text))
 
 
 def _unit(text: str) -> str:
@@ -97,11 +111,16 @@ def _reading() -> _Parser:
         metavar=('LO', 'HI'),
         help='refuse records whose voltage leaves these [V]',
     )
-    group.add_argument('--namespace', help='take the topics of a bag below this namespace')
-    group.add_argument('--voltage-topic', metavar='TOPIC', help='topic of a bag with the voltage')
     group.add_argument(
-        '--displacement-topic', metavar='TOPIC', help='topic of a bag with the displacement'
+        '--namespace', type=_name, help='take the topics of a bag below this namespace'
     )
+    for quantity in ('voltage', 'displacement'):
+        group.add_argument(
+            f'--{quantity}-topic',
+            type=_name,
+            metavar='TOPIC',
+            help=f'topic of a bag with the {quantity}',
+        )
     return options
 
 
@@ -114,7 +133,7 @@ def _json() -> _Parser:
 def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'out',
-        type=Path,
+        type=_path,
         metavar='OUT',
         help='.csv, .npz, .mat, .mcap, .db3, or a folder for a rosbag2 bag',
     )
@@ -139,9 +158,14 @@ def _build_parser() -> _Parser:
         )
 
     p = verb('simulate', 'Make a record with the simulated stage', _json())
-    p.add_argument('--config', default='stage_paper', help='stage: a file, or the name of one')
     p.add_argument(
-        '--program', default='identification', help='programme: a file, or the name of one'
+        '--config', type=_name, default='stage_paper', help='stage: a file, or the name of one'
+    )
+    p.add_argument(
+        '--program',
+        type=_name,
+        default='identification',
+        help='programme: a file, or the name of one',
     )
     p.add_argument('--seed', type=_whole, help="of the sensor noise; the stage's own when absent")
     p.add_argument('--sample-rate', type=float, metavar='HZ', help="the stage's own when absent")
@@ -149,14 +173,14 @@ def _build_parser() -> _Parser:
 
     p = verb('identify', 'Learn a model from records', _reading(), _json())
     p.add_argument(
-        'records', nargs='+', type=Path, metavar='RECORD', help='file, bag, or folder of records'
+        'records', nargs='+', type=_path, metavar='RECORD', help='file, bag, or folder of records'
     )
-    p.add_argument('--model', type=Path, metavar='YAML', help='write the model there')
-    p.add_argument('--report', type=Path, metavar='DIR', help='write tables and pictures there')
+    p.add_argument('--model', type=_path, metavar='YAML', help='write the model there')
+    p.add_argument('--report', type=_path, metavar='DIR', help='write tables and pictures there')
     p.add_argument(
         '--validation',
         nargs='+',
-        type=Path,
+        type=_path,
         default=[],
         metavar='RECORD',
         help='further records: predicted, not fitted',
@@ -182,22 +206,22 @@ def _build_parser() -> _Parser:
     p.add_argument('--seed', type=_whole, default=0, help='of the swarm (default: 0)')
 
     p = verb('predict', 'Run a model over a record', _reading(), _json())
-    p.add_argument('model', type=Path, metavar='MODEL', help='model file')
-    p.add_argument('record', type=Path, metavar='RECORD', help='file or bag')
+    p.add_argument('model', type=_path, metavar='MODEL', help='model file')
+    p.add_argument('record', type=_path, metavar='RECORD', help='file or bag')
     p.add_argument(
-        '--out', type=Path, metavar='OUT', help='.csv or .npz with the columns t, v, y, y_hat'
+        '--out', type=_path, metavar='OUT', help='.csv or .npz with the columns t, v, y, y_hat'
     )
-    p.add_argument('--plot', type=Path, metavar='PNG', help='picture of measured and predicted')
+    p.add_argument('--plot', type=_path, metavar='PNG', help='picture of measured and predicted')
 
     p = verb('convert', 'Turn a record into another format', _reading(), _json())
-    p.add_argument('record', type=Path, metavar='IN', help='file or bag')
+    p.add_argument('record', type=_path, metavar='IN', help='file or bag')
     _add_output(p)
 
     verb('effects', 'List the effects that a model can have', _json())
 
     p = verb('demo', 'Identify simulated stages, and a measured one if it is there')
-    p.add_argument('--out', type=Path, default=Path('demo_report'), metavar='DIR', help='reports')
-    p.add_argument('--measured', type=Path, metavar='RECORD', help='a measured record')
+    p.add_argument('--out', type=_path, default=Path('demo_report'), metavar='DIR', help='reports')
+    p.add_argument('--measured', type=_path, metavar='RECORD', help='a measured record')
     return parser
 
 
@@ -227,24 +251,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code.
     """
-    for stream in (sys.stdout, sys.stderr):
-        # a terminal without micro signs gets question marks instead of a traceback
-        if hasattr(stream, 'reconfigure'):
-            stream.reconfigure(errors='replace')
+    with interrupts.handled(is_process=argv is None):
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     try:
+        for stream in (sys.stdout, sys.stderr):
+            # a terminal without micro signs gets question marks instead of a traceback
+            if hasattr(stream, 'reconfigure'):
+                stream.reconfigure(errors='replace')
         try:
             args = _build_parser().parse_args(argv)
         except SystemExit as stop:
             return int(stop.code or 0)
         _one_thread()
-        from piezo_ident.cli import commands
+        with interrupts.quitting():
+            from piezo_ident.cli import commands
 
         commands.run(args)
         sys.stdout.flush()
+        interrupts.finish()
     except KeyboardInterrupt:
-        # a second Ctrl-C has nothing left to stop
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return _stop(INTERRUPTED, 'interrupted; nothing was left half written')
+        return _interrupted()
     except BrokenPipeError:
         # whoever read has read enough; the interpreter's own flush must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -256,9 +285,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _stop(BAD_INPUT, f'error: {where}{error.strerror or error}')
     except MemoryError:
         return _stop(BAD_INPUT, 'error: out of memory; give fewer or shorter records')
+    except Exception:
+        # libraries make errors of their own of it
+        if interrupts.met:
+            return _interrupted()
+        raise
     return DONE
 
 
+def _interrupted() -> int:
+    interrupts.ignore()
+    sys.stderr.write(MESSAGE)
+    return STATUS
+
+
 def _stop(code: int, text: str) -> int:
+    if interrupts.met:
+        return _interrupted()
+    interrupts.ignore()
     sys.stderr.write(f'piezo_ident: {_one_line(text)}\n')
     return code

@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 from piezo_ident.cli.common import check_record_output, read, say_faults, story
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
-from piezo_ident.cli.outputs import check_folder
+from piezo_ident.cli.outputs import check_folder, check_link
 from piezo_ident.effects import catalogue
 from piezo_ident.errors import ConfigError
 from piezo_ident.program import load_program
@@ -54,6 +55,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
     check_record_output(args)
     files = {}
     for kind, name in (('stage', args.config), ('program', args.program)):
+        check_link(Path(name))
         files[kind] = find_config(name, kind)
         if Path(name).suffix and not Path(name).is_file():
             console.note(f'{name} is not here; taking the shipped {files[kind]}')
@@ -69,13 +71,14 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
     record = simulate(stage, sequence, np.random.default_rng(seed), name=out.name)
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
-    losses = write_record(
-        record,
-        out,
-        overwrite=args.overwrite,
-        storage=args.storage,
-        custom_data=data if is_bag else None,
-    )
+    with interrupts.waiting():
+        losses = write_record(
+            record,
+            out,
+            overwrite=args.overwrite,
+            storage=args.storage,
+            custom_data=data if is_bag else None,
+        )
     console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, seed {seed}')
     if not console.as_json:
         console.say(sequence.describe())
@@ -92,7 +95,8 @@ def convert_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_record_output(args)
     record = read(args.record, args)
-    losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
+    with interrupts.waiting():
+        losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
         f'{record.duration:.6g} s'

@@ -28,7 +28,16 @@ from piezo_ident.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.record import Record
 from piezo_ident.record_io import read_record
 
-__all__ = ['check_record_output', 'expand', 'naming', 'read', 'say_faults', 'story']
+__all__ = [
+    'RECORD_FILES',
+    'check_record_output',
+    'expand',
+    'naming',
+    'read',
+    'read_all',
+    'say_faults',
+    'story',
+]
 
 RECORD_FILES = ('.csv', '.npz', '.mat', '.mcap', '.db3')
 
@@ -80,7 +89,26 @@ def read(path: Path, args: argparse.Namespace) -> Record:
         namespace=args.namespace,
         voltage_topic=args.voltage_topic,
         displacement_topic=args.displacement_topic,
+        # saving what is whole of a bag is for convert; the others send there
+        recover=args.verb == 'convert',
     )
+
+
+def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
+    """Read records of one call, which share the options."""
+    records = []
+    for path in paths:
+        try:
+            records.append(read(path, args))
+        except DataError as error:
+            if len(paths) == 1 or '--displacement-unit' not in str(error):
+                raise
+            raise DataError(
+                f'{error}; one unit holds for all records of a call: where theirs differ, first '
+                'turn those that are not in m into m, with piezo_ident convert '
+                '--displacement-unit um IN OUT.npz'
+            ) from None
+    return records
 
 
 def check_record_output(args: argparse.Namespace) -> None:

@@ -24,8 +24,9 @@ import shutil
 import sys
 from typing import Any
 
+from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.model_io import plain
-from piezo_ident.results import Progress, silent
+from piezo_ident.results import Progress
 
 __all__ = ['Console']
 
@@ -64,7 +65,7 @@ class Console:
     def progress(self) -> Iterator[Progress]:
         """Yield what shows the progress: one bar a step on a terminal, nothing elsewhere."""
         if not sys.stderr.isatty():
-            yield silent
+            yield lambda step, share: interrupts.check()
             return
         from tqdm import tqdm
 
@@ -72,6 +73,7 @@ class Console:
         bars: dict[str, Any] = {}
 
         def show(step: str, share: float) -> None:
+            interrupts.check()
             if step not in bars:
                 for bar in bars.values():
                     bar.close()

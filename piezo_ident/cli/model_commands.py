@@ -22,9 +22,19 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from piezo_ident.cli.common import expand, naming, read, say_faults, story
+from piezo_ident.cli.common import (
+    expand,
+    naming,
+    read,
+    read_all,
+    RECORD_FILES,
+    say_faults,
+    story,
+)
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
+from piezo_ident.errors import ConfigError
 from piezo_ident.identification import identify
 from piezo_ident.metrics import FORMULA
 from piezo_ident.model import StageModel
@@ -37,6 +47,7 @@ from piezo_ident.table_io import Table, WRITERS
 
 __all__ = ['identify_command', 'predict_command']
 
+MODEL_FILES = ('.yaml', '.yml')
 TABLE_FILES = ('.csv', '.npz')
 PICTURES = ('.png', '.pdf', '.svg')
 
@@ -55,7 +66,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     )
     paths, further = expand(args.records), expand(args.validation)
     if args.model is not None:
-        check_suffix(args.model, ('.yaml', '.yml'), 'a model')
+        check_suffix(args.model, MODEL_FILES, 'a model')
         if args.model.parent == args.report:
             # the report makes the folder first
             check_folder(args.report)
@@ -64,19 +75,26 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         check_distinct(args.model, [*paths, *further])
     if args.report is not None:
         check_folder(args.report)
-    records = [read(path, args) for path in paths]
-    validation = [read(path, args) for path in further]
+    everything = read_all([*paths, *further], args)
+    records, validation = everything[: len(paths)], everything[len(paths) :]
     with naming(*(record.name for record in records)), console.progress() as progress:
         result = identify(records, settings, progress=progress)
     checks = [_validate(result.model, record) for record in validation]
 
-    from piezo_ident import report
+    with interrupts.quitting():
+        from piezo_ident import report
 
     page = None
-    if args.report is not None:
-        page = report.write_report(result, [*records, *validation], args.report)
-    if args.model is not None:
-        save_model(result.model, args.model)
+    with interrupts.waiting():
+        if args.report is not None:
+            page = report.write_report(
+                result,
+                [*records, *validation],
+                args.report,
+                progress=lambda step, share: interrupts.check(),
+            )
+        if args.model is not None:
+            save_model(result.model, args.model)
     console.say(report.text_summary(result))
     for check in checks:
         console.say()
@@ -136,6 +154,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             check_suffix(path, suffixes, what)
             check_file(path, overwrite=True)
             check_distinct(path, [args.model, args.record])
+    _check_order(args)
     model = load_model(args.model)
     record = read(args.record, args)
     with naming(str(args.model)):
@@ -147,12 +166,17 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             'y': np.concatenate([p.y for p in record]),
             'y_hat': np.concatenate(free_run.prediction.pieces),
         }
-        with temporary_output(args.out, overwrite=True) as target, target.open('xb') as file:
+        with (
+            interrupts.waiting(),
+            temporary_output(args.out, overwrite=True) as target,
+            target.open('xb') as file,
+        ):
             WRITERS[args.out.suffix.lower()](file, Table(columns))
     if args.plot is not None:
         from piezo_ident.plots import write_prediction_plot
 
-        write_prediction_plot(record, free_run.prediction, args.plot)
+        with interrupts.waiting():
+            write_prediction_plot(record, free_run.prediction, args.plot)
     console.say(f'{args.model} on {record.name}, free run:')
     console.say('\n'.join(_error_lines(free_run)))
     say_faults(record, (), console)
@@ -170,7 +194,18 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
     )
 
 
+def _check_order(args: argparse.Namespace) -> None:
+    order = 'MODEL comes first: piezo_ident predict model.yaml record.csv'
+    model, record = args.model, args.record
+    if model.suffix.lower() in RECORD_FILES or model.is_dir():
+        raise ConfigError(f'{model}: is a record, no model file; {order}')
+    if record.suffix.lower() in MODEL_FILES:
+        raise ConfigError(f'{record}: is no record; {order}')
+
+
 def _error_lines(free_run: RecordPrediction) -> list[str]:
+    from piezo_ident.report.numbers import length
+
     lines = []
     rows = [('whole record', free_run.whole)]
     if any(free_run.estimated):
@@ -178,10 +213,20 @@ def _error_lines(free_run: RecordPrediction) -> list[str]:
             lines.append('  no sample at which the start is forgotten: drive a wider range')
         else:
             rows.append(('start forgotten', free_run.after))
-    table = [
-        f'  {name:16s} {e.percent:8.3g} % of stroke   fit {e.fit:8.3f} %   {e.n} samples'
-        for name, e in rows
+    centred = [
+        f', {e.percent_without_offset:.3g} % after removing a mean of {length(e.offset)}'
+        if e.mostly_offset
+        else ''
+        for _, e in rows
     ]
+    width = max(map(len, centred))
+    table = [
+        f'  {name:16s} {e.percent:8.3g} % of stroke{text:{width}s}   fit {e.fit:8.3f} %   '
+        f'{e.n} samples'
+        for (name, e), text in zip(rows, centred, strict=True)
+    ]
+    if width:
+        lines.append('  such a mean is what a sensor shows that was set to zero elsewhere')
     return [
         *table,
         *lines,
@@ -192,7 +237,13 @@ def _error_lines(free_run: RecordPrediction) -> list[str]:
 
 def _error_data(free_run: RecordPrediction) -> dict[str, Any]:
     def row(errors: Any) -> dict[str, Any]:
-        return {'percent_of_stroke': errors.percent, 'fit_percent': errors.fit, 'n': errors.n}
+        return {
+            'percent_of_stroke': errors.percent,
+            'fit_percent': errors.fit,
+            'n': errors.n,
+            'offset': errors.offset,
+            'percent_of_stroke_without_offset': errors.percent_without_offset,
+        }
 
     return {
         'formula': FORMULA,

@@ -21,8 +21,9 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.model_io import broken_link
 
-__all__ = ['check_distinct', 'check_file', 'check_folder', 'check_suffix']
+__all__ = ['check_distinct', 'check_file', 'check_folder', 'check_link', 'check_suffix']
 
 
 def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
@@ -41,6 +42,19 @@ def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
         )
 
 
+def check_link(path: Path) -> None:
+    """
+    Refuse a symbolic link that leads nowhere.
+
+    Raises
+    ------
+    DataError
+    """
+    broken = broken_link(path)
+    if broken:
+        raise DataError(f'{path}: {broken}')
+
+
 def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
     """
     Refuse an output that could not be written in the end.
@@ -57,6 +71,7 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
     ------
     DataError
     """
+    check_link(path)
     try:
         if path.is_dir() and not folder_too:
             raise DataError(f'{path}: is a folder; name a file')
@@ -81,11 +96,13 @@ def check_folder(path: Path) -> None:
     ------
     DataError
     """
+    check_link(path)
     try:
         if path.exists() and not path.is_dir():
             raise DataError(f'{path}: is a file; name a folder')
         here = path.absolute()
         while not here.exists():
+            check_link(here)
             here = here.parent
         _try(here)
     except OSError as error:

@@ -140,10 +140,16 @@ IDENTIFIER = (
     Declaration(
         'excitation_limit',
         20.0,
-        'how long ~/run waits for a sign of the excitation',
+        'how long ~/run waits for a sign of the excitation, or of the stage',
         's',
         0.5,
         3600.0,
+    ),
+    Declaration(
+        'channels',
+        '',
+        'topics of further channels (layout t,x_<name>), with blanks between',
+        read_only=True,
     ),
     Declaration(
         'nice', 5, 'by how much the work gives way to the capture', '1', 0, 19, read_only=True

@@ -117,7 +117,11 @@ def response_caption(identification: Identification) -> str:
     )
 
 
-def draw(identification: Identification, runs: Sequence[FreeRun]) -> Drawn:
+def draw(
+    identification: Identification,
+    runs: Sequence[FreeRun],
+    tick: Callable[[float], None] = lambda share: None,
+) -> Drawn:
     """
     Draw everything that the data of an identification allow.
 
@@ -126,6 +130,8 @@ def draw(identification: Identification, runs: Sequence[FreeRun]) -> Drawn:
     identification : Identification
     runs : sequence of FreeRun
         From `piezo_ident.validation.free_runs`.
+    tick : callable, optional
+        Called with the share of the work done; may raise to stop it.
 
     Returns
     -------
@@ -199,7 +205,8 @@ def draw(identification: Identification, runs: Sequence[FreeRun]) -> Drawn:
         ),
     ]
     pictures, left_out = [], []
-    for name, title, caption, make in wanted:
+    for i, (name, title, caption, make) in enumerate(wanted):
+        tick(i / len(wanted))
         try:
             pictures.append(Picture(name, title, caption, make()))
         except NothingToDraw as reason:

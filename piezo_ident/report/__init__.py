@@ -15,11 +15,12 @@
 """What an identification found, for people and for programs."""
 
 from piezo_ident.report.folder import write_report
-from piezo_ident.report.numbers import to_json, verdict
+from piezo_ident.report.numbers import steps_to_json, to_json, verdict
 from piezo_ident.report.text import error_table_for_sines, table_one, text_summary
 
 __all__ = [
     'error_table_for_sines',
+    'steps_to_json',
     'table_one',
     'text_summary',
     'to_json',

@@ -29,7 +29,7 @@ from piezo_ident.model_io import save_model
 from piezo_ident.record import Record
 from piezo_ident.report.numbers import to_json
 from piezo_ident.report.page import page
-from piezo_ident.results import Identification
+from piezo_ident.results import Identification, Progress, silent
 from piezo_ident.validation import free_runs, sines_of
 
 __all__ = ['write_report']
@@ -39,6 +39,8 @@ def write_report(
     identification: Identification,
     records: Sequence[Record] | Record,
     folder: str | os.PathLike[str],
+    *,
+    progress: Progress = silent,
 ) -> Path:
     """
     Write a report.
@@ -52,6 +54,9 @@ def write_report(
         Those that were identified.
     folder : path
         Made when it does not exist.  Files of an earlier report there are replaced.
+    progress : callable, optional
+        Called with what is done and the share of it; may raise `Cancelled` as long as nothing is
+        written.
 
     Returns
     -------
@@ -69,12 +74,14 @@ def write_report(
 
     records = [records] if isinstance(records, Record) else list(records)
     runs = free_runs(identification.model, records, identification.memories)
-    drawn = draw(identification, runs)
+    drawn = draw(identification, runs, lambda share: progress('drawing', 0.4 * share))
     shown = []
-    for picture in drawn.pictures:
+    for i, picture in enumerate(drawn.pictures):
+        progress('drawing', 0.4 + 0.5 * i / len(drawn.pictures))
         buffer = io.BytesIO()
         picture.figure.savefig(buffer, format='png', dpi=DPI)
         shown.append((picture.name, picture.title, picture.caption, buffer.getvalue()))
+    progress('writing', 0.9)
     html = page(identification, records, sines_of(runs), shown, drawn.left_out)
     numbers = json.dumps(
         to_json(identification, records, runs), indent=2, ensure_ascii=False, allow_nan=False

@@ -28,7 +28,7 @@ from piezo_ident.dynamics import Dynamics
 from piezo_ident.metrics import FORMULA
 from piezo_ident.model_io import plain
 from piezo_ident.record import Record
-from piezo_ident.results import Identification
+from piezo_ident.results import DelayResult, DynamicsResult, Identification, Steps
 from piezo_ident.validation import FreeRun, sines_of
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     'moves',
     'number',
     'share',
+    'steps_to_json',
     'to_json',
     'verdict',
 ]
@@ -144,7 +145,11 @@ def verdict(identification: Identification) -> str:
         kind, said = 'held out', 'On data it did not fit'
     elif selection:
         # rest and ramps flatter: they are no test of a model
-        kind, said = 'selection', 'On the parts of noise and triangle that were kept from the fit'
+        kind = 'selection'
+        said = (
+            'On the parts of steps, noise and triangle that were kept from the fit (no other '
+            'motion was there to test it)'
+        )
     else:
         kind, said = 'fitted', 'Nothing was held out; on the data it was fitted to'
     said += f', the model errs by {number(identification.error(kind))} % of stroke'
@@ -190,9 +195,7 @@ def to_json(
     """
     model, fit, dynamics = identification.model, identification.hysteresis, identification.dynamics
     h, G, delay = model.hysteresis, model.dynamics, identification.delay
-    m, na, nb = h.thresholds.size, G.a.size, G.b.size
-    sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
-    known = sigma.size == na + nb
+    m = h.thresholds.size
     swarm = identification.swarm
     data = {
         'schema_version': JSON_VERSION,
@@ -214,27 +217,10 @@ def to_json(
             'percent_of_stroke': identification.noise_floor,
             'source': identification.noise_source,
         },
-        'delay': {
-            'samples': delay.samples,
-            'seconds': model.delay.total / model.sample_rate,
-            'std': delay.std,
-            'source': delay.source,
-            'from_steps': delay.step.samples if delay.step is not None else None,
-            'from_scan': delay.scan,
-            'agree': delay.agree,
-        },
+        'delay': _delay(delay, model.delay.total / model.sample_rate),
         'dynamics': {
-            'order': list(dynamics.order),
-            'a': G.a,
-            'b': G.b,
-            'a_std': sigma[:na] if known else None,
-            'b_std': sigma[na:] if known else None,
-            'modes': [asdict(mode) for mode in modes(G, model.sample_rate, dynamics.covariance)],
-            'methods': dynamics.methods,
+            **_dynamics(dynamics, G, model.sample_rate),
             'bias': model.scaling.v0 + model.scaling.V * dynamics.bias,
-            'slope_measured': dynamics.slope_measured,
-            'slope_model': dynamics.slope_model,
-            'band': dynamics.band,
         },
         'hysteresis': {
             'thresholds': h.thresholds,
@@ -257,17 +243,77 @@ def to_json(
         'not_identified': [
             {'what': what, 'why': why} for what, why in identification.not_identified
         ],
-        'data_faults': [
-            {'record': record.name, **asdict(fault)}
-            for record in records
-            for fault in record.faults
-        ],
+        'data_faults': _faults(list(records)),
         'settings': asdict(identification.settings),
         'seed': identification.settings.seed,
         'versions': model.identification.get('versions', {}),
     }
     result: dict[str, Any] = _strict(plain(data))
     return result
+
+
+def steps_to_json(
+    steps: Steps, sample_rate: float, records: Sequence[Record] = ()
+) -> dict[str, Any]:
+    """
+    Return what single steps have found, under the keys of `to_json`.
+
+    Parameters
+    ----------
+    steps : Steps
+    sample_rate : float
+        [Hz]
+    records : sequence of Record, optional
+        For the faults that were met in the data.
+    """
+    data: dict[str, Any] = {
+        'schema_version': JSON_VERSION,
+        'package_version': __version__,
+        'sample_rate': sample_rate,
+        'data_faults': _faults(records),
+    }
+    if steps.delay is not None:
+        data['delay'] = _delay(steps.delay, steps.delay.samples / sample_rate)
+    if steps.dynamics is not None:
+        data['dynamics'] = _dynamics(*steps.dynamics, sample_rate)
+    result: dict[str, Any] = _strict(plain(data))
+    return result
+
+
+def _delay(delay: DelayResult, seconds: float) -> dict[str, Any]:
+    return {
+        'samples': delay.samples,
+        'seconds': seconds,
+        'std': delay.std,
+        'source': delay.source,
+        'from_steps': delay.step.samples if delay.step is not None else None,
+        'from_scan': delay.scan,
+        'agree': delay.agree,
+    }
+
+
+def _dynamics(dynamics: DynamicsResult, G: Dynamics, sample_rate: float) -> dict[str, Any]:
+    na, nb = G.a.size, G.b.size
+    sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
+    known = sigma.size == na + nb
+    return {
+        'order': list(dynamics.order),
+        'a': G.a,
+        'b': G.b,
+        'a_std': sigma[:na] if known else None,
+        'b_std': sigma[na:] if known else None,
+        'modes': [asdict(mode) for mode in modes(G, sample_rate, dynamics.covariance)],
+        'methods': dynamics.methods,
+        'slope_measured': dynamics.slope_measured,
+        'slope_model': dynamics.slope_model,
+        'band': dynamics.band,
+    }
+
+
+def _faults(records: Sequence[Record]) -> list[dict[str, Any]]:
+    return [
+        {'record': record.name, **asdict(fault)} for record in records for fault in record.faults
+    ]
 
 
 def _strict(value: Any) -> Any:

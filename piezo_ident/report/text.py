@@ -17,12 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import math
 import textwrap
 
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
 from piezo_ident.report.numbers import KINDS, length, moves, number, share, verdict
-from piezo_ident.results import Identification
+from piezo_ident.results import ErrorRow, Identification
 from piezo_ident.validation import sine_errors, SineError
 
 __all__ = ['error_table_for_sines', 'table_one', 'text_summary']
@@ -103,6 +104,7 @@ def text_summary(identification: Identification) -> str:
     lines = [*textwrap.wrap(verdict(identification), WIDTH), '']
     facts = [
         ('stage', f'{length(identification.stroke)} over {low:g} .. {high:g} V'),
+        *([('direction', 'retracts with rising voltage')] if model.scaling.Y < 0.0 else []),
         ('rate', f'{model.sample_rate:g} Hz'),
         ('delay', f'{delay.samples} samples ({delay.source})'),
         ('dynamics', f'na = {dynamics.order[0]}, nb = {dynamics.order[1]}'),
@@ -126,7 +128,7 @@ def text_summary(identification: Identification) -> str:
                         f'{name}, {kind}',
                         number(row.percent),
                         number(row.static_percent),
-                        share(row.fit),
+                        _fit(row),
                         str(row.n),
                     ]
                 )
@@ -136,6 +138,12 @@ def text_summary(identification: Identification) -> str:
     for said in identification.warnings:
         lines += _item(f'warning: {printable(said)}')
     return '\n'.join(lines)
+
+
+def _fit(row: ErrorRow) -> str:
+    # at rest there is nothing but noise to explain, and a good model looks like a bad one
+    rests = row.segment.partition(':')[0] == 'idle' or math.isinf(row.fit)
+    return share(math.nan if rests else row.fit)
 
 
 def _item(text: str) -> list[str]:

@@ -99,6 +99,8 @@ class Handle:
         self.name = name
         self.process = process
         self._log = log
+        #: whether its end is the test's doing
+        self.is_ended = False
 
     @property
     def log(self) -> str:
@@ -109,18 +111,20 @@ class Handle:
         """Return its latest status."""
         return self.graph.status(self.name)
 
-    def signal(self, number: int) -> None:
+    def send(self, number: int) -> None:
         """Send it a signal and do not wait."""
+        self.is_ended = number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
         self.process.send_signal(number)
 
     def stop(self, number: int = signal.SIGINT, timeout: float = 10.0) -> int:
         """Send it a signal, wait for its end, and return the exit code."""
         if self.process.poll() is None:
-            self.process.send_signal(number)
+            self.send(number)
         return self.process.wait(timeout)
 
     def kill(self) -> None:
         """End it outright, with all that it started."""
+        self.is_ended = True
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(5.0)
@@ -256,13 +260,12 @@ class Graph:
         handle = Handle(self, name, process, log)
         self.handles.append(handle)
         if wait:
-
-            def up() -> bool:
-                if process.poll() is not None:
-                    raise AssertionError(f'{name} ended with {process.returncode}: {handle.log}')
-                return len(self._statuses[name]) > before
-
-            self.wait(up, START_LIMIT, f'first status of {name}')
+            self.wait(
+                lambda: len(self._statuses[name]) > before, START_LIMIT, f'first status of {name}'
+            )
+        else:
+            # its end may be what is tested
+            handle.is_ended = True
         return handle
 
     # looking
@@ -352,6 +355,10 @@ class Graph:
         """Wait until a condition holds; `AssertionError` with the whole state when it does not."""
         deadline = time.monotonic() + timeout
         while not condition():
+            died = [h for h in self.handles if not h.is_ended and h.process.poll() is not None]
+            if died:
+                codes = {h.name: (h.process.returncode, h.log) for h in died}
+                raise AssertionError(f'{what}: nodes ended by themselves: {codes}')
             if time.monotonic() > deadline:
                 states = {name: self.status(name) for name in self._statuses}
                 logs = {h.name: h.log for h in self.handles if h.log}

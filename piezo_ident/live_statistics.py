@@ -1,0 +1,237 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Measured beside predicted as they come: joined on time, binned for people, judged by rms."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.wire_format import Samples
+
+__all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
+
+#: time for which a block waits for its partner [s]
+WAIT = 2.0
+#: most blocks that wait
+MOST = 500
+#: bins that a quantity may lag behind before it is no longer waited for
+LAG = 25
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Measured and predicted displacement of the same samples [m]."""
+
+    t: NDArray[np.float64]
+    y: NDArray[np.float64]
+    y_hat: NDArray[np.float64]
+    segment: str
+
+    @property
+    def residual(self) -> Samples:
+        """The residual as a block."""
+        return Samples(self.t, self.y - self.y_hat, self.segment, 'displacement')
+
+
+class Matcher:
+    """
+    Joins two streams of blocks on time, whichever comes first and however they are cut.
+
+    Attributes
+    ----------
+    unmatched : int
+        Measured samples for which no prediction came in time.
+    """
+
+    def __init__(self) -> None:
+        self.unmatched = 0
+        self._predicted: list[Samples] = []
+        self._measured: list[Samples] = []
+
+    def predicted(self, samples: Samples) -> list[Matched]:
+        """Take a prediction; return what is complete now."""
+        pairs = self._match(samples, self._predicted, self._measured)
+        return [Matched(a.t, b.values, a.values, a.segment) for a, b in pairs]
+
+    def measured(self, samples: Samples) -> list[Matched]:
+        """Take a measured block; return what is complete now."""
+        pairs = self._match(samples, self._measured, self._predicted)
+        return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
+
+    def _match(
+        self, new: Samples, own: list[Samples], others: list[Samples]
+    ) -> list[tuple[Samples, Samples]]:
+        pairs, rest = [], new
+        for other in list(others):
+            if not rest.t.size:
+                break
+            if other.t[-1] < rest.t[0] or other.t[0] > rest.t[-1]:
+                continue
+            others.remove(other)
+            if np.array_equal(other.t, rest.t):
+                pairs.append((rest, other))
+                rest = _rows(rest, np.zeros(rest.t.size, dtype=bool))
+                break
+            _, i, j = np.intersect1d(rest.t, other.t, return_indices=True)
+            if i.size:
+                pairs.append((_rows(rest, i), _rows(other, j)))
+            left, rest = _without(other, j), _without(rest, i)
+            if left.t.size:
+                others.append(left)
+        if rest.t.size:
+            own.append(rest)
+        self._forget(float(new.t[-1]))
+        return sorted(pairs, key=lambda pair: float(pair[0].t[0]))
+
+    def _forget(self, now: float) -> None:
+        for waiting in (self._predicted, self._measured):
+            kept = [s for s in waiting if abs(s.t[-1] - now) <= WAIT][-MOST:]
+            if waiting is self._measured:
+                self.unmatched += sum(s.t.size for s in waiting) - sum(s.t.size for s in kept)
+            waiting[:] = kept
+
+
+def _rows(samples: Samples, rows: NDArray[np.generic]) -> Samples:
+    return replace(samples, t=samples.t[rows], values=samples.values[rows])
+
+
+def _without(samples: Samples, rows: NDArray[np.intp]) -> Samples:
+    keep = np.ones(samples.t.size, dtype=bool)
+    keep[rows] = False
+    return _rows(samples, keep)
+
+
+@dataclass(frozen=True)
+class PreviewBin:
+    """
+    Mean, smallest and largest of each quantity over a stretch of sample time.
+
+    Attributes
+    ----------
+    t : float
+        Begin of the stretch [s].
+    values : dict of str to (mean, min, max)
+    """
+
+    t: float
+    values: dict[str, tuple[float, float, float]]
+
+
+class Preview:
+    """
+    Bins on the grid of sample time.
+
+    A bin is complete when every quantity that is coming has gone past it.
+
+    Parameters
+    ----------
+    rate : float
+        Bins a second [Hz].
+    """
+
+    def __init__(self, rate: float = 50.0) -> None:
+        self.rate = rate
+        self._newest: dict[str, int] = {}
+        self._bins: dict[int, dict[str, tuple[int, float, float, float]]] = {}
+
+    def add(self, name: str, t: NDArray[np.float64], x: NDArray[np.float64]) -> list[PreviewBin]:
+        """
+        Take samples of a quantity; return the bins that are complete now, in order.
+
+        Parameters
+        ----------
+        name : str
+        t, x : ndarray, shape (n,)
+            Time [s], rising, and values; what is not a finite number is left out.
+        """
+        finite = np.isfinite(x) & np.isfinite(t)
+        if not finite.all():
+            t, x = t[finite], x[finite]
+        if not t.size:
+            return []
+        # a tick that division put a hair before its bin belongs into it
+        k = np.floor(t * self.rate + 1e-6).astype(np.int64)
+        done: list[PreviewBin] = []
+        if k[0] < self._newest.get(name, k[0]):
+            done = self._take(sorted(self._bins))
+            self._newest.clear()
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(k)) + 1])
+        count = np.diff(np.append(starts, k.size))
+        total, low, high = (f.reduceat(x, starts) for f in (np.add, np.minimum, np.maximum))
+        for i, start in enumerate(starts):
+            here = self._bins.setdefault(int(k[start]), {})
+            n, s, a, b = here.get(name, (0, 0.0, np.inf, -np.inf))
+            here[name] = (
+                n + int(count[i]),
+                s + float(total[i]),
+                min(a, float(low[i])),
+                max(b, float(high[i])),
+            )
+        self._newest[name] = int(k[-1])
+        end = max(min(self._newest.values()), max(self._newest.values()) - LAG)
+        return done + self._take(sorted(b for b in self._bins if b < end))
+
+    def _take(self, bins: list[int]) -> list[PreviewBin]:
+        taken = []
+        for b in bins:
+            values = {name: (s / n, a, z) for name, (n, s, a, z) in self._bins.pop(b).items()}
+            taken.append(PreviewBin(b / self.rate, values))
+        return taken
+
+
+class LiveError:
+    """
+    Rms of the residual over the last stretch of sample time.
+
+    Parameters
+    ----------
+    window : float
+        [s]
+    """
+
+    def __init__(self, window: float) -> None:
+        self.window = window
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        # begin, end, samples and sum of squares of each stretch
+        self._parts: deque[tuple[float, float, int, float]] = deque()
+
+    def add(self, t: NDArray[np.float64], residual: NDArray[np.float64]) -> None:
+        """Take a stretch of the residual [m]."""
+        e = residual[np.isfinite(residual)]
+        if not e.size:
+            return
+        if self._parts and t[0] <= self._parts[-1][1]:
+            self.clear()
+        self._parts.append((float(t[0]), float(t[-1]), e.size, float(e @ e)))
+        while self._parts[-1][1] - self._parts[0][0] > self.window:
+            self._parts.popleft()
+
+    @property
+    def seconds(self) -> float:
+        """How much of the window is filled [s]."""
+        return self._parts[-1][1] - self._parts[0][0] if self._parts else 0.0
+
+    @property
+    def rms(self) -> float:
+        """Root mean square [m]; NaN before the first sample."""
+        n = sum(part[2] for part in self._parts)
+        return float(np.sqrt(sum(part[3] for part in self._parts) / n)) if n else float('nan')

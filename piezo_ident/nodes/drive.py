@@ -1,0 +1,209 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The identifier's route to the excitation: set its programme, start it, watch it to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from piezo_ident.nodes.wire import LATCHED
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+__all__ = ['Drive', 'Streams']
+
+#: states of the excitation in which it has ended, one way or the other, or not begun
+_RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
+#: how long the last blocks may be under way after the excitation says done [s]
+_TAIL = 1.0
+
+
+@dataclass(frozen=True)
+class Streams:
+    """How far the two streams have come: a number that grows, and the time of the last sample."""
+
+    voltage: int
+    voltage_time: float
+    displacement: int
+    displacement_time: float
+
+
+class Drive:
+    """
+    One run of the excitation's programme at a time.
+
+    Nothing waits: answers are looked for whenever `poll` is called.
+
+    Parameters
+    ----------
+    node : Node
+        On which clients and subscription are made.
+    streams : callable
+        Returns the `Streams` as they are.
+    begin : callable
+        Called right before the excitation is asked to start.
+    ended : callable
+        Called once with None when the programme was captured to its end, else with the reason.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        streams: Callable[[], Streams],
+        begin: Callable[[], None],
+        ended: Callable[[str | None], None],
+    ) -> None:
+        self._streams, self._begin, self._ended = streams, begin, ended
+        self._set = node.create_client(SetParameters, 'excitation/set_parameters')
+        self._start = node.create_client(Trigger, 'excitation/start')
+        self._stop = node.create_client(Trigger, 'excitation/stop')
+        node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
+        self._phase = ''
+        self._future: Any = None
+        self._state, self._message = '', ''
+        self.progress = 0.0
+
+    @property
+    def running(self) -> bool:
+        """Whether a run is under way."""
+        return bool(self._phase)
+
+    def start(self, program: str, limit: float) -> None:
+        """
+        Begin a run.
+
+        Parameters
+        ----------
+        program : str
+            For the excitation's parameter ``program``.
+        limit : float
+            How long to wait for a sign of the excitation, or of the stage [s].
+        """
+        self._program, self._limit = program, limit
+        self._phase, self._future, self.progress = 'finding', None, 0.0
+        self._sign = time.monotonic()
+
+    def stop(self) -> None:
+        """Give up the run, and ask the excitation to ramp to rest."""
+        if self._phase in ('starting', 'playing') and self._stop.service_is_ready():
+            self._stop.call_async(Trigger.Request())
+        self._phase = ''
+
+    def _end(self, reason: str | None) -> None:
+        if reason is not None:
+            self.stop()
+        self._phase = ''
+        self._ended(reason)
+
+    def _hear(self, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        self._state, self._message = values.get('state', ''), message.message
+        if self._phase != 'playing':
+            return
+        self._sign = time.monotonic()
+        if self._state not in _RESTING:
+            # what was latched before this run says nothing about it
+            self._active = True
+            try:
+                self.progress = float(values.get('progress', '0'))
+            except ValueError:
+                pass
+
+    def poll(self) -> None:
+        """Go on where something has happened, and give up where nothing has for too long."""
+        if self._phase:
+            getattr(self, f'_{self._phase}')()
+
+    def _silent(self) -> bool:
+        return time.monotonic() - self._sign > self._limit
+
+    def _finding(self) -> None:
+        if self._set.service_is_ready() and self._start.service_is_ready():
+            parameter = Parameter('program', value=self._program).to_parameter_msg()
+            request = SetParameters.Request(parameters=[parameter])
+            self._phase, self._sign = 'setting', time.monotonic()
+            self._future = self._set.call_async(request)
+        elif self._silent():
+            self._end(
+                f"no excitation offers '{self._start.srv_name}' within {self._limit:g} s; start "
+                'it in this namespace, or remap that name'
+            )
+
+    def _setting(self) -> None:
+        answer = self._answer('taking the programme')
+        if answer is None:
+            return
+        result = answer.results[0]
+        if not result.successful:
+            self._end(f'the excitation refuses the programme: {result.reason}')
+            return
+        self._begin()
+        self._first, self._active, self._done = self._streams(), False, 0.0
+        self._seen, self._stage_sign = self._first, time.monotonic()
+        self._phase, self._sign = 'starting', time.monotonic()
+        self._future = self._start.call_async(Trigger.Request())
+
+    def _starting(self) -> None:
+        answer = self._answer('starting')
+        if answer is None:
+            return
+        if not answer.success:
+            self._end(f'the excitation does not start: {answer.message}')
+            return
+        self._phase, self._sign = 'playing', time.monotonic()
+        # the status may have come before the answer
+        self._active = self._state not in _RESTING
+
+    def _answer(self, doing: str) -> Any:
+        if self._future.done():
+            future, self._future = self._future, None
+            answer = future.result()
+            if answer is not None:
+                return answer
+            self._end(f'the excitation gave no answer while {doing}')
+        elif self._silent():
+            self._end(f'the excitation gave no answer within {self._limit:g} s while {doing}')
+        return None
+
+    def _playing(self) -> None:
+        now, streams = time.monotonic(), self._streams()
+        if streams.voltage_time != self._seen.voltage_time:
+            self._sign = now
+        behind = streams.displacement_time != streams.voltage_time
+        if streams.displacement_time != self._seen.displacement_time or not behind:
+            self._stage_sign = now
+        self._seen = streams
+        started = self._active or streams.voltage != self._first.voltage
+        if started and self._state == 'done':
+            self._done = self._done or now
+            if not behind or now - self._done > _TAIL:
+                self._end(None)
+        elif started and self._state in _RESTING:
+            self._end(f'the excitation ended early ({self._state}): {self._message}')
+        elif behind and streams.voltage and now - self._stage_sign > self._limit:
+            self._end(
+                f'the stage has given no displacement for {self._limit:g} s, since t = '
+                f'{streams.displacement_time:.6g} s; is it running?'
+            )
+        elif self._silent():
+            said = f' (last: {self._state}, {self._message})' if self._state else ''
+            self._end(f'no sign of the excitation for {self._limit:g} s{said}')

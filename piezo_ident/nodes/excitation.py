@@ -1,0 +1,418 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The excitation node: plays programmes on `voltage`.
+
+Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every programme;
+at real time a block is sent when its first sample is due, counted from the first one.  At any
+other speed there is flow control besides: no more than `in_flight` blocks are on their way, the
+`displacement` that comes back being the answer; at ``rate_factor`` 0 the answers alone set the
+pace.
+
+``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
+and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
+A ramp runs in real time and waits for nobody.
+
+Two programmes at once would tear the stage to and fro, so a second publisher on `voltage` is
+refused at the start, and reported when it comes later.  An excitation that was killed is seen by
+the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
+for that.  Before the first block this node therefore listens for half a second.
+
+The flow control knows of the stage alone.  Where another node is slower, hand that one's answer to
+the excitation instead: ``-r displacement:=prediction`` waits for the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, field
+import math
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import ConfigError, PiezoIdentError
+from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.wire import STREAM, to_message
+from piezo_ident.pacing import BlockClock
+from piezo_ident.program import load_program, parse_program, Program, Sequence
+from piezo_ident.shipped import find_config
+from piezo_ident.wire_format import cut_blocks, Samples
+from rclpy.duration import Duration
+from std_msgs.msg import Float64MultiArray
+
+__all__ = ['ExcitationNode', 'main']
+
+#: how long the ramp of a node that is ending may take [s]
+LAST_RAMP = 0.7
+#: how long to listen whether somebody else is playing [s]
+LISTEN = 0.5
+#: between the match of a subscriber and the first block, for the other side to know of it too [s]
+SETTLE = 0.1
+
+
+def read_program(text: str) -> Program:
+    """
+    Return the programme that a parameter names or contains.
+
+    Raises
+    ------
+    ConfigError
+        When there is none.
+    """
+    if '\n' in text or ('segments' in text and ':' in text):
+        return parse_program(text)
+    return load_program(find_config(text, 'program'))
+
+
+@dataclass(eq=False)
+class Playing:
+    """One programme on its way, as the threads see it."""
+
+    sequence: Sequence
+    block_size: int
+    factor: float
+    stop: threading.Event = field(default_factory=threading.Event)
+    answered: threading.Event = field(default_factory=threading.Event)
+    hurry: bool = False
+    tick: int = 0
+    voltage: float | None = None
+    seen: int = 0
+    heard_other: bool = False
+    clock: BlockClock | None = None
+    work: float = 0.0
+    segment: str = ''
+
+
+class _Stopped(Exception):
+    """Somebody asked for the end."""
+
+
+class ExcitationNode(LabNode):
+    """Plays the programme of its parameter `program`."""
+
+    executable = 'excitation'
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._built: tuple[tuple[object, ...], Sequence] | None = None
+        self._playing: Playing | None = None
+        self._thread: threading.Thread | None = None
+        self._second = ''
+        self._rate = (time.monotonic(), 0)
+        super().__init__(**kwargs)
+        self._build(self.values['program'])
+        self._guard_settings()
+        self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
+        self._answers: Any = None
+        self._ears: Any = None
+        self.offer('start', self._start)
+        self.offer('stop', self._stop)
+
+    # parameters
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Refuse programmes that cannot be played, and limits that are crossed."""
+        if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
+            return None
+        # while parameters are declared, those that come later are not there yet
+        if not {'program', 'voltage_low', 'voltage_high', 'rest'} <= self.values.keys():
+            return None
+        if name != 'program' and self._is_playing():
+            return f'{name} cannot be changed while a programme is played; call ~/stop first'
+        wanted = {**self.values, name: value}
+        try:
+            self._guard_settings(wanted)
+            self._build(wanted['program'], wanted)
+        except PiezoIdentError as error:
+            return str(error)
+        return None
+
+    def _build(self, text: str, values: Mapping[str, Any] | None = None) -> Sequence:
+        values = values or self.values
+        limits = (values['voltage_low'], values['voltage_high'])
+        key = (text, limits)
+        # a file may have changed since
+        if self._built is None or self._built[0] != key or '\n' not in text:
+            try:
+                sequence = read_program(text).build(values['sample_rate'], limits=limits)
+            except (OSError, MemoryError) as error:
+                raise ConfigError(f'program: {error}') from None
+            self._built = (key, sequence)
+        return self._built[1]
+
+    def _guard_settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
+        v = values or self.values
+        return GuardSettings(
+            v['voltage_low'],
+            v['voltage_high'],
+            math.inf,
+            v['ramp_slew'],
+            v['rest'],
+            v['sample_rate'],
+        )
+
+    # services
+
+    def _is_playing(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _start(self) -> str:
+        if self._is_playing():
+            raise ConfigError('a programme is being played already; call ~/stop first')
+        self._refuse_others()
+        sequence = self._build(self.values['program'])
+        playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
+        self._clean_up()
+        if playing.factor != 1.0:
+            self._answers = self.create_subscription(
+                Float64MultiArray, 'displacement', self._on_answer, STREAM
+            )
+        self._ears = self.create_subscription(Float64MultiArray, 'voltage', self._on_other, STREAM)
+        self._playing = playing
+        self._rate = (time.monotonic(), 0)
+        self.report_status('waiting', 0.0, 'waiting for subscribers')
+        self._thread = threading.Thread(
+            target=self._run, args=(playing,), name='playing', daemon=True
+        )
+        self._thread.start()
+        return (
+            f'{sequence.name}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
+            f'{sequence.n} samples'
+        )
+
+    def _stop(self) -> str:
+        playing = self._playing
+        if playing is None or not self._is_playing():
+            raise ConfigError('nothing is being played')
+        playing.stop.set()
+        return f'ramping to {self.values["rest"]:g} V'
+
+    def _other_publishers(self) -> list[str]:
+        """Return who else publishes voltage; a namesake may be one that was killed."""
+        own = self.get_fully_qualified_name()
+        infos = self.get_publishers_info_by_topic(self._voltage.topic_name)
+        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
+        return [name for name in names if name != own]
+
+    def _refuse_others(self) -> None:
+        for name in self._other_publishers():
+            raise ConfigError(
+                f'{name} publishes on {self._voltage.topic_name} too; end it first: '
+                'two programmes at once would tear the stage to and fro'
+            )
+
+    def _clean_up(self) -> None:
+        """Give back what only a programme needs; on the executor's thread."""
+        self._close_ears()
+        if self._answers is not None:
+            self.destroy_subscription(self._answers)
+            self._answers = None
+
+    def _close_ears(self) -> None:
+        # they would hear every block that we send ourselves
+        if self._ears is not None:
+            self.destroy_subscription(self._ears)
+            self._ears = None
+
+    def _on_answer(self, message: Float64MultiArray) -> None:
+        playing = self._playing
+        if playing is None or len(message.data) < 2:
+            return
+        t = message.data[-2]
+        if not math.isfinite(t):
+            return
+        tick = round(t * playing.sequence.sample_rate) + 1
+        # what lies ahead of us is the end of an earlier programme
+        if playing.seen < tick <= playing.tick:
+            playing.seen = tick
+            playing.answered.set()
+
+    def _on_other(self, _: Float64MultiArray) -> None:
+        playing = self._playing
+        if playing is not None and playing.tick == 0:
+            playing.heard_other = True
+
+    # the thread that plays
+
+    def _run(self, playing: Playing) -> None:
+        try:
+            self._await_graph(playing)
+            self._play(playing)
+        except _Stopped:
+            self._ramp(playing, 'stopped', 'stopped')
+        except PiezoIdentError as error:
+            self._ramp(playing, 'failed', str(error))
+        else:
+            clock = playing.clock
+            # at other speeds it is the answers that set the pace
+            late = clock.late if clock and playing.factor == 1.0 else 0
+            behind = f', {late} blocks late' if late else ''
+            self.report_status('done', 100.0, f'{playing.sequence.name} played{behind}')
+
+    def _await_graph(self, playing: Playing) -> None:
+        limit, needed = self.values['wait_limit'], self.values['subscribers']
+        begin = time.monotonic()
+        self._sleep(playing, begin + LISTEN)
+        self._refuse_others()
+        while True:
+            if playing.heard_other:
+                raise ConfigError(
+                    f'another {self.get_fully_qualified_name()} is playing on '
+                    f'{self._voltage.topic_name}; end it first'
+                )
+            # without our own ears
+            found = self._voltage.get_subscription_count() - 1
+            answers = self._answers is None or self._answers.get_publisher_count() > 0
+            if found >= needed and answers:
+                break
+            if time.monotonic() - begin > limit + LISTEN:
+                what = (
+                    f'{max(0, found)} of {needed} subscribers on {self._voltage.topic_name}'
+                    if found < needed
+                    else 'nobody publishes displacement, which rate_factor other than 1 needs,'
+                )
+                raise ConfigError(
+                    f'{what} after {limit:g} s; start the stage, or set subscribers or wait_limit'
+                )
+            self._sleep(playing, time.monotonic() + 0.02)
+        if self.executor is not None:
+            self.executor.create_task(self._close_ears)
+        self._sleep(playing, time.monotonic() + SETTLE)
+
+    def _sleep(self, playing: Playing, until: float) -> None:
+        if playing.stop.wait(max(0.0, until - time.monotonic())):
+            raise _Stopped
+
+    def _play(self, playing: Playing) -> None:
+        sequence, factor = playing.sequence, playing.factor
+        clock = BlockClock(factor * sequence.sample_rate, time.monotonic())
+        playing.clock = clock
+        for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
+            if factor != 1.0:
+                self._await_answer(playing, start)
+            self._sleep(playing, clock.due(start))
+            self._send(playing, sequence.v[start:stop], label)
+            clock.note(start, stop - start, time.monotonic())
+            level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
+            self.report_status(
+                'running',
+                math.floor(100.0 * stop / sequence.n),
+                f'{sequence.name}: {label}{warning}',
+                level,
+                segment=label,
+            )
+
+    def _await_answer(self, playing: Playing, tick: int) -> None:
+        ahead = self.values['in_flight'] * playing.block_size
+        limit = self.values['wait_limit']
+        give_up = time.monotonic() + limit
+        while tick - playing.seen >= ahead:
+            playing.answered.clear()
+            if playing.stop.is_set():
+                raise _Stopped
+            if tick - playing.seen >= ahead and not playing.answered.wait(0.05):
+                if time.monotonic() > give_up:
+                    raise ConfigError(
+                        f'no displacement for {limit:g} s: the last that came back was of '
+                        f't = {playing.seen / playing.sequence.sample_rate:.6g} s'
+                    )
+
+    def _send(self, playing: Playing, v: NDArray[np.float64], label: str) -> None:
+        begin = time.perf_counter()
+        t = np.arange(playing.tick, playing.tick + v.size) / playing.sequence.sample_rate
+        # counted before it is sent: the answer may be there before publish returns
+        playing.tick += v.size
+        playing.voltage, playing.segment = float(v[-1]), label
+        self._voltage.publish(to_message(Samples(t, v, label)))
+        playing.work = time.perf_counter() - begin
+
+    def _ramp(self, playing: Playing, state: str, message: str) -> None:
+        """Go to rest from wherever we are, in real time, and say what came of it."""
+        settings = self._guard_settings()
+        level = WARN if state == 'failed' else OK
+        progress = math.floor(100.0 * playing.tick / playing.sequence.n)
+        if playing.voltage is not None and playing.voltage != settings.rest:
+            self.report_status('stopping', progress, f'ramping to {settings.rest:g} V', level)
+            self._send_ramp(playing, Guard(settings, playing.voltage))
+        self.report_status(state, progress, message, level)
+
+    def _send_ramp(self, playing: Playing, guard: Guard) -> None:
+        settings = guard.settings
+        hurried, origin = False, playing.tick
+        clock = playing.clock = BlockClock(settings.sample_rate, time.monotonic())
+        # short blocks even where those of the programme are long: the end must not wait
+        size = min(playing.block_size, max(1, round(0.005 * settings.sample_rate)))
+        while not guard.is_at_rest:
+            if playing.hurry and not hurried:
+                guard, hurried = Guard(settings, guard.applied), True
+            v = guard.idle(size, LAST_RAMP if hurried else math.inf)
+            time.sleep(max(0.0, clock.due(playing.tick - origin) - time.monotonic()))
+            start = playing.tick
+            self._send(playing, v, 'ramp:stop')
+            clock.note(start - origin, size, time.monotonic())
+
+    # diagnostics, end
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return rate, blocks, delays and head-room; watch for a second publisher."""
+        playing = self._playing
+        if not self._is_playing():
+            self._clean_up()
+        foreign = self._other_publishers()
+        self._second = f'second publisher {foreign[0]} on voltage' if foreign else ''
+        if playing is None:
+            return (WARN if foreign else OK), self._second or 'nothing played yet', {}
+        now = time.monotonic()
+        (then, before), self._rate = self._rate, (now, playing.tick)
+        clock = playing.clock
+        values: dict[str, object] = {
+            'rate': f'{(playing.tick - before) / max(now - then, 1e-9):.1f}',
+            'samples': playing.tick,
+            'segment': playing.segment,
+        }
+        if clock is not None:
+            period = playing.block_size / clock.speed if clock.speed else math.inf
+            values |= {
+                'blocks': clock.sent,
+                'late': clock.late,
+                'worst_delay': f'{clock.worst:.6f}',
+                'slipped': f'{clock.slipped:.6f}',
+                'head_room': f'{max(0.0, 1.0 - playing.work / period):.3f}',
+            }
+        level, message = OK, 'playing' if self._is_playing() else 'silent'
+        if foreign:
+            level, message = WARN, self._second
+        elif clock is not None and clock.slipped:
+            level, message = WARN, f'the clock fell behind by {clock.slipped:.3f} s'
+        return level, message, values
+
+    def close(self) -> None:
+        """Ramp to rest within a second."""
+        playing = self._playing
+        if playing is not None and self._thread is not None:
+            playing.hurry = True
+            playing.stop.set()
+            self._thread.join(LAST_RAMP + 0.4)
+            self._voltage.wait_for_all_acked(Duration(seconds=0.1))
+
+
+def main(argv: Many[str] | None = None) -> int:
+    """Run the node; see `piezo_ident.nodes.base.run`."""
+    return run(ExcitationNode, argv)

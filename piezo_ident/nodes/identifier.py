@@ -1,0 +1,311 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The identifier: captures what passes, drives the excitation, and learns the model."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+import functools
+from pathlib import Path
+import time
+from typing import Any
+
+from piezo_ident.capture import APPLIED, Capture
+from piezo_ident.cli.outputs import check_folder
+from piezo_ident.errors import Cancelled, DataError, PiezoIdentError
+from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.drive import Drive, Streams
+from piezo_ident.nodes.jobs import (
+    identify_job,
+    Outcome,
+    save_job,
+    settings_of,
+    share_of,
+)
+from piezo_ident.nodes.wire import from_message, LATCHED, STREAM
+from piezo_ident.results import Steps
+from piezo_ident.worker import Worker
+from std_msgs.msg import Float64MultiArray, String
+
+__all__ = ['IdentifierNode', 'main']
+
+#: quantities that a topic may say it carries, beside its own name
+_CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
+#: how often the run of the excitation is looked at [s]
+POLL = 0.05
+#: how often it is told how much was captured [s]
+TELL = 0.5
+#: how long the end of the node waits for the work to end [s]
+PATIENCE = 1.7
+
+
+class IdentifierNode(LabNode):
+    """Captures, identifies, and publishes model and report."""
+
+    executable = 'identifier'
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._capture = Capture(self.values['capture_limit'])
+        self._worker = Worker(self.values['nice'])
+        self._outcomes: deque[Callable[[], None]] = deque()
+        self._state, self._doing, self._told = 'idle', '', 0.0
+        self._steps = Steps()
+        self._found: Outcome | None = None
+        self._counted, self._counted_at = 0, time.monotonic()
+        self._passed: dict[str, int] = {}
+        self._model = self.create_publisher(String, 'model', LATCHED)
+        self._report = self.create_publisher(String, 'report', LATCHED)
+        for key in ('voltage', 'displacement', APPLIED):
+            self._listen(key, key)
+        for topic in self.values['channels'].split():
+            self._listen(topic, '')
+        self._drive = Drive(self, self._streams, self._begin_run, self._run_ended)
+        self.create_timer(POLL, self._poll)
+        self._wake = self.create_guard_condition(self._take_outcomes)
+        self.offer('run', self._run)
+        self.offer('identify', functools.partial(self._identify, 'all'))
+        for step in ('delay', 'dynamics', 'hysteresis'):
+            self.offer(f'identify_{step}', functools.partial(self._identify, step))
+        self.offer('cancel', self._cancel)
+        self.offer('clear', self._clear)
+        self.offer('save', self._save)
+
+    # capture
+
+    def _listen(self, topic: str, key: str) -> None:
+        take = functools.partial(self._take, topic, key)
+        self.create_subscription(Float64MultiArray, topic, take, STREAM)
+
+    def _take(
+        self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
+    ) -> None:
+        try:
+            samples = from_message(message)
+            known = (*_CARRIED[key], key) if key else ()
+            quantity = samples.quantity
+            # a further channel says itself what it is
+            if quantity not in known and (key or not quantity.startswith('x_')):
+                wanted = key or 'x_<name>'
+                raise DataError(f"layout says 't,{quantity}', not 't,{wanted}'")
+        except DataError as error:
+            self._capture.unreadable(topic, str(error))
+            return
+        arrival = info.get('received_timestamp') or time.time_ns()
+        self._capture.add(key or samples.quantity, samples, arrival)
+        self._passed[topic] = self._passed.get(topic, 0) + samples.t.size
+
+    def _streams(self) -> Streams:
+        c = self._capture
+        return Streams(
+            self._passed.get('voltage', 0),
+            c.last_time('voltage'),
+            self._passed.get('displacement', 0),
+            c.last_time('displacement'),
+        )
+
+    # state
+
+    def _say(self, state: str, progress: float, message: str, level: bytes = OK) -> None:
+        self._state = state
+        self.report_status(state, progress, message, level)
+
+    def _poll(self) -> None:
+        if self._drive.running:
+            self._drive.poll()
+        if self._drive.running:
+            segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
+            message = f'{self._doing}: {self._capture.seconds:.0f} s captured{segment}'
+            self._say('exciting', self._drive.progress, message)
+        elif self._state == 'idle' and time.monotonic() - self._told > TELL:
+            self._told = time.monotonic()
+            self._say('idle', 0.0, self._listening())
+
+    def _listening(self) -> str:
+        captured = [self._capture.seconds_of(key) for key in ('voltage', 'displacement')]
+        if not any(captured):
+            return 'ready'
+        return '{:.3f} s of voltage, {:.3f} s of displacement captured'.format(*captured)
+
+    def _refuse_when_busy(self) -> None:
+        if self._drive.running or self._worker.busy:
+            raise PiezoIdentError(f'busy: {self._doing}; wait for its end, or call ~/cancel')
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Refuse what the settings would refuse later."""
+        if name == 'thresholds':
+            defaults = {'solver': 'swarm', 'max_order': 15, 'seed': 0}
+            swarm = {'swarm_size': 40, 'swarm_iterations': 1000}
+            try:
+                settings_of({**defaults, **swarm, 'thresholds': value})
+            except PiezoIdentError as error:
+                return str(error)
+        if name == 'program' and not value.strip():
+            return 'program must not be empty; name a programme, a path, or write YAML'
+        return None
+
+    def apply(self, changed: Mapping[str, Any]) -> None:
+        """Hand the limit on to the capture; the rest is read when work begins."""
+        if 'capture_limit' in changed:
+            self._capture.limit = changed['capture_limit']
+
+    # services
+
+    def _run(self) -> str:
+        self._refuse_when_busy()
+        settings_of(self.values)
+        self._doing = 'excitation'
+        self._drive.start(self.values['program'], self.values['excitation_limit'])
+        self._say('exciting', 0.0, 'asking the excitation for the programme')
+        return 'the programme is asked for; see ~/status'
+
+    def _begin_run(self) -> None:
+        # a run stands for itself: older data may come from another stage, or another day
+        self._forget()
+
+    def _run_ended(self, reason: str | None) -> None:
+        if reason is not None:
+            self._say('failed', 0.0, reason, ERROR)
+            return
+        try:
+            self._identify('all')
+        except PiezoIdentError as error:
+            self._say('failed', 0.0, str(error), ERROR)
+
+    def _identify(self, which: str) -> str:
+        self._refuse_when_busy()
+        if not self._capture.n:
+            raise DataError(
+                'nothing has been captured; start the excitation, call ~/run, or replay a bag'
+            )
+        job = identify_job(self._capture.snapshot(), settings_of(self.values), which, self._steps)
+        self._doing = 'identification' if which == 'all' else f'identification of the {which}'
+        self._say('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
+        self._worker.start(job, progress=self._progress, ended=self._ended)
+        return f'{self._doing} has begun; see ~/status'
+
+    def _save(self) -> str:
+        self._refuse_when_busy()
+        found, folder = self._found, self.values['output']
+        if found is None or found.identification is None or found.record is None:
+            raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
+        if not folder:
+            raise PiezoIdentError("parameter 'output' is empty; set it to the folder to write to")
+        check_folder(Path(folder))
+        self._doing = 'saving'
+        self._say('saving', 0.0, f'writing to {folder}')
+        job = save_job(found.identification, found.record, folder)
+        self._worker.start(job, progress=self._progress, ended=self._ended)
+        return f'writing to {folder}; see ~/status'
+
+    def _cancel(self) -> str:
+        if self._drive.running:
+            self._drive.stop()
+            self._say('cancelled', 0.0, 'the excitation was asked to ramp to rest')
+            return 'cancelled; the excitation ramps to rest'
+        if not self._worker.busy:
+            raise PiezoIdentError('nothing is at work')
+        self._worker.cancel()
+        return f'{self._doing} is being cancelled; see ~/status'
+
+    def _clear(self) -> str:
+        self._refuse_when_busy()
+        seconds = self._capture.seconds
+        self._forget()
+        self._say('idle', 0.0, 'ready')
+        return f'{seconds:.3g} s of capture forgotten'
+
+    def _forget(self) -> None:
+        self._capture.clear()
+        self._steps = Steps()
+
+    # work
+
+    def _progress(self, step: str, share: float) -> None:
+        state = 'saving' if self._doing == 'saving' else 'identifying'
+        percent = 100.0 * share if state == 'saving' else share_of(step, share)
+        self.report_status(state, percent, step)
+
+    def _ended(self, result: Outcome | str | None, error: Exception | None) -> None:
+        # published by the executor, so that who hears of the end finds the worker free
+        self._outcomes.append(functools.partial(self._conclude, result, error))
+        self._wake.trigger()
+
+    def _take_outcomes(self) -> None:
+        while self._outcomes:
+            self._worker.join(1.0)
+            self._outcomes.popleft()()
+
+    def _conclude(self, result: Outcome | str | None, error: Exception | None) -> None:
+        if isinstance(error, Cancelled):
+            self._say('cancelled', 0.0, f'{self._doing} was cancelled; nothing was changed')
+        elif isinstance(error, PiezoIdentError):
+            self._say('failed', 0.0, ' '.join(str(error).split()), ERROR)
+        elif error is not None:
+            reason = f'{self._doing}: {type(error).__name__}: {error}'
+            self.get_logger().error(reason)
+            self._say('failed', 0.0, ' '.join(reason.split()), ERROR)
+        elif isinstance(result, Outcome):
+            self._steps = result.steps or self._steps
+            self._report.publish(String(data=result.report))
+            if result.model:
+                self._found = result
+                self._model.publish(String(data=result.model))
+            count = result.warnings
+            said = f'; {count} warning{"s" * (count > 1)} in the report' if count else ''
+            self._say('done', 100.0, result.message + said, WARN if count else OK)
+        else:
+            self._say('done', 100.0, f'written: {result}')
+
+    # end and diagnostics
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return how the capture goes."""
+        now, passed = time.monotonic(), self._passed.get('voltage', 0)
+        rate = (passed - self._counted) / max(now - self._counted_at, 1e-3)
+        self._counted, self._counted_at = passed, now
+        capture = self._capture
+        values: dict[str, object] = {
+            'state': self._state,
+            'rate': f'{rate:.0f}',
+            'captured': f'{capture.seconds:.3f}',
+            'segments': ' '.join(capture.segments),
+            'room': f'{max(capture.limit - capture.seconds, 0.0):.1f}',
+            'lost': sum(capture.lost.values()),
+        }
+        problems = capture.problems
+        if problems:
+            return WARN, '; '.join(problems), values
+        return OK, self._doing if self._worker.busy else 'listening', values
+
+    def close(self) -> None:
+        """Cancel what is at work, and ask the excitation to ramp to rest."""
+        if self._drive.running:
+            self._drive.stop()
+        if self._worker.busy:
+            self._worker.cancel()
+            self._worker.join(PATIENCE)
+            self._say('cancelled', 0.0, 'the node ends')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(IdentifierNode, argv)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,164 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What the identifier's worker does; nothing here knows of topics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import json
+
+from piezo_ident.capture import refuse_incomplete, Snapshot
+from piezo_ident.errors import ConfigError
+from piezo_ident.identification import identify
+from piezo_ident.model_io import model_to_yaml
+from piezo_ident.record import Record
+from piezo_ident.report import steps_to_json, to_json, verdict, write_report
+from piezo_ident.results import Identification, Settings, Steps
+from piezo_ident.single_steps import find_delay, find_dynamics, find_hysteresis
+from piezo_ident.validation import free_runs
+
+__all__ = ['Outcome', 'identify_job', 'save_job', 'settings_of', 'share_of']
+
+Tick = Callable[[str, float], None]
+
+#: where each step stands in the whole, by how long it takes
+_SHARES = {'delay': (0.02, 0.05), 'dynamics': (0.05, 0.8), 'hysteresis': (0.8, 0.98)}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """
+    What a job brings home.
+
+    Attributes
+    ----------
+    message : str
+        One line for people.
+    report : str
+        JSON; empty when there is nothing to report.
+    warnings : int
+        How many there are in the report.
+    steps : Steps or None
+        What single steps found.
+    identification, record : Identification and Record, or None
+    model : str
+        YAML; empty without a model.
+    """
+
+    message: str
+    report: str = ''
+    warnings: int = 0
+    steps: Steps | None = None
+    identification: Identification | None = None
+    record: Record | None = None
+    model: str = ''
+
+
+def settings_of(values: dict[str, object]) -> Settings:
+    """
+    Return the settings that a node's parameters ask for.
+
+    Raises
+    ------
+    ConfigError
+        When a value is out of range.
+    """
+    text = str(values['thresholds']).strip()
+    refine = text == 'refined'
+    if not refine and not text.isdecimal():
+        raise ConfigError(f"thresholds must be a number of 2 to 400, or 'refined', got {text!r}")
+    return Settings(
+        thresholds=10 if refine else int(text),
+        refine=refine,
+        solver=str(values['solver']),  # type: ignore[arg-type]
+        max_order=int(str(values['max_order'])),
+        swarm_size=int(str(values['swarm_size'])),
+        swarm_iterations=int(str(values['swarm_iterations'])),
+        seed=int(str(values['seed'])),
+    )
+
+
+def share_of(step: str, share: float) -> float:
+    """Return the progress of the whole in percent."""
+    low, high = _SHARES.get(step, (0.0, 1.0))
+    return 100.0 * (low + (high - low) * share)
+
+
+def identify_job(
+    snapshot: Snapshot, settings: Settings, which: str = 'all', steps: Steps | None = None
+) -> Callable[[Tick], Outcome]:
+    """
+    Return a job that makes a record of what was captured, and takes the steps.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    settings : Settings
+    which : {'all', 'delay', 'dynamics', 'hysteresis'}
+    steps : Steps, optional
+        What was found already; for single steps only.
+    """
+
+    def job(tick: Tick) -> Outcome:
+        tick('record', 0.0)
+        record = snapshot.record('capture')
+        tick('record', 0.01)
+        refuse_incomplete(record)
+        records = [record]
+        if which in ('delay', 'dynamics'):
+            if which == 'delay':
+                found = find_delay(records, settings, progress=tick)
+            else:
+                found = find_dynamics(records, settings, steps=steps, progress=tick)
+            data = steps_to_json(found, record.pieces[0].sample_rate, records)
+            return Outcome(_said(found), json.dumps(data), len(record.faults), found)
+        if which == 'hysteresis':
+            result = find_hysteresis(records, settings, steps=steps, progress=tick)
+        else:
+            result = identify(records, settings, progress=tick)
+        tick('report', 0.98)
+        runs = free_runs(result.model, records, result.memories)
+        tick('report', 0.99)
+        return Outcome(
+            message=verdict(result),
+            report=json.dumps(to_json(result, records, runs)),
+            warnings=len(result.warnings),
+            steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
+            identification=result,
+            record=record,
+            model=model_to_yaml(result.model),
+        )
+
+    return job
+
+
+def _said(steps: Steps) -> str:
+    if steps.dynamics is not None:
+        na, nb = steps.dynamics[0].order
+        return f'dynamics: na = {na}, nb = {nb}'
+    delay = steps.delay
+    return '' if delay is None else f'delay: {delay.samples} samples ({delay.source})'
+
+
+def save_job(identification: Identification, record: Record, folder: str) -> Callable[[Tick], str]:
+    """Return a job that writes model, report and pictures."""
+
+    def job(tick: Tick) -> str:
+        tick('drawing', 0.0)
+        return str(write_report(identification, record, folder, progress=tick))
+
+    return job

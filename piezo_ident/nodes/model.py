@@ -1,0 +1,289 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The model beside the stage: prediction, residual and preview as blocks come."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import functools
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from piezo_ident.errors import DataError, PiezoIdentError
+from piezo_ident.live import expected_error, Predictor, warm_up
+from piezo_ident.live_statistics import LiveError, Matched, Matcher, Preview, PreviewBin
+from piezo_ident.model import StageModel
+from piezo_ident.model_io import load_model, model_from_dict, parse_yaml
+from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
+from piezo_ident.wire_format import Samples
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+
+__all__ = ['ModelNode', 'main']
+
+QUANTITIES = ('displacement', 'prediction', 'residual')
+#: how long a problem of the stream stays in the status [s]
+REMEMBER = 5.0
+
+
+class ModelNode(LabNode):
+    """Predicts what the stage does, and says when it does something else."""
+
+    executable = 'model'
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._files: dict[str, StageModel] = {}
+        super().__init__(**kwargs)
+        warm_up()
+        self._predictor, self._matcher = Predictor(), Matcher()
+        self._preview = Preview(self.values['preview_rate'])
+        self._error = LiveError(self.values['window'])
+        self._source, self._turned_down, self._unreadable = '', '', 0
+        self._trouble, self._trouble_at = '', 0.0
+        self._range = (float('inf'), float('-inf'))
+        self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
+        self._texts: list[str] = []
+        self._parsed: list[tuple[StageModel | None, str]] = []
+        self._parsing: threading.Thread | None = None
+        self._wake = self.create_guard_condition(self._take_parsed)
+        self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
+        self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
+        self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
+        if self.values['model']:
+            self._use(self._files.pop(self.values['model']), self.values['model'])
+        self.create_subscription(String, 'model', self._on_model, LATCHED)
+        for topic, take in (('voltage', self._voltage), ('displacement', self._displacement)):
+            on_message = functools.partial(self._on_block, topic, take)
+            self.create_subscription(Float64MultiArray, topic, on_message, STREAM)
+        self._tell()
+
+    # models
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Refuse a model file that cannot be used."""
+        if name == 'model' and value:
+            try:
+                self._files = {value: _tried(load_model(value))}
+            except PiezoIdentError as error:
+                return str(error)
+        return None
+
+    def apply(self, changed: Mapping[str, Any]) -> None:
+        """Take a model file, or another window."""
+        if changed.get('model'):
+            self._use(self._files.pop(changed['model']), changed['model'])
+            self._tell()
+        if 'window' in changed:
+            self._error.window = changed['window']
+
+    def _on_model(self, message: String) -> None:
+        # reading YAML takes longer than a block: it is done in a thread, the swap here
+        self._texts = [message.data]
+        if self._parsing is None:
+            self._parse()
+
+    def _parse(self) -> None:
+        text = self._texts.pop()
+
+        def work() -> None:
+            try:
+                model = _tried(model_from_dict(parse_yaml(text, 'topic model'), 'topic model'))
+                self._parsed.append((model, ''))
+            except PiezoIdentError as error:
+                self._parsed.append((None, ' '.join(str(error).split())))
+            # a text from outside must not end the node, whatever it trips over
+            except Exception as error:  # noqa: BLE001
+                self._parsed.append((None, f'topic model: {type(error).__name__}: {error}'))
+            self._wake.trigger()
+
+        self._parsing = threading.Thread(target=work, name='parse', daemon=True)
+        self._parsing.start()
+
+    def _take_parsed(self) -> None:
+        if self._parsing is None or not self._parsed:
+            return
+        self._parsing.join()
+        self._parsing = None
+        model, reason = self._parsed.pop()
+        if model is None:
+            self._refuse_model(reason)
+        else:
+            self._use(model, 'topic model')
+        self._tell()
+        if self._texts:
+            self._parse()
+
+    def _use(self, model: StageModel, source: str) -> None:
+        try:
+            self._predictor.set_model(model)
+        except PiezoIdentError as error:
+            self._refuse_model(f'{source}: {error}')
+            return
+        self._source, self._turned_down = source, ''
+        self._error.clear()
+
+    def _refuse_model(self, reason: str) -> None:
+        kept = 'the old model is kept' if self._predictor.model else 'there is no model'
+        self._turned_down = f'model refused, {kept}: {reason}'
+        self.get_logger().warning(self._turned_down)
+
+    # blocks
+
+    def _on_block(self, topic: str, take: Any, message: Float64MultiArray) -> None:
+        begin = time.perf_counter()
+        try:
+            samples = from_message(message)
+            if samples.quantity != topic:
+                raise DataError(f"layout says 't,{samples.quantity}', not 't,{topic}'")
+        except DataError as error:
+            self._unreadable += 1
+            self._meet(f'a message on {topic} is no block: {error}')
+            return
+        take(samples)
+        self._work += time.perf_counter() - begin
+
+    def _voltage(self, samples: Samples) -> None:
+        predictor = self._predictor
+        predictor.problem = ''
+        prediction = predictor.process(samples)
+        if prediction is not None:
+            self._prediction.publish(to_message(prediction))
+        self._count += samples.t.size
+        if samples.t.size:
+            low, high = self._range
+            self._range = (
+                min(low, float(samples.values.min())),
+                max(high, float(samples.values.max())),
+            )
+        if predictor.problem:
+            self._meet(predictor.problem)
+        if prediction is not None:
+            self._show(self._preview.add('prediction', prediction.t, prediction.values))
+            self._compare(self._matcher.predicted(prediction))
+
+    def _displacement(self, samples: Samples) -> None:
+        if not samples.t.size:
+            return
+        usable = np.isfinite(samples.t) & np.isfinite(samples.values)
+        if not usable.all():
+            self._meet('a block of displacement holds NaN or infinite numbers; they are left out')
+            samples = Samples(
+                samples.t[usable], samples.values[usable], samples.segment, samples.quantity
+            )
+            if not samples.t.size:
+                return
+        self._show(self._preview.add('displacement', samples.t, samples.values))
+        if self._predictor.model is not None:
+            self._compare(self._matcher.measured(samples))
+
+    def _compare(self, pairs: list[Matched]) -> None:
+        for pair in pairs:
+            residual = pair.residual
+            self._residual.publish(to_message(residual))
+            self._show(self._preview.add('residual', residual.t, residual.values))
+            if self._predictor.memory_known:
+                self._error.add(residual.t, residual.values)
+
+    def _show(self, bins: list[PreviewBin]) -> None:
+        for b in bins:
+            message = JointState()
+            message.header.stamp = self.get_clock().now().to_msg()
+            for quantity in QUANTITIES:
+                # a quantity that does not come leaves a hole in the plot, not a zero
+                values = b.values.get(quantity, (float('nan'),) * 3)
+                message.name += [f'{quantity}/{what}' for what in ('mean', 'min', 'max')]
+                message.position.extend(values)
+            self._joints.publish(message)
+
+    # status and diagnostics
+
+    def _meet(self, problem: str) -> None:
+        self._trouble, self._trouble_at = problem, time.monotonic()
+        self._tell()
+
+    def _verdict(self) -> str:
+        """Return why the stage should be identified again, empty when there is no reason."""
+        model = self._predictor.model
+        if model is None or self._error.seconds < 0.5 * self._error.window:
+            return ''
+        before, now = expected_error(model), self._live_error(model)
+        ratio = self.values['warn_ratio']
+        if before is None or now <= ratio * before:
+            return ''
+        return (
+            f'identify again: the live error is {now:.3g} % of stroke, {now / before:.1f} times '
+            f'that at identification'
+        )
+
+    def _live_error(self, model: StageModel) -> float:
+        return 100.0 * self._error.rms / abs(model.scaling.Y)
+
+    def _tell(self) -> None:
+        fresh = time.monotonic() - self._trouble_at < REMEMBER
+        said = [self._turned_down, self._trouble if fresh else '']
+        state = 'predicting' if self._predictor.model is not None else 'waiting'
+        message = f'with {self._source}' if self._source else 'for a model'
+        text = '; '.join(filter(None, [message, *said]))
+        self.report_status(state, 0.0, text, WARN if any(said) else OK)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return how the prediction goes."""
+        self._tell()
+        now, p = time.monotonic(), self._predictor
+        elapsed = max(now - self._count_at, 1e-3)
+        values: dict[str, object] = {
+            'rate': f'{self._count / elapsed:.0f}',
+            'load': f'{100.0 * self._work / elapsed:.1f}',
+            'lost': p.lost,
+            'late': p.late,
+            'restarts': p.restarts,
+            'unreadable': self._unreadable,
+            'unmatched': self._matcher.unmatched,
+        }
+        (low, high), self._range = self._range, (float('inf'), float('-inf'))
+        self._count, self._count_at, self._work = 0, now, 0.0
+        model = p.model
+        if model is None:
+            return OK, 'no model yet', values
+        values['memory_known'] = p.memory_known
+        values['residual_rms'] = f'{self._error.rms:.6g}'
+        values['residual_percent'] = f'{self._live_error(model):.4g}'
+        said = [self._verdict()]
+        if low <= high:
+            room = min(low - model.scaling.range[0], model.scaling.range[1] - high)
+            values['head_room'] = f'{room:.6g}'
+            if room < -1e-3 * (model.scaling.range[1] - model.scaling.range[0]):
+                said.append(f'the voltage leaves the identified range by {-room:.3g} V')
+        message = '; '.join(filter(None, said))
+        return (WARN, message, values) if message else (OK, 'predicting', values)
+
+
+def _tried(model: StageModel) -> StageModel:
+    """Return the model after a few samples, so that all it needs is compiled and fits together."""
+    model.stream().process(np.full(10, model.scaling.range[0]))
+    return model
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(ModelNode, argv)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

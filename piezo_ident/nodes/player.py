@@ -1,0 +1,323 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The player node: replays a bag onto topics with the original spacing, or faster.
+
+Blocks carry their own times, so the samples that are replayed are the samples that were measured,
+bit by bit, at whatever rate.  The spacing is that of the log times, on a schedule that is counted
+from its start.  Only the measured topics are replayed unless `topics` says otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+import threading
+import time
+from typing import Any
+
+from piezo_ident.bag_recovery import Bag, opened_bag, Stored
+from piezo_ident.errors import DataError, PiezoIdentError
+from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.taps import message_class
+from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.replay import chosen_topics, ReplayClock
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
+
+__all__ = ['PlayerNode', 'main']
+
+#: how long a start may take before it is answered [s]
+PATIENCE = 1.5
+#: between the match of the subscribers and the first message, for them to know of it too [s]
+SETTLE = 0.2
+#: how often progress is told [s]
+TELL = 0.25
+
+
+class _Stopped(Exception):
+    """The replay was asked to end."""
+
+
+@dataclass(eq=False)
+class Replay:
+    """One replay on its way, as both threads see it."""
+
+    bag: str
+    topics: tuple[str, ...]
+    ready: threading.Event = field(default_factory=threading.Event)
+    stop: threading.Event = field(default_factory=threading.Event)
+    refusal: str = ''
+    failure: str = ''
+    messages: int = 0
+    total: int = 0
+    progress: float = 0.0
+    slipped: float = 0.0
+    names: str = ''
+    thread: threading.Thread | None = None
+
+
+class PlayerNode(LabNode):
+    """Replays bags."""
+
+    executable = 'player'
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._replay: Replay | None = None
+        self._senders: dict[tuple[str, str, bool, bool, int], Any] = {}
+        self._last_count = (time.monotonic(), 0)
+        super().__init__(**kwargs)
+        self.offer('start', self.start)
+        self.offer('stop', self.stop)
+        if self.values['autostart']:
+            self.start()
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Refuse names that cannot be."""
+        if name == 'topics':
+            if not value:
+                return 'topics must name at least one'
+            for topic in value:
+                try:
+                    self.resolve_topic_name(topic)
+                except (InvalidTopicNameException, ValueError) as error:
+                    return f'topics: {topic!r} is no name of a topic ({error})'
+        return None
+
+    # services
+
+    def start(self) -> str:
+        """
+        Replay the bag from its beginning, also when it is being replayed.
+
+        Raises
+        ------
+        PiezoIdentError
+            When there is no such bag, or it cannot be replayed.
+        """
+        if not self.values['bag']:
+            raise PiezoIdentError('no bag is named; set the parameter bag')
+        self._halt()
+        replay = Replay(self.values['bag'], tuple(self.values['topics']))
+        replay.thread = threading.Thread(target=self._work, args=(replay,), name='replay')
+        self._replay = replay
+        replay.thread.start()
+        replay.ready.wait(PATIENCE)
+        if replay.refusal:
+            raise PiezoIdentError(replay.refusal)
+        if not replay.ready.is_set():
+            return f'looking through {replay.bag}, which was not finished'
+        return f'replaying {replay.names} of {replay.bag}: {replay.total} messages'
+
+    def stop(self) -> str:
+        """
+        End the replay.
+
+        Raises
+        ------
+        PiezoIdentError
+            When there is none.
+        """
+        replay = self._replay
+        if replay is None or replay.thread is None or not replay.thread.is_alive():
+            raise PiezoIdentError('not replaying; call start first')
+        replay.stop.set()
+        return 'stopping'
+
+    def close(self) -> None:
+        """End the replay before the node ends."""
+        self._halt()
+
+    def _halt(self) -> None:
+        replay = self._replay
+        if replay is not None and replay.thread is not None:
+            replay.stop.set()
+            replay.thread.join(PATIENCE)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return how fast it goes."""
+        now, replay = time.monotonic(), self._replay
+        messages = replay.messages if replay else 0
+        then, before = self._last_count
+        self._last_count = (now, messages)
+        rate = max(0, messages - before) / max(now - then, 1e-3)
+        values = {**self._numbers(), 'rate': f'{rate:.1f}'}
+        if replay is not None and (replay.failure or replay.refusal):
+            return ERROR, replay.failure or replay.refusal, values
+        if replay is not None and replay.slipped > 0.1:
+            return WARN, f'slower than asked by {replay.slipped:.1f} s; lower the rate', values
+        return OK, 'ready', values
+
+    # the replay, in a thread of its own
+
+    def _work(self, replay: Replay) -> None:
+        try:
+            with opened_bag(replay.bag) as bag:
+                chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
+                senders = self._prepared(bag, chosen)
+                replay.names = ', '.join(chosen.values())
+                replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
+                replay.ready.set()
+                self._await_subscribers(replay, senders)
+                clock = self._send(replay, bag, senders)
+                self._report_end(replay, bag, clock)
+        except _Stopped:
+            self._report(
+                'stopped',
+                f'stopped after {replay.messages} of {replay.total} messages',
+                progress=replay.progress,
+            )
+        except PiezoIdentError as error:
+            if not replay.ready.is_set():
+                replay.refusal = str(error)
+                self._report('refused', str(error), ERROR)
+            else:
+                replay.failure = str(error)
+                self._report('failed', str(error), ERROR, replay.progress)
+        finally:
+            replay.ready.set()
+
+    def _prepared(self, bag: Bag, chosen: Mapping[str, str]) -> dict[str, Any]:
+        """Return the publisher of each chosen topic of the bag."""
+        senders = {}
+        for connection in bag.connections:
+            if connection.topic in chosen and connection.topic not in senders:
+                target = chosen[connection.topic]
+                profile = _profile(connection)
+                key = (
+                    target,
+                    connection.msgtype,
+                    profile.reliability == ReliabilityPolicy.RELIABLE,
+                    profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                    profile.depth,
+                )
+                # kept from one replay to the next: its subscribers are met already
+                if key not in self._senders:
+                    kind = message_class(connection.msgtype)
+                    self._senders[key] = self.create_publisher(kind, target, profile)
+                senders[connection.topic] = self._senders[key]
+        if not any(c.msgcount for c in bag.connections if c.topic in senders):
+            raise DataError(f'{bag.path}: no messages on {", ".join(chosen)}; name another bag')
+        return senders
+
+    def _await_subscribers(self, replay: Replay, senders: Mapping[str, Any]) -> None:
+        """
+        Wait until enough listen to every topic.
+
+        Raises
+        ------
+        PiezoIdentError
+            When they do not come.
+        """
+        need, limit = self.values['subscribers'], self.values['wait_limit']
+        began = time.monotonic()
+        while True:
+            few = {t: s.get_subscription_count() for t, s in senders.items()}
+            few = {t: n for t, n in few.items() if n < need}
+            if not few:
+                break
+            lacking = ', '.join(f'{senders[t].topic_name} ({n} of {need})' for t, n in few.items())
+            if time.monotonic() - began > limit:
+                raise PiezoIdentError(
+                    f'too few subscribers after {limit:g} s: {lacking}; start them, or lower '
+                    'the parameter subscribers'
+                )
+            self._report('waiting', f'waiting for subscribers: {lacking}')
+            self._pause(replay, 0.05)
+        if need:
+            self._pause(replay, SETTLE)
+
+    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> ReplayClock:
+        """Send every message when it is due."""
+        rate = self.values['rate']
+        clock: ReplayClock | None = None
+        first, told = 0, float('-inf')
+        for connection, stamp, raw in self._chosen(bag, senders):
+            now = time.monotonic()
+            if clock is None:
+                clock, first = ReplayClock(rate, stamp, now), stamp
+            elif self.values['rate'] != clock.rate:
+                clock.change_rate(self.values['rate'], stamp, now)
+            # in short waits, so that a pause in the recording neither hides a stop nor the status
+            while True:
+                if now - told > TELL:
+                    told = now
+                    self._report('playing', f'replaying {replay.names}', OK, replay.progress)
+                ahead = clock.due(stamp) - now
+                if replay.stop.is_set() or ahead > 0:
+                    self._pause(replay, min(max(ahead, 0.0), TELL))
+                if ahead <= TELL:
+                    break
+                now = time.monotonic()
+            senders[connection.topic].publish(raw)
+            clock.note(stamp, time.monotonic())
+            replay.messages += 1
+            replay.slipped = clock.slipped
+            replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)
+        if clock is None:
+            raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
+        return clock
+
+    def _chosen(self, bag: Bag, senders: Mapping[str, Any]) -> Iterator[Stored]:
+        return bag.messages([c for c in bag.connections if c.topic in senders])
+
+    def _pause(self, replay: Replay, seconds: float) -> None:
+        if replay.stop.wait(seconds):
+            raise _Stopped
+
+    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock) -> None:
+        about = f'replayed {replay.messages} messages of {replay.bag}'
+        if clock.slipped > 0.1:
+            about += f', {clock.slipped:.1f} s slower than asked'
+        faults = '; '.join(str(f) for f in bag.faults)
+        if faults:
+            self._report('done', f'{about}; the bag ends early: {faults}', WARN, 100.0)
+        else:
+            self._report('done', about, OK, 100.0)
+
+    # what is told
+
+    def _numbers(self) -> Mapping[str, object]:
+        replay = self._replay or Replay('', ())
+        return {
+            'messages': replay.messages,
+            'total': replay.total,
+            'bag': replay.bag,
+            'slipped': f'{replay.slipped:.3f}',
+        }
+
+    def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
+        self.report_status(state, progress, message, level, **self._numbers())
+
+
+def _profile(connection: Connection) -> QoSProfile:
+    """Return the QoS with which a topic was recorded; that of the graph where it is unknown."""
+    offered = getattr(connection.ext, 'offered_qos_profiles', None) or []
+    reliable = all(o.reliability != QosReliability.BEST_EFFORT for o in offered)
+    latched = bool(offered) and all(o.durability == QosDurability.TRANSIENT_LOCAL for o in offered)
+    depth = LATCHED.depth if latched else STREAM.depth
+    known = [o.depth for o in offered if o.history == QosHistory.KEEP_LAST and o.depth > 0]
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=max(known, default=depth),
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def main(argv: Any = None) -> int:
+    """Run the node."""
+    return run(PlayerNode, argv)

@@ -1,0 +1,318 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The stage node: a simulated stage, sample-exact whatever the block size.
+
+Each block of `voltage` passes the guard (`piezo_ident.guard`), drives the stage, and comes back as
+`displacement` with the same t and segment; `applied_voltage` is what the guard made of the
+command, before the converter rounds it.  Where the two differ the guard had reason to: the
+displacement is published all the same, so that nothing is lost.
+
+The stage itself never starts over: as a real one it keeps its memory from stream to stream, and
+its own clock (of drift and hum) goes on.
+
+| in the stream | what the stage does | status |
+|---|---|---|
+| layout of no block, stamps off the clock | the block is refused; its ticks become a gap | WARN |
+| a sample that is no number | the last command stays in force for it | WARN |
+| outside the limits, faster than the slew | at the limit; followed at the slew | WARN |
+| a block that came before | ignored: no displacement, the stage does not move | WARN |
+| a gap up to `silence` | the stage holds its voltage for as many ticks, reported on \
+`applied_voltage` as `hold:gap`; no displacement is published for them; the stream is then \
+followed at the slew | WARN |
+| a longer gap | a new stream | WARN |
+| swapped blocks | the early one makes a gap, the late one is refused: its time has passed | WARN |
+| another block size | nothing: blocks are cut as they come | |
+| t jumps back | a new stream, joined by a ramp | |
+| no block for `silence` | ramp to rest in real time, on `applied_voltage` as `ramp:silence`, t \
+going on; what comes next is a new stream | WARN, unless it was at rest |
+| a second publisher | the stream that was there first is followed, the other's blocks are \
+refused until the first falls silent | WARN |
+
+Publishers are told apart by the numbers that they give their messages, where the middleware hands
+them on, and by the continuity of t.
+
+SIGINT and SIGTERM ramp to rest within a second, steeper than `ramp_slew` where that would take
+longer.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import DataError, PiezoIdentError
+from piezo_ident.follower import Follower, Kind
+from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.wire import from_message, STREAM, to_message
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage
+from piezo_ident.wire_format import BLOCK_SIZE, Samples
+from rclpy.duration import Duration
+from std_msgs.msg import Float64MultiArray
+
+__all__ = ['StageNode', 'main']
+
+#: how long the ramp of a node that is ending may take [s]
+LAST_RAMP = 0.7
+#: how long a fault stays in the status [s]
+FAULT_SHOWN = 3.0
+#: period of the timer that ramps a silent stage [s]
+RAMP_PERIOD = 0.01
+
+_WHY = {
+    'not_finite': 'samples are no numbers: the last command stays in force',
+    'outside_limits': 'samples are outside the voltage limits: applied at the limit',
+    'too_fast': 'samples are faster than slew: followed at the slew',
+    'joining': 'samples changed while the stream is joined by a ramp',
+}
+
+
+class StageNode(LabNode):
+    """Simulates a stage on the topics of a real one."""
+
+    executable = 'stage'
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        try:
+            self._stage = load_stage(find_config(self.values['stage'], 'stage'))
+        except OSError as error:
+            raise DataError(f'stage: {error}') from None
+        seed = self._stage.seed if self.values['seed'] < 0 else self.values['seed']
+        self.sample_rate = self._stage.model.sample_rate
+        self._guard = Guard(self._settings())
+        self._warm_up()
+        self._run = self._stage.run(np.random.default_rng(seed))
+        self._follower = Follower(self.sample_rate, self.values['silence'])
+        # tick of the next sample applied, whatever it comes from
+        self._tick = 0
+        self._segment = ''
+        self._counts: Counter[str] = Counter()
+        # the latest of each fault, and how long it stays in the status
+        self._faults: dict[str, tuple[str, float]] = {}
+        self._state = 'idle'
+        self._sources = 0
+        self._last = self._recount = self._ramp_begin = time.monotonic()
+        self._ramped = 0
+        self._rate = (self._last, 0, 0.0)
+        self._busy = 0.0
+        self._displacement = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
+        self._applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
+        self._input = self.create_subscription(
+            Float64MultiArray, 'voltage', self._on_voltage, STREAM
+        )
+        self._watch = self.create_timer(self._watch_period(), self._on_watch)
+        self._ramp_timer = self.create_timer(RAMP_PERIOD, self._on_ramp, autostart=False)
+
+    def _warm_up(self) -> None:
+        """Compile what the first block would otherwise wait for."""
+        run, guard = self._stage.run(np.random.default_rng(0)), Guard(self._guard.settings)
+        rest = guard.applied
+        for v in ([rest] * 2, [rest, math.nan]):
+            run.process(guard.process(v).voltage)
+
+    # parameters
+
+    def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
+        v = values or self.values
+        return GuardSettings(
+            v['voltage_low'],
+            v['voltage_high'],
+            v['slew'],
+            v['ramp_slew'],
+            v['rest'],
+            self.sample_rate,
+        )
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Refuse limits that are crossed, and a rest outside of them."""
+        if name not in ('voltage_low', 'voltage_high', 'rest') or 'silence' not in self.values:
+            return None
+        try:
+            self._settings({**self.values, name: value})
+        except PiezoIdentError as error:
+            return str(error)
+        return None
+
+    def apply(self, changed: Mapping[str, Any]) -> None:
+        """Take new limits and times over at the next sample."""
+        self._guard.settings = self._settings()
+        self._follower.longest_gap = self.values['silence']
+        self._watch.timer_period_ns = int(self._watch_period() * 1e9)
+
+    def _watch_period(self) -> float:
+        return min(0.05, max(0.005, self.values['silence'] / 4))
+
+    # the stream
+
+    def _on_voltage(self, message: Float64MultiArray, info: Mapping[str, Any]) -> None:
+        begin = time.perf_counter()
+        sequence = info.get('publication_sequence_number')
+        try:
+            samples = from_message(message)
+            if samples.quantity != 'voltage':
+                raise DataError(f'a block of {samples.quantity!r}, expected is voltage')
+        except DataError as error:
+            self._follower.skip(sequence)
+            self._blame('malformed', f'a block is refused: {error}')
+        else:
+            self._take(samples, sequence)
+            self._busy += time.perf_counter() - begin
+        self._say()
+
+    def _take(self, samples: Samples, sequence: int | None) -> None:
+        verdict = self._follower.judge(samples, sequence, self._count_publishers())
+        kind = verdict.kind
+        if not verdict.is_taken:
+            self._blame(kind.value, f'a block is refused: {verdict.reason}')
+            return
+        self._last = time.monotonic()
+        if verdict.missing:
+            self._counts['lost'] += verdict.missing
+            self._blame('gap', verdict.reason)
+        if kind is Kind.START:
+            self._ramp_timer.cancel()
+            self._counts['streams'] += 1
+        elif kind is Kind.GAP:
+            self._move(self._guard.hold(verdict.missing), 'hold:gap')
+        applied = self._guard.process(samples.values, restarted=kind is Kind.START)
+        for why, n in applied.altered.items():
+            self._blame(why, f'{n} {_WHY[why]}', n)
+        y = self._run.process(applied.voltage)
+        self._displacement.publish(
+            to_message(Samples(samples.t, y, samples.segment, 'displacement'))
+        )
+        self._applied.publish(to_message(replace(samples, values=applied.voltage)))
+        self._tick = verdict.tick + samples.t.size
+        self._counts['blocks'] += 1
+        self._counts['samples'] += samples.t.size
+        self._state, self._segment = 'running', samples.segment
+
+    def _count_publishers(self) -> int:
+        # asking costs more than a block: once every tenth of a second will do
+        now = time.monotonic()
+        if now > self._recount or not self._sources:
+            self._sources = self._input.get_publisher_count()
+            self._recount = now + 0.1
+        return self._sources
+
+    def _move(self, v: NDArray[np.float64], segment: str) -> None:
+        """Apply what nobody commanded, and report it as applied."""
+        self._run.process(v)
+        for start in range(0, v.size, BLOCK_SIZE):
+            cut = v[start : start + BLOCK_SIZE]
+            t = np.arange(self._tick, self._tick + cut.size) / self.sample_rate
+            self._applied.publish(to_message(Samples(t, cut, segment)))
+            self._tick += cut.size
+
+    # silence
+
+    def _on_watch(self) -> None:
+        silent = time.monotonic() - self._last
+        if self._follower.head is not None and silent > self.values['silence']:
+            self._follower.lose()
+            if self._guard.is_at_rest:
+                self._state = 'idle'
+            else:
+                self._blame('silence', f'no voltage for {silent:.2f} s: ramping to rest')
+                self._state, self._segment = 'ramping', 'ramp:silence'
+                self._ramped, self._ramp_begin = 0, time.monotonic()
+                self._ramp_timer.reset()
+        self._say()
+
+    def _on_ramp(self) -> None:
+        now = round((time.monotonic() - self._ramp_begin) * self.sample_rate)
+        # after a pause of this process the ramp goes on where it was, it does not catch up
+        due = min(now - self._ramped, round(5 * RAMP_PERIOD * self.sample_rate))
+        self._ramped = now
+        if due > 0:
+            self._move(self._guard.idle(due), 'ramp:silence')
+        if self._guard.is_at_rest:
+            self._ramp_timer.cancel()
+            self._state = 'idle'
+            self._blame('silence', 'no voltage: ramped to rest')
+        self._say()
+
+    # reports
+
+    def _blame(self, fault: str, message: str, count: int = 1) -> None:
+        self._counts[fault] += count
+        self._faults[fault] = (message, time.monotonic() + FAULT_SHOWN)
+
+    def _recent_faults(self) -> str:
+        """Return the faults of the last seconds, empty when there were none."""
+        now = time.monotonic()
+        self._faults = {k: fault for k, fault in self._faults.items() if fault[1] > now}
+        return '; '.join(message for message, _ in self._faults.values())
+
+    def _say(self) -> None:
+        faults = self._recent_faults()
+        now = {'running': self._segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
+        message = f'{now}; {faults}' if faults else now
+        level = WARN if faults else OK
+        self.report_status(self._state, 0.0, message, level, segment=self._segment)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return rate, what was lost, altered and refused, and head-room."""
+        now, samples = time.monotonic(), self._counts['samples']
+        (then, before, busy), self._rate = self._rate, (now, samples, self._busy)
+        count = samples - before
+        worked, span = self._busy - busy, count / self.sample_rate
+        faults = self._recent_faults()
+        refused = ('malformed', 'repeat', 'late', 'second')
+        altered = ('not_finite', 'outside_limits', 'too_fast', 'joining')
+        values: dict[str, object] = {
+            'rate': f'{count / max(now - then, 1e-9):.1f}',
+            'samples': samples,
+            'blocks': self._counts['blocks'],
+            'lost': self._counts['lost'],
+            'gaps': self._counts['gap'],
+            'streams': self._counts['streams'],
+            'silences': self._counts['silence'],
+            **{f'refused_{why}': self._counts[why] for why in refused},
+            **{f'altered_{why}': self._counts[why] for why in altered},
+            'clipped': self._run.clipped_input + self._run.clipped_output,
+            'publishers': self._input.get_publisher_count(),
+            'applied': f'{self._guard.applied:.6f}',
+        }
+        if span:
+            values['head_room'] = f'{max(0.0, 1.0 - worked / span):.3f}'
+        return (WARN if faults else OK), faults or self._state, values
+
+    def close(self) -> None:
+        """Ramp to rest within a second."""
+        size = max(1, round(RAMP_PERIOD * self.sample_rate))
+        # a ramp that is under way at its own pace gives way to one that ends in time
+        guard = Guard(self._guard.settings, self._guard.applied)
+        begin, sent = time.monotonic(), 0
+        while not guard.is_at_rest:
+            self._move(guard.idle(size, LAST_RAMP), 'ramp:stop')
+            sent += size
+            time.sleep(max(0.0, begin + sent / self.sample_rate - time.monotonic()))
+        self._applied.wait_for_all_acked(Duration(seconds=0.1))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; see `piezo_ident.nodes.base.run`."""
+    return run(StageNode, argv)

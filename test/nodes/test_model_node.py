@@ -1,0 +1,335 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The model node as a process: what it predicts, refuses, shows, and when it warns."""
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from graph import Graph
+from piezo_ident.model_io import load_model, model_from_dict, model_to_yaml, parse_yaml
+from piezo_ident.nodes.wire import PREVIEW, to_message
+from piezo_ident.shipped import find_config
+from piezo_ident.wire_format import Samples
+from sensor_msgs.msg import JointState
+import yaml
+
+FS = 20_000.0
+
+
+def paper(**changes):
+    """Return the YAML of the paper's stage as a model."""
+    data = yaml.safe_load(find_config('paper', 'stage').read_text())
+    data.pop('sensor')
+    data.pop('seed')
+    return yaml.safe_dump({**data, **changes})
+
+
+def model_of(text):
+    return model_from_dict(parse_yaml(text, 'test'))
+
+
+OTHER = paper(hysteresis={'thresholds': [0.2, 0.5], 'weights': [0.3, 0.2], 'p1': -0.1, 'p2': 0.9})
+
+
+def sine(n, first=0, frequency=5.0):
+    """Return voltage that starts at 0 V."""
+    t = np.arange(first, first + n) / FS
+    return t, 5.0 - 5.0 * np.cos(2 * np.pi * frequency * t)
+
+
+def blocks(n, first=0, size=100):
+    t, v = sine(n, first)
+    return [Samples(t[i : i + size], v[i : i + size], 'sine:5Hz') for i in range(0, n, size)]
+
+
+def send(g, several, topic='voltage'):
+    """Send blocks no faster than four times real time."""
+    for block in several:
+        g.publish(topic, block)
+        time.sleep(0.00125)
+
+
+@pytest.fixture
+def lab():
+    with Graph() as g:
+        yield g
+
+
+@pytest.fixture(scope='module')
+def fast():
+    """Return a graph with a model node that outlives many tests; each begins with a restart."""
+    with Graph() as g:
+        for topic in ('voltage', 'displacement', 'prediction', 'residual'):
+            g.collect(topic)
+        g.start('model', params={'window': 0.2})
+        g.publish_text('model', paper())
+        g.wait(lambda: g.status('model')['state'] == 'predicting', 10, 'model')
+        yield g
+
+
+def heard(g, topic, since, count, timeout=10):
+    """Wait for blocks of a topic and return their rows in one piece."""
+    g.wait(lambda: len(g.collect(topic)) >= since + count, timeout, f'{count} of {topic}')
+    new = g.collect(topic)[since : since + count]
+    return np.concatenate([b.t for b in new]), np.concatenate([b.values for b in new])
+
+
+def reset(g, text=None):
+    """Set the model, and return how many blocks were heard."""
+    text = text or paper()
+    before = len(g.statuses('model'))
+    g.publish_text('model', text)
+    g.wait(
+        lambda: (
+            g.status('model')['message'].startswith('with topic model')
+            and 'refused' not in g.status('model')['message']
+            or len(g.statuses('model')) > before
+        ),
+        5,
+        'model',
+    )
+    return {topic: len(g.collect(topic)) for topic in ('prediction', 'residual')}
+
+
+def test_without_a_model_it_waits_and_says_so(lab):
+    node = lab.start('model')
+    assert node.status()['state'] == 'waiting' or node.status()['state'] == 'idle'
+    lab.wait(lambda: node.status()['state'] == 'waiting', 10, 'waiting')
+    ok, reason = lab.set('model', 'model', '/nowhere/model.yaml')
+    assert not ok and 'no such file' in reason
+    # refused texts leave it waiting
+    lab.publish_text('model', 'a: [')
+    lab.wait(lambda: 'there is no model' in node.status()['message'], 5, 'refusal')
+    assert node.status()['level'] == '1' and 'not valid YAML' in node.status()['message']
+    lab.publish_text('model', paper(dynamics={'a': [-1.5], 'b': [1.0]}))
+    lab.wait(lambda: 'unstable' in node.status()['message'], 5, 'refusal')
+    # voltage that came before the model counts
+    prediction = lab.collect('prediction')
+    send(lab, blocks(2000))
+    lab.wait(lambda: lab.diagnostics('model').get('message') == 'no model yet', 5, 'diagnostics')
+    lab.publish_text('model', paper())
+    lab.wait(lambda: node.status()['state'] == 'predicting', 10, 'model')
+    send(lab, blocks(500, 2000))
+    lab.wait(lambda: len(prediction) == 5, 5, 'prediction')
+    _, v = sine(2500)
+    expected = model_of(paper()).stream().process(v, np.arange(2500) / FS)[2000:]
+    np.testing.assert_array_equal(np.concatenate([b.values for b in prediction]), expected)
+    assert node.stop() == 0 and 'Traceback' not in node.log
+
+
+def test_prediction_is_the_model_bit_for_bit_and_carries_t_and_segment(fast):
+    since = reset(fast)
+    send(fast, blocks(6000))
+    t, y = heard(fast, 'prediction', since['prediction'], 60)
+    expected_t, v = sine(6000)
+    np.testing.assert_array_equal(t, expected_t)
+    np.testing.assert_array_equal(y, model_of(paper()).stream().process(v, t))
+    last = fast.collect('prediction')[-1]
+    assert (last.segment, last.quantity) == ('sine:5Hz', 'displacement')
+
+
+def test_a_new_model_takes_over_without_a_glitch(fast):
+    since = reset(fast)
+    send(fast, blocks(6000))
+    heard(fast, 'prediction', since['prediction'], 60)
+    fast.publish_text('model', OTHER)
+    new, (_, v) = model_of(OTHER), sine(12_000)
+    whole = new.stream().process(v, np.arange(12_000) / FS)
+    # the swap happens while blocks come: each of them is of one model or the other
+    send(fast, blocks(6000, 6000))
+    t, y = heard(fast, 'prediction', since['prediction'], 120)
+    old = model_of(paper()).stream().process(v, t)
+    of_new = np.isclose(y, whole, rtol=0, atol=1e-12 * 75e-6)
+    of_old = np.isclose(y, old, rtol=0, atol=1e-12 * 75e-6)
+    assert np.all(of_new | of_old)
+    assert of_new[-3000:].all()
+
+
+@pytest.mark.parametrize('first', ['voltage', 'displacement'])
+def test_residual_joins_whichever_comes_first(fast, first):
+    since = reset(fast)
+    t, v = sine(2000)
+    expected = model_of(paper()).stream().process(v, t)
+    y = [
+        Samples(b.t, e + 1e-7, b.segment, 'displacement')
+        for b, e in zip(blocks(2000), np.split(expected, 20), strict=True)
+    ]
+    for voltage, displacement in zip(blocks(2000), y, strict=True):
+        pair = [('voltage', voltage), ('displacement', displacement)]
+        for topic, block in pair if first == 'voltage' else pair[::-1]:
+            fast.publish(topic, block)
+        time.sleep(0.001)
+    got_t, e = heard(fast, 'residual', since['residual'], 20)
+    np.testing.assert_array_equal(np.sort(got_t), t)
+    np.testing.assert_allclose(e, 1e-7, atol=1e-16)
+
+
+def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
+    shown = []
+    subscription = fast.node.create_subscription(JointState, 'preview', shown.append, PREVIEW)
+    fast.wait(lambda: fast.node.count_publishers('preview') == 1, 5, 'preview')
+    time.sleep(0.3)  # nothing tells when a best-matched reader has been matched
+    since = reset(fast)
+    send(fast, blocks(4000))
+    t, y = heard(fast, 'prediction', since['prediction'], 40)
+    for block, part in zip(blocks(4000), np.split(y, 40), strict=True):
+        fast.publish('displacement', Samples(block.t, part + 2e-9, block.segment, 'displacement'))
+    heard(fast, 'residual', since['residual'], 40)
+    names = [
+        f'{quantity}/{what}'
+        for quantity in ('displacement', 'prediction', 'residual')
+        for what in ('mean', 'min', 'max')
+    ]
+
+    def complete():
+        rows = [dict(zip(m.name, m.position, strict=True)) for m in shown]
+        return [r for r in rows if np.isfinite(list(r.values())).all()]
+
+    # the last bin is complete when the next begins
+    fast.wait(lambda: len(complete()) >= 9, 5, 'preview')
+    assert list(shown[-1].name) == names and shown[-1].header.stamp.sec > 0
+    parts = np.split(y, 10)
+    wanted = [p.mean() for p in parts[:9]]
+    got = [r['prediction/mean'] for r in complete()][-9:]
+    np.testing.assert_allclose(got, wanted, rtol=1e-9)
+    row = complete()[-1]
+    assert row['prediction/min'] == parts[8].min() and row['prediction/max'] == parts[8].max()
+    assert row['residual/mean'] == pytest.approx(2e-9, rel=1e-6)
+    fast.node.destroy_subscription(subscription)
+
+
+def test_faults_of_the_stream_are_said_and_survived(fast):
+    since = reset(fast)
+    b = blocks(6000)
+    nan = Samples(b[10].t, np.where(np.arange(100) == 3, np.nan, b[10].values), b[10].segment)
+    malformed = to_message(b[0])
+    malformed.layout.dim[1].label = 'voltage'
+    steps = [
+        ([*b[:10], nan, *b[11:20]], 19, '100 samples of voltage are missing'),
+        ([b[19]], 0, 'came again or out of turn'),
+        ([b[21], b[20]], 1, 'came again or out of turn'),
+        ([malformed], 0, 'a message on voltage is no block'),
+        (b[22:], 38, ''),
+    ]
+    count = 0
+    for several, answers, said in steps:
+        begin = len(fast.statuses('model'))
+        send(fast, several)
+        count += answers
+
+        def told(said=said, begin=begin):
+            return any(said in s['message'] for s in fast.statuses('model')[begin - 1 :])
+
+        fast.wait(told, 5, said)
+    t, y = heard(fast, 'prediction', since['prediction'], count)
+    assert np.isfinite(y).all() and t[-1] == b[-1].t[-1]
+    before = fast.diagnostics('model')
+    fast.wait(lambda: fast.diagnostics('model') is not before, 3, 'diagnostics')
+    fast.wait(lambda: int(fast.diagnostics('model')['lost']) >= 200, 3, 'lost samples')
+    assert int(fast.diagnostics('model')['unreadable']) >= 1
+    assert int(fast.diagnostics('model')['late']) >= 200
+    assert fast.status('model')['state'] == 'predicting'
+
+
+def test_it_says_when_to_identify_again(fast):
+    story = {'errors': {'unit': '% of stroke', 'held_out': 0.1}}
+    since = reset(fast, paper(identification=story))
+    send(fast, blocks(8000))
+    _, y = heard(fast, 'prediction', since['prediction'], 80)
+    for error, verdict in ((0.2, 'predicting'), (0.5, 'identify again')):
+        level = error / 100 * 75e-6
+        first = 0 if error == 0.2 else 8000
+        if first:
+            send(fast, blocks(8000, 8000))
+            _, y = heard(fast, 'prediction', since['prediction'] + 80, 80)
+        for block, part in zip(blocks(8000, first), np.split(y, 80), strict=True):
+            fast.publish(
+                'displacement', Samples(block.t, part + level, block.segment, 'displacement')
+            )
+            time.sleep(0.0005)
+        fast.wait(
+            lambda level=level, verdict=verdict: (
+                fast.diagnostics('model').get('residual_rms') == f'{level:.6g}'
+                and fast.diagnostics('model')['message'].startswith(verdict)
+            ),
+            5,
+            verdict,
+        )
+    d = fast.diagnostics('model')
+    assert d['level'] == '1' and '0.5 % of stroke, 5.0 times' in d['message']
+    assert {'rate', 'load', 'lost', 'head_room', 'memory_known'} <= set(d)
+    assert fast.set('model', 'warn_ratio', 10.0) == (True, '')
+    fast.wait(lambda: fast.diagnostics('model')['message'] == 'predicting', 5, 'taken back')
+    assert fast.set('model', 'warn_ratio', 3.0) == (True, '')
+
+
+def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
+    since = reset(fast)
+    send(fast, blocks(1000))
+    heard(fast, 'prediction', since['prediction'], 10)
+    fast.publish_text('model', paper(sample_rate=5000.0))
+    said = 'the old model is kept: topic model: the stream is sampled at 20000 Hz'
+    fast.wait(lambda: said in fast.status('model')['message'], 5, said)
+    send(fast, blocks(500, 1000))
+    t, y = heard(fast, 'prediction', since['prediction'] + 10, 5)
+    _, v = sine(1500)
+    whole = model_of(paper()).stream().process(v, np.arange(1500) / FS)
+    np.testing.assert_array_equal(y, whole[1000:])
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'reason'),
+    [
+        ('warn_ratio', 0.5, 'warn_ratio'),
+        ('window', float('nan'), 'window'),
+        ('preview_rate', 10.0, 'read'),
+        ('model', '/nowhere.yaml', 'no such file'),
+    ],
+)
+def test_bad_parameters_are_refused(fast, name, value, reason):
+    ok, said = fast.set('model', name, value)
+    assert not ok and reason in said
+
+
+def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
+    file, other = tmp_path / 'one.yaml', tmp_path / 'other.yaml'
+    file.write_text(paper())
+    other.write_text(model_to_yaml(model_of(OTHER)))
+    node = lab.start('model', params={'model': str(file)})
+    lab.wait(lambda: node.status()['state'] == 'predicting', 10, 'file')
+    assert node.status()['message'] == f'with {file}'
+    assert lab.set('model', 'model', str(other)) == (True, '')
+    lab.wait(lambda: node.status()['message'] == f'with {other}', 5, 'other file')
+    prediction = lab.collect('prediction')
+    lab.matched('prediction')
+    send(lab, blocks(1000))
+    lab.wait(lambda: len(prediction) == 10, 5, 'prediction')
+    _, v = sine(1000)
+    expected = load_model(other).stream().process(v, np.arange(1000) / FS)
+    np.testing.assert_array_equal(np.concatenate([b.values for b in prediction]), expected)
+    begin = time.monotonic()
+    assert node.stop() == 0 and time.monotonic() - begin < 2.0
+
+
+def test_a_bad_model_file_keeps_it_from_starting(lab, tmp_path):
+    (tmp_path / 'bad.yaml').write_text('sample_rate: 20000\n')
+    node = lab.start('model', params={'model': str(tmp_path / 'bad.yaml')}, wait=False)
+    assert node.process.wait(30) == 2
+    assert 'piezo_ident: error: model:' in node.log and 'Traceback' not in node.log

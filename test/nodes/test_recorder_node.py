@@ -1,0 +1,270 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The recorder on a running graph: what passes is in the bag, whatever ends the recorder."""
+
+import json
+import os
+from pathlib import Path
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from graph import Graph
+from piezo_ident.bag_io import read_bag
+from piezo_ident.bag_recovery import is_unfinished, opened_bag
+from piezo_ident.cli import main
+from piezo_ident.nodes.parameters import NODES
+from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
+from piezo_ident.wire_format import Samples
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+import yaml
+
+RATE = 20000.0
+BLOCK = 100
+
+
+def pair(k: int) -> tuple[Samples, Samples]:
+    t = np.arange(BLOCK * k, BLOCK * (k + 1)) / RATE
+    return (
+        Samples(t, 5 + np.sin(7 * t), 'noise', 'voltage'),
+        Samples(t, 1e-5 + 1e-6 * np.sin(7 * t), 'noise', 'displacement'),
+    )
+
+
+class Source:
+    """Sends pairs of blocks at real time, 200 a second each, from a thread."""
+
+    def __init__(self, graph: Graph, namespace: str = '') -> None:
+        self.publishers = [
+            graph.node.create_publisher(Float64MultiArray, f'{namespace}/{name}', STREAM)
+            for name in ('voltage', 'displacement')
+        ]
+        self.sent: list[float] = []
+        self.raw: list[tuple[bytes, bytes]] = []
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._send, daemon=True)
+
+    def __enter__(self) -> 'Source':
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _send(self) -> None:
+        start = time.monotonic()
+        k = 0
+        while not self._end.wait(max(0.0, start + k * BLOCK / RATE - time.monotonic())):
+            messages = [to_message(s) for s in pair(k)]
+            for publisher, message in zip(self.publishers, messages, strict=True):
+                publisher.publish(message)
+            self.raw.append(tuple(serialize_message(m) for m in messages))
+            self.sent.append(time.monotonic())
+            k += 1
+
+
+def start(graph: Graph, folder: Path, name: str = 'recorder', **params) -> str:
+    """Call start, wait until it records, and return the path."""
+    ok, message = graph.call(f'{name}/start')
+    assert ok, message
+    graph.wait(lambda: graph.status(name)['state'] == 'recording', what='recording')
+    return graph.status(name)['path']
+
+
+def contents(path: Path | str) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    with opened_bag(path) as bag:
+        for connection, _, raw in bag.messages(bag.connections):
+            found.setdefault(connection.topic, []).append(bytes(raw))
+    return found
+
+
+def test_record_stop_and_refusals(tmp_path):
+    with Graph() as g:
+        source = Source(g, '/a')
+        model = g.node.create_publisher(String, '/a/model', LATCHED)
+        model.publish(String(data='before the recorder'))
+        g.start('recorder', {'output': str(tmp_path / 'bag'), 'sample_rate': RATE}, 'a')
+        assert g.call('a/recorder/stop') == (False, 'not recording; call start first')
+        path = start(g, tmp_path, 'a/recorder')
+        assert path == str(tmp_path / 'bag')
+        assert g.call('a/recorder/start') == (False, 'recording already; call stop first')
+        assert 'read-only' in g.set('a/recorder', 'storage', 'sqlite3')[1]
+        assert not g.set('a/recorder', 'output', '')[0]
+        assert not g.set('a/recorder', 'flush', 5.0)[0]
+        with source:
+            g.wait(lambda: len(source.sent) > 100, what='blocks')
+            # a topic that appears late
+            late = g.node.create_publisher(Float64MultiArray, '/a/residual', STREAM)
+            g.wait(lambda: late.get_subscription_count() == 1, what='recorder hears of it')
+            late.publish(to_message(pair(0)[1]))
+            g.wait(lambda: int(g.status('a/recorder')['messages']) > 300, what='messages')
+        seen = int(g.status('a/recorder')['messages'])
+        ok, message = g.call('a/recorder/stop')
+        assert (ok, message) == (True, f'closing {path}')
+        g.wait(lambda: g.status('a/recorder')['state'] == 'done', what='closed bag')
+        status = g.status('a/recorder')
+        assert status['lost'] == '0'
+        assert int(status['messages']) == 2 * len(source.sent) + 2 >= seen
+        assert int(status['bytes']) == (tmp_path / 'bag' / 'bag.mcap').stat().st_size
+        # a second one beside it
+        assert start(g, tmp_path, 'a/recorder') == str(tmp_path / 'bag_1')
+        assert g.call('a/recorder/stop')[0]
+        g.wait(lambda: g.status('a/recorder')['state'] == 'done', what='closed bag')
+        # a place that cannot be
+        (tmp_path / 'file').write_text('')
+        assert g.set('a/recorder', 'output', str(tmp_path / 'file' / 'bag'))[0]
+        ok, message = g.call('a/recorder/start')
+        assert not ok
+        assert 'cannot be written' in message
+        g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), what='diagnostics')
+    got = contents(tmp_path / 'bag')
+    assert got['/a/voltage'] == [v for v, _ in source.raw]
+    assert got['/a/displacement'] == [y for _, y in source.raw]
+    assert got['/a/model'] == [serialize_message(String(data='before the recorder'))]
+    assert got['/a/residual'] == [serialize_message(to_message(pair(0)[1]))]
+    record = read_bag(tmp_path / 'bag')
+    n = BLOCK * len(source.sent)
+    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * np.arange(n) / RATE))
+    assert (record.n, record.faults) == (n, ())
+    assert record.pieces[0].sample_rate == RATE
+    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    info = info['rosbag2_bagfile_information']
+    assert info['custom_data']['sample_rate'] == repr(RATE)
+    assert info['custom_data']['namespace'] == '/a'
+    offered = {
+        t['topic_metadata']['name']: t['topic_metadata']['offered_qos_profiles']
+        for t in info['topics_with_message_count']
+    }
+    for topic, depth, durability in (
+        ('/a/voltage', 100, 'volatile'),
+        ('/a/model', 1, 'transient_local'),
+    ):
+        (qos,) = offered[topic]
+        assert (qos['history'], qos['depth'], qos['reliability'], qos['durability']) == (
+            'keep_last',
+            depth,
+            'reliable',
+            durability,
+        )
+    # log times are when a message came, on the clock of the day, in order
+    with opened_bag(tmp_path / 'bag') as bag:
+        stamps = np.array([m.stamp for m in bag.messages(bag.connections)])
+        assert (np.diff(stamps) >= 0).all()
+        assert abs(stamps[-1] * 1e-9 - time.time()) < 60
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_sigkill_loses_less_than_a_second(tmp_path, storage, capsys):
+    with Graph() as g:
+        source = Source(g)
+        recorder = g.start('recorder', {'output': str(tmp_path / 'bag'), 'storage': storage})
+        start(g, tmp_path)
+        with source:
+            g.wait(lambda: len(source.sent) > 500, what='2.5 s of blocks')
+            recorder.kill()
+            sent = len(source.sent)
+    assert is_unfinished(tmp_path / 'bag')
+    assert main(['convert', '--json', str(tmp_path / 'bag'), str(tmp_path / 'out')]) == 0
+    story = json.loads(capsys.readouterr().out)
+    (fault,) = (f for f in story['faults'] if f['name'] == 'truncated_bag')
+    assert 'the recorder did not close the bag' in fault['action']
+    record = read_bag(tmp_path / 'out')
+    assert len(record.pieces) == 1
+    lost = sent / 200 - record.pieces[0].n / RATE
+    assert -0.1 < lost < 1.0
+    # of what was sent half a second before the end nothing is missing, but for a busy machine
+    with capsys.disabled():
+        if os.environ.get('PIEZO_IDENT_VERBOSE'):
+            print(f'{storage}: {lost:.3f} s lost')
+    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * record.pieces[0].t))
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_close_the_bag(tmp_path, number):
+    storage = 'mcap' if number == signal.SIGINT else 'sqlite3'
+    with Graph() as g:
+        source = Source(g)
+        params = {'output': str(tmp_path / 'bag'), 'autostart': True, 'storage': storage}
+        recorder = g.start('recorder', params)
+        g.wait(lambda: g.status('recorder')['state'] == 'recording', what='recording')
+        with source:
+            g.wait(lambda: int(g.status('recorder')['messages'] or 0) > 50, what='messages')
+            began = time.monotonic()
+            assert recorder.stop(number) == 0
+            assert time.monotonic() - began < 2.0
+    assert not is_unfinished(tmp_path / 'bag')
+    record = read_bag(tmp_path / 'bag')
+    assert record.n >= 2500
+    assert not [f for f in record.faults if f.name == 'truncated_bag']
+
+
+def test_other_topics_types_and_qos(tmp_path):
+    params = {'output': str(tmp_path / 'bag'), 'topics': ['voltage', 'drive', '/else/pose', 'odd']}
+    with Graph() as g:
+        # a driver that sends best effort, on a topic that is expected to be reliable
+        effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        voltage = g.node.create_publisher(Float64MultiArray, '/voltage', effort)
+        g.start('recorder', params, remaps={'drive': '/lab/drive'})
+        start(g, tmp_path)
+        drive = g.node.create_publisher(Float64MultiArray, '/lab/drive', STREAM)
+        pose = g.node.create_publisher(JointState, '/else/pose', 10)
+        for publisher in (voltage, drive, pose):
+            g.wait(lambda p=publisher: p.get_subscription_count() == 1, what=publisher.topic_name)
+        drive.publish(to_message(pair(0)[0]))
+        pose.publish(JointState(name=['x'], position=[1.0]))
+
+        def both() -> bool:
+            voltage.publish(to_message(pair(0)[0]))
+            return int(g.status('recorder')['messages'] or 0) > 5
+
+        g.wait(both, what='messages')
+        assert g.call('recorder/stop')[0]
+        g.wait(lambda: g.status('recorder')['state'] == 'done', what='closed bag')
+    got = contents(tmp_path / 'bag')
+    assert set(got) == {'/voltage', '/lab/drive', '/else/pose'}
+    assert len(got['/lab/drive']) == len(got['/else/pose']) == 1
+    with opened_bag(tmp_path / 'bag') as bag:
+        types = {c.topic: c.msgtype for c in bag.connections}
+        assert types['/else/pose'] == 'sensor_msgs/msg/JointState'
+        (qos,) = next(c for c in bag.connections if c.topic == '/voltage').ext.offered_qos_profiles
+        assert qos.reliability.name == 'BEST_EFFORT'
+
+
+def test_bad_topic_names_end_the_node(tmp_path):
+    with Graph() as g:
+        recorder = g.start('recorder', {'topics': ['volt age']}, wait=False)
+        assert recorder.process.wait(40) == 2
+        assert 'is no name of a topic' in recorder.log
+
+
+def test_the_configuration_is_declared():
+    root = Path(__file__).resolve().parents[2]
+    for node in ('recorder', 'player'):
+        (section,) = yaml.safe_load((root / 'config' / f'{node}.yaml').read_text()).values()
+        defaults = {
+            d.name: list(d.default) if isinstance(d.default, tuple) else d.default
+            for d in NODES[node]
+        }
+        assert section['ros__parameters'] == defaults

@@ -1,0 +1,287 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The stage node as a process, under streams that are in order and others."""
+
+import signal
+import time
+
+from graph import Graph
+import numpy as np
+from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.nodes.wire import STREAM, to_message
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage
+from piezo_ident.wire_format import Samples
+import pytest
+from std_msgs.msg import Float64MultiArray
+
+FS = 20000.0
+SETTINGS = GuardSettings(0.0, 10.0, 40000.0, 20.0, 0.0, FS)
+
+
+def block(tick, v, segment='sine:50Hz'):
+    """Return a block from a tick on."""
+    v = np.asarray(v, dtype=np.float64)
+    return Samples(np.arange(tick, tick + v.size) / FS, v, segment)
+
+
+def level(value, blocks, tick=0, segment='hold'):
+    """Return blocks of a constant voltage."""
+    return [block(tick + 100 * k, np.full(100, value), segment) for k in range(blocks)]
+
+
+def column(blocks):
+    """Return t and values of blocks in one piece."""
+    return np.concatenate([b.t for b in blocks]), np.concatenate([b.values for b in blocks])
+
+
+def idle(g):
+    """Wait until the stage is at rest and expects a new stream."""
+    g.wait(lambda: g.status('stage')['state'] == 'idle', what='idle')
+
+
+def warned(g, text):
+    """Wait for a warning in the status."""
+    g.wait(
+        lambda: text in g.status('stage')['message'] and g.status('stage')['level'] == '1',
+        what=text,
+    )
+
+
+@pytest.fixture(scope='module')
+def lab():
+    with Graph() as g:
+        g.collect('displacement')
+        g.collect('applied_voltage')
+        g.start('stage', {'silence': 0.2, 'seed': 3})
+        g.matched('displacement')
+        g.matched('applied_voltage')
+        yield g
+
+
+def test_every_fault_in_one_stream_sample_by_sample():
+    v = 5 - 5 * np.cos(2 * np.pi * 50 * np.arange(1200) / FS)
+    sizes = {'a': 100, 'b': 7, 'c': 333, 'd': 1, 'e': 100, 'f': 100, 'g': 100, 'h': 100}
+    blocks, tick = {}, 0
+    for name, n in sizes.items():
+        blocks[name] = block(tick, v[tick : tick + n])
+        tick += n
+    bad = blocks['g'].values.copy()
+    bad[[3, 4, 70]] = np.nan, np.inf, 12.0
+    blocks['g'] = block(round(blocks['g'].t[0] * FS), bad)
+
+    # the same offline: what is expected sample by sample
+    guard = Guard(SETTINGS)
+    run = load_stage(find_config('paper', 'stage')).run(np.random.default_rng(3))
+    applied, back, fast = [], [], 0
+    for name in 'abcdfgh':
+        if name == 'f':
+            hold = guard.hold(blocks['e'].t.size)
+            applied.append(hold)
+            run.process(hold)
+        out = guard.process(blocks[name].values)
+        applied.append(out.voltage)
+        fast += out.altered.get('too_fast', 0)
+        back.append(run.process(applied[-1]))
+
+    # after the gap and after the samples that are no numbers it has to catch up
+    assert fast > 0
+    with Graph() as g:
+        seen, got = g.collect('displacement'), g.collect('applied_voltage')
+        g.start('stage', {'silence': 2.0, 'seed': 3})
+        g.matched('displacement')
+        g.matched('applied_voltage')
+
+        def send(*names):
+            for name in names:
+                g.publish('voltage', blocks[name])
+
+        send('a', 'b', 'c', 'c')
+        warned(g, 'the block at t = 0.00535 s came twice')
+        send('d', 'f')
+        warned(g, '100 samples are missing at t = 0.02705 s')
+        send('e')
+        warned(g, 'the block at t = 0.02205 s came too late')
+        send('g')
+        warned(g, '1 samples are outside the voltage limits')
+        message = to_message(blocks['h'])
+        message.layout.dim[0].size = 99
+        g.publish('voltage', message)
+        warned(g, 'not N x 2')
+        g.publish('voltage', Samples(np.arange(100) / 10000.0, np.zeros(100), 'x'))
+        warned(g, 'sampled at 10000 Hz, expected are 20000 Hz')
+        g.publish('voltage', Samples(blocks['h'].t, blocks['h'].values, 'x', 'displacement'))
+        warned(g, "a block of 'displacement', expected is voltage")
+        g.publish('voltage', Float64MultiArray())
+        warned(g, 'is not')
+        send('h')
+        g.wait(lambda: len(seen) == 7 and len(got) == 8, what='answers')
+        assert [b.segment for b in got].count('hold:gap') == 1
+        assert column(got)[1].tobytes() == np.concatenate(applied).tobytes()
+        assert column(seen)[1].tobytes() == np.concatenate(back).tobytes()
+        assert column(seen)[0].tobytes() == column([blocks[k] for k in 'abcdfgh'])[0].tobytes()
+        # t goes on over the gap
+        assert np.array_equal(np.rint(column(got)[0] * FS), np.arange(tick))
+        g.wait(lambda: g.diagnostics('stage').get('blocks') == '7', what='diagnostics')
+        counts = g.diagnostics('stage')
+        assert {k: counts[k] for k in counts if k.startswith(('refused', 'altered', 'lost'))} == {
+            'lost': '100',
+            'refused_malformed': '4',
+            'refused_repeat': '1',
+            'refused_late': '1',
+            'refused_second': '0',
+            'altered_not_finite': '2',
+            'altered_outside_limits': '1',
+            'altered_too_fast': str(fast),
+            'altered_joining': '0',
+        }
+
+
+def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab):
+    idle(lab)
+    seen, got = lab.collect('displacement'), lab.collect('applied_voltage')
+    before, applied = len(seen), len(got)
+    stream = level(5.0, 60)
+    for b in stream:
+        lab.publish('voltage', b)
+    # at 5 V since 0.5 s of its samples
+    lab.wait(lambda: len(seen) == before + 60, what='answers')
+    begin = time.monotonic()
+    guard = Guard(SETTINGS)
+    expected = guard.process(column(stream)[1])
+    assert expected.altered == {'joining': 6000}
+    lab.wait(lambda: len(got) >= applied + 60, what='applied')
+    assert column(got[applied : applied + 60])[1].tobytes() == expected.voltage.tobytes()
+    assert 'joined by a ramp' in lab.status('stage')['message']
+    # no displacement is missing, altered or not
+    assert column(seen[before:])[0].tobytes() == column(stream)[0].tobytes()
+
+    warned(lab, 'ramping to rest')
+    lab.wait(lambda: got[-1].values[-1] == 0.0, what='rest')
+    # from where the join had got to, with 20 V/s at its steepest, in real time
+    took = time.monotonic() - begin
+    distance = expected.voltage[-1]
+    assert 2 * distance / 20 < took < 2 * distance / 20 + 1.0
+    ramp = [b for b in got[applied:] if b.segment == 'ramp:silence']
+    t, v = column(got[applied:])
+    assert np.array_equal(np.rint(t * FS), np.arange(t.size))
+    assert np.abs(np.diff(v)).max() * FS == pytest.approx(20.0, rel=1e-3)
+    assert np.all(np.diff(column(ramp)[1]) <= 0)
+    assert len(seen) == before + 60
+    idle(lab)
+
+
+def test_the_next_stream_joins_while_the_ramp_is_under_way(lab):
+    idle(lab)
+    got = lab.collect('applied_voltage')
+    applied = len(got)
+    for b in [*level(0.0, 1), block(100, np.linspace(0, 9, 9000)), *level(9.0, 1, 9100)]:
+        lab.publish('voltage', b)
+    lab.wait(lambda: got[-1].segment == 'ramp:silence' and got[-1].values[-1] < 8.5, what='ramp')
+    for b in level(1.0, 180, segment='hold:next'):
+        lab.publish('voltage', b)
+        if b.t[0] % 0.1 < 0.005:
+            lab.wait(lambda b=b: got[-1].t[-1] == b.t[-1], what='answer')
+    lab.wait(lambda: got[-1].segment == 'hold:next' and got[-1].values[-1] == 1.0, what='joined')
+    _, v = column(got[applied:])
+    assert np.abs(np.diff(v)).max() * FS <= 20.01
+    idle(lab)
+
+
+def test_limits_and_slew_may_be_set_and_hold_at_once(lab):
+    idle(lab)
+    got = lab.collect('applied_voltage')
+    assert lab.set('stage', 'voltage_high', 4.0) == (True, '')
+    assert lab.set('stage', 'slew', 20000.0) == (True, '')
+    try:
+        taken, reason = lab.set('stage', 'rest', 5.0)
+        assert not taken
+        assert 'outside the voltage limits 0 .. 4 V' in reason
+        assert not lab.set('stage', 'voltage_low', 4.0)[0]
+        assert not lab.set('stage', 'seed', 4)[0]
+        applied = len(got)
+        lab.publish('voltage', block(0, [0.0, 0.0, 7.0, 7.0, 7.0, 7.0, 7.0, 0.0]))
+        lab.wait(lambda: len(got) > applied, what='applied')
+        assert got[applied].values.tolist() == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 4.0, 3.0]
+        warned(lab, 'are faster than slew')
+    finally:
+        assert lab.set('stage', 'voltage_high', 10.0)[0]
+        assert lab.set('stage', 'slew', 40000.0)[0]
+
+
+def test_a_restart_of_the_same_publisher_and_a_very_long_gap(lab):
+    idle(lab)
+    seen = lab.collect('displacement')
+    before = len(seen)
+    # two runs of the sample clock, and a jump ahead that no gap is that long
+    stream = [*level(0.0, 12), *level(0.0, 3, segment='again'), *level(0.0, 2, 10**6, 'far')]
+    for b in stream:
+        lab.publish('voltage', b)
+    # the first block that starts over cannot be told from a repetition where all are zero
+    lab.wait(lambda: len(seen) >= before + len(stream), what='answers')
+    assert [b.segment for b in seen[before:]] == [b.segment for b in stream]
+    idle(lab)
+
+
+def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
+    idle(lab)
+    seen, got = lab.collect('displacement'), lab.collect('applied_voltage')
+    second = lab.node.create_publisher(Float64MultiArray, 'voltage', STREAM)
+    lab.publish('voltage', level(0.0, 1)[0])
+    lab.wait(second.get_subscription_count, what='match')
+    lab.wait(lambda: lab.diagnostics('stage').get('publishers') == '2', what='two publishers')
+    idle(lab)
+    try:
+        before, applied = len(seen), len(got)
+        mine = level(0.0, 40, segment='first')
+        others = level(3.0, 40, 100000, 'second')
+        for a, b in zip(mine, others, strict=True):
+            lab.publish('voltage', a)
+            second.publish(to_message(b))
+        warned(lab, 'second publisher')
+        lab.wait(lambda: len(seen) == before + 40, what='answers')
+        assert {b.segment for b in seen[before:]} == {'first'}
+        assert column(got[applied:])[1].max() == 0.0
+        idle(lab)
+        for b in level(3.0, 90, 200000, 'second'):
+            second.publish(to_message(b))
+        lab.wait(lambda: len(seen) == before + 130, what='the second one alone')
+        assert seen[-1].segment == 'second'
+        assert column(got[applied:])[1].max() == 3.0
+    finally:
+        lab.node.destroy_publisher(second)
+    idle(lab)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ramps_to_rest_first(number):
+    with Graph() as g:
+        seen, got = g.collect('displacement'), g.collect('applied_voltage')
+        # a slow ramp gives way to the two seconds that a node has for its end
+        stage = g.start('stage', {'ramp_slew': 10.0, 'silence': 5.0})
+        g.matched('applied_voltage')
+        for b in [block(0, np.linspace(0, 10, 10000)), *level(10.0, 3, 10000)]:
+            g.publish('voltage', b)
+        g.wait(lambda: len(seen) == 4 and got[-1].values[-1] == 10.0, what='10 V')
+        begin = time.monotonic()
+        assert stage.stop(number) == 0
+        assert time.monotonic() - begin < 2.0
+        g.wait(lambda: got[-1].values[-1] == 0.0, what='rest')
+        assert got[-1].segment == 'ramp:stop'
+        t, v = column(got)
+        assert np.array_equal(np.rint(t * FS), np.arange(t.size))
+        assert np.abs(np.diff(v)).max() <= 2.0
+        assert stage.log == ''
