@@ -1,4 +1,4 @@
-# make demo    a simulated stage, identified from nothing: demo_report/
+# make demo    the lab graph on a simulated stage, identified from nothing: demo_report/
 # make test    the checks and the tests
 #
 # Each makes its own virtual environment from a bare Python: make PYTHON=python3.12 test
@@ -44,10 +44,10 @@ colcon: .venv/.colcon
 	test -f install/piezo_ident/share/ament_index/resource_index/packages/piezo_ident
 
 # one environment, more of it as it is asked for
-.venv/.demo: EXTRAS :=
-.venv/.test: EXTRAS := [test]
+.venv/.demo: EXTRAS := [ros]
+.venv/.test: EXTRAS := [ros,test]
 .venv/.colcon: EXTRAS := [colcon]
-.venv-jazzy/.test: EXTRAS := [test]
+.venv-jazzy/.test: EXTRAS := [ros,test]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
 
 .venv-jazzy/.test: constraints-jazzy.txt

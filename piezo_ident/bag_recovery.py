@@ -44,6 +44,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import parse_qos
+import yaml
 
 __all__ = ['Bag', 'Stored', 'damage_as_data_error', 'is_unfinished', 'opened_bag']
 
@@ -152,18 +153,29 @@ def is_unfinished(path: Path) -> bool:
     DataError
         For a folder without any bag in it.
     """
-    if path.is_dir():
-        if not (path / 'metadata.yaml').is_file():
-            _storage_files(path)
-            return True
-        return any(_cut_off(f) for f in sorted(path.iterdir()) if f.suffix in ('.mcap', '.db3'))
-    return path.suffix in ('.mcap', '.db3') and _cut_off(path)
+    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+        _storage_files(path)
+        return True
+    return any(_cut_off(f) for f in _storage_files(path) if f.suffix in ('.mcap', '.db3'))
+
+
+def _listed(path: Path) -> list[Path]:
+    """Return the files that the metadata of a folder names, none when it names none."""
+    try:
+        meta = yaml.safe_load((path / 'metadata.yaml').read_text('utf-8'))
+        names = meta['rosbag2_bagfile_information']['relative_file_paths']
+        files = [path / Path(name).name for name in names]
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return []
+    return [f for f in files if f.is_file()]
 
 
 def _storage_files(path: Path) -> list[Path]:
     """Return the files of a folder that belong to one recording, in order."""
     if not path.is_dir():
         return [path]
+    if (path / 'metadata.yaml').is_file():
+        return _listed(path)
     found = [f for f in sorted(path.iterdir()) if f.suffix in ('.mcap', '.db3')]
     if not found:
         raise DataError(

@@ -28,6 +28,10 @@ __all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
+#: time that jumps back by more than this is that of another run [s]
+BACK = 0.05
+#: after this time without any match, two streams are taken to be in the same run [s]
+CATCH_UP = 1.0
 #: most blocks that wait
 MOST = 500
 #: bins that a quantity may lag behind before it is no longer waited for
@@ -49,9 +53,43 @@ class Matched:
         return Samples(self.t, self.y - self.y_hat, self.segment, 'displacement')
 
 
+class _Side:
+    """One of two streams: what waits, how far it is, and how often its clock began anew."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Samples] = []
+        self.run = 0
+        self.begin = self.last = float('nan')
+
+    def restarts_with(self, t: NDArray[np.float64]) -> bool:
+        """Take note of a block, and return whether its clock began anew."""
+        first, last = float(t[0]), float(t[-1])
+        from_start = first <= self.begin and last < self.last
+        again = from_start or first < self.last - BACK
+        if again or np.isnan(self.begin):
+            self.begin = first
+        self.last = last if again else max(last, float(np.nan_to_num(self.last, nan=last)))
+        return again
+
+    @property
+    def span(self) -> float:
+        """Time between the oldest and the newest block that waits [s]."""
+        return float(self.waiting[-1].t[-1] - self.waiting[0].t[0]) if self.waiting else 0.0
+
+    def forget(self) -> int:
+        """Drop what has waited for too long, and return how many samples that were."""
+        kept = [s for s in self.waiting if self.last - s.t[-1] <= WAIT][-MOST:]
+        n = sum(s.t.size for s in self.waiting) - sum(s.t.size for s in kept)
+        self.waiting = kept
+        return n
+
+
 class Matcher:
     """
     Joins two streams of blocks on time, whichever comes first and however they are cut.
+
+    Where a clock begins anew, the old run's times come again; a block waits until the other
+    stream is in its run.
 
     Attributes
     ----------
@@ -61,8 +99,7 @@ class Matcher:
 
     def __init__(self) -> None:
         self.unmatched = 0
-        self._predicted: list[Samples] = []
-        self._measured: list[Samples] = []
+        self._predicted, self._measured = _Side(), _Side()
 
     def predicted(self, samples: Samples) -> list[Matched]:
         """Take a prediction; return what is complete now."""
@@ -74,37 +111,38 @@ class Matcher:
         pairs = self._match(samples, self._measured, self._predicted)
         return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
 
-    def _match(
-        self, new: Samples, own: list[Samples], others: list[Samples]
-    ) -> list[tuple[Samples, Samples]]:
+    def _match(self, new: Samples, own: _Side, other: _Side) -> list[tuple[Samples, Samples]]:
+        if np.isnan(own.begin):
+            own.run = other.run
+        if own.restarts_with(new.t):
+            own.waiting.clear()
+            # who begins anew second has only caught up
+            own.run = other.run if other.run > own.run else own.run + 1
         pairs, rest = [], new
-        for other in list(others):
+        if own.run != other.run and own.span > CATCH_UP:
+            # one of them was silent when the clock began anew
+            own.run = other.run = max(own.run, other.run)
+        for one in list(other.waiting) if own.run == other.run else ():
             if not rest.t.size:
                 break
-            if other.t[-1] < rest.t[0] or other.t[0] > rest.t[-1]:
+            if one.t[-1] < rest.t[0] or one.t[0] > rest.t[-1]:
                 continue
-            others.remove(other)
-            if np.array_equal(other.t, rest.t):
-                pairs.append((rest, other))
-                rest = _rows(rest, np.zeros(rest.t.size, dtype=bool))
+            other.waiting.remove(one)
+            if np.array_equal(one.t, rest.t):
+                pairs.append((rest, one))
+                rest = _without(rest, np.arange(rest.t.size))
                 break
-            _, i, j = np.intersect1d(rest.t, other.t, return_indices=True)
+            _, i, j = np.intersect1d(rest.t, one.t, return_indices=True)
             if i.size:
-                pairs.append((_rows(rest, i), _rows(other, j)))
-            left, rest = _without(other, j), _without(rest, i)
+                pairs.append((_rows(rest, i), _rows(one, j)))
+            left, rest = _without(one, j), _without(rest, i)
             if left.t.size:
-                others.append(left)
+                other.waiting.append(left)
         if rest.t.size:
-            own.append(rest)
-        self._forget(float(new.t[-1]))
+            own.waiting.append(rest)
+        self._predicted.forget()
+        self.unmatched += self._measured.forget()
         return sorted(pairs, key=lambda pair: float(pair[0].t[0]))
-
-    def _forget(self, now: float) -> None:
-        for waiting in (self._predicted, self._measured):
-            kept = [s for s in waiting if abs(s.t[-1] - now) <= WAIT][-MOST:]
-            if waiting is self._measured:
-                self.unmatched += sum(s.t.size for s in waiting) - sum(s.t.size for s in kept)
-            waiting[:] = kept
 
 
 def _rows(samples: Samples, rows: NDArray[np.generic]) -> Samples:

@@ -129,13 +129,14 @@ class ReplayClock:
         return self._start + (stamp - self._stamp) * 1e-9 / self.rate
 
     def note(self, stamp: int, now: float) -> None:
-        """Take note that the message with a log time was sent."""
+        """Take note that the message with a log time is next, before waiting for its time."""
         delay = now - self.due(stamp)
         if delay < self.SLACK:
+            # there is time to wait: whatever was late is caught up with
             self._late = 0
             return
         self._late += 1
-        if self._late > self.BURST:
+        if self._late >= self.BURST:
             self._start += delay
             self.slipped += delay
             self._late = 0

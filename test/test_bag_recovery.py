@@ -252,13 +252,15 @@ def test_sigkill(tmp_path, storage):
         process.wait()
         process.stdout.close()
     before = {f.name: f.read_bytes() for f in (tmp_path / 'bag').iterdir()}
-    record = read_bag(tmp_path / 'bag')
+    record = read_bag(tmp_path / 'bag', recover=True)
     assert len(record.pieces) == 1
     assert record.pieces[0].n >= 100 * (flushed + 1)
     t = np.arange(record.n) / RATE
     np.testing.assert_array_equal(record.pieces[0].t, t)
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
     assert 'metadata.yaml is missing' in truncation(record)
+    with pytest.raises(DataError, match=r"'piezo_ident convert .* OUT' saves what is whole"):
+        read_bag(tmp_path / 'bag')
     lacking = 'bag.mcap' if storage == 'mcap' else 'transaction that was never finished'
     assert lacking in truncation(record)
     # nothing of what was measured is touched
@@ -273,7 +275,7 @@ def test_convert_says_so_and_recovers(tmp_path, storage, capsys):
     assert 'met: truncated_bag' in said
     assert 'recovered the 80 messages' in said
     assert 'is unknown' in said
-    whole = read_record(tmp_path / 'whole')
+    whole = read_record(tmp_path / 'whole', recover=True)
     assert (whole.n, whole.faults) == (4000, ())
     assert main(['convert', '--json', str(tmp_path / 'bag'), str(tmp_path / 'out.npz')]) == 0
     story = json.loads(capsys.readouterr().out)
@@ -285,13 +287,13 @@ def test_a_lone_file_and_a_bag_without_metadata(tmp_path, storage):
     killed(tmp_path / 'bag', storage=storage)
     (file,) = (tmp_path / 'bag').iterdir()
     if storage == 'mcap':
-        assert 'the end of bag.mcap is missing' in truncation(read_record(file))
+        assert 'the end of bag.mcap is missing' in truncation(read_record(file, recover=True))
     else:
         # all of it is committed: as a file of its own nothing is amiss
-        assert read_record(file).faults == ()
+        assert read_record(file, recover=True).faults == ()
     write(tmp_path / 'good', storage).close()
     (tmp_path / 'good' / 'metadata.yaml').unlink()
-    record = read_record(tmp_path / 'good')
+    record = read_record(tmp_path / 'good', recover=True)
     assert record.n == 4000
     assert 'recovered the 80 messages' in truncation(record)
     assert 'metadata.yaml is missing' in truncation(record)
@@ -308,7 +310,13 @@ def test_several_files(tmp_path):
         assert len(list(bag.messages(bag.connections))) == 160
     (folder / 'bag_1.mcap').rename(folder / 'another.mcap')
     with pytest.raises(DataError, match=r'name one of its files: another\.mcap, bag_0\.mcap'):
-        read_bag(folder)
+        read_bag(folder, recover=True)
+
+
+def test_a_stray_file_is_no_part_of_a_bag(tmp_path):
+    write(tmp_path / 'bag').close()
+    (tmp_path / 'bag' / 'stray.mcap').write_bytes(b'')
+    assert read_bag(tmp_path / 'bag').faults == ()
 
 
 def test_cut_anywhere(tmp_path):
@@ -344,7 +352,7 @@ def test_truncated_file(tmp_path, storage, share, metadata):
     if not metadata:
         (tmp_path / 'b' / 'metadata.yaml').unlink()
     try:
-        record = read_bag(tmp_path / 'b')
+        record = read_bag(tmp_path / 'b', recover=True)
     except DataError as error:
         assert 'damaged or unfinished bag' in str(error)
         assert '\n' not in str(error)
@@ -374,9 +382,9 @@ def test_compressed_bags_of_other_writers(tmp_path, compression, crc):
                 writer.add_message(i, 10**18 + k, data, 10**18 + k)
         writer.finish()
     data = file.read_bytes()
-    assert read_record(tmp_path / 'bag').n == 5000
+    assert read_record(tmp_path / 'bag', recover=True).n == 5000
     file.write_bytes(data[: len(data) // 2])
-    record = read_record(tmp_path / 'bag')
+    record = read_record(tmp_path / 'bag', recover=True)
     assert 1000 < record.n < 5000
     # a byte within the first chunk
     broken = bytearray(data[: len(data) // 2])
@@ -384,7 +392,7 @@ def test_compressed_bags_of_other_writers(tmp_path, compression, crc):
     file.write_bytes(broken)
     if crc:
         with pytest.raises(DataError, match='makes no sense'):
-            read_record(tmp_path / 'bag')
+            read_record(tmp_path / 'bag', recover=True)
 
 
 def chunk(raw_size: int, compression: bytes, packed: bytes, declared: int | None = None) -> bytes:
@@ -419,7 +427,7 @@ def test_garbage_takes_no_memory(tmp_path, records):
     file = tmp_path / 'bag.mcap'
     file.write_bytes(MAGIC + HEADER + records)
     with pytest.raises(DataError, match='damaged or unfinished') as caught:
-        read_record(file)
+        read_record(file, recover=True)
     assert '\n' not in str(caught.value)
 
 
@@ -430,7 +438,7 @@ def test_a_zstd_bomb_is_not_unpacked(tmp_path):
     file = tmp_path / 'bag.mcap'
     file.write_bytes(MAGIC + HEADER + chunk(1000, b'zstd', packed))
     with pytest.raises(DataError, match='checksum or size is wrong'):
-        read_record(file)
+        read_record(file, recover=True)
 
 
 @pytest.mark.parametrize('storage', STORAGES)
@@ -445,7 +453,7 @@ def test_flipped_bytes_never_crash(tmp_path, storage):
             broken[rng.randrange(len(data))] = rng.randrange(256)
         file.write_bytes(broken[: rng.randint(len(data) // 2, len(data))])
         try:
-            record = read_record(path)
+            record = read_record(path, recover=True)
         except DataError:
             continue
         assert truncation(record)
@@ -458,7 +466,7 @@ def test_a_database_that_is_no_bag(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag.db3').rename(tmp_path / 'bag' / 'bag.db3')
     with pytest.raises(DataError, match='damaged or unfinished bag'):
-        read_bag(tmp_path / 'bag')
+        read_bag(tmp_path / 'bag', recover=True)
 
 
 def test_write_ahead_log(tmp_path):

@@ -16,6 +16,7 @@
 
 from collections.abc import Callable, Iterator
 import contextlib
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -24,11 +25,13 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.cli import main
 from piezo_ident.cli.demo import find_measured
+from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_file, check_folder
 from piezo_ident.errors import ConfigError, DataError
 from piezo_ident.model_io import load_model
@@ -222,11 +225,40 @@ def test_predict_warns_outside_the_identified_range(capsys, tmp_path, made):
     assert 'outside the identified range' in text
 
 
+def test_predict_tells_an_offset_from_a_bad_model(capsys, tmp_path, made):
+    piece = read_record(made / 'sine.csv').pieces[0]
+    write_record(Record((replace(piece, y=piece.y + 5e-6),)), tmp_path / 'shifted.npz')
+    argv = ['predict', made / 'model.yaml', tmp_path / 'shifted.npz']
+    text = succeed(capsys, *argv)
+    assert '% after removing a mean of 5.00' in text
+    assert 'set to zero elsewhere' in text
+    whole = json.loads(succeed(capsys, *argv, '--json'))['whole']
+    assert whole['offset'] == pytest.approx(5e-6, rel=0.01)
+    assert whole['percent_of_stroke'] > 5.0
+    assert whole['percent_of_stroke_without_offset'] < 0.2
+    # nothing is said where there is no offset
+    plain = succeed(capsys, 'predict', made / 'model.yaml', made / 'sine.csv')
+    assert 'after removing' not in plain
+    assert 'set to zero' not in plain
+
+
 def test_identify_without_model_writes_nothing(capsys, tmp_path, made, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = succeed(capsys, 'identify', made / 'record.npz', *FAST)
     assert '--model' in text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_summary_of_a_stage_that_retracts(capsys, tmp_path, made):
+    text = succeed(capsys, 'identify', made / 'record.npz', *FAST)
+    assert 'retracts' not in text
+    rows = {line.split(',')[0]: line.split() for line in text.splitlines() if ', held out' in line}
+    assert rows['record.npz idle'][-2] == '–'
+    assert float(rows['record.npz ramp'][-2]) > 99
+    piece = read_record(made / 'record.npz').pieces[0]
+    write_record(Record((replace(piece, y=-piece.y),)), tmp_path / 'r.npz')
+    text = succeed(capsys, 'identify', tmp_path / 'r.npz', *FAST)
+    assert 'direction     retracts with rising voltage\n' in text
 
 
 def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
@@ -344,6 +376,16 @@ def test_a_unit_converts(capsys, tmp_path):
     assert read_record(tmp_path / 'r.npz').stroke == pytest.approx(75e-6, rel=1e-3)
 
 
+def test_one_unit_for_all_records(capsys, tmp_path, made):
+    path = tmp_path / 'um.csv'
+    path.write_text(csv_text(y=7.5 * table()['v']))
+    argv = ['identify', path, made / 'record.npz', '--displacement-unit', 'um']
+    refuse(capsys, tmp_path, argv, 'record.npz', 'one unit holds for all', 'piezo_ident convert')
+    argv = ['identify', path, '--validation', made / 'record.npz']
+    refuse(capsys, tmp_path, argv, 'um.csv', 'one unit holds for all', 'piezo_ident convert')
+    assert 'one unit' not in refuse(capsys, tmp_path, ['identify', path], '--displacement-unit')
+
+
 def cut_in_half(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -412,6 +454,51 @@ def test_bad_model(capsys, tmp_path, made, text, cure):
     refuse(capsys, tmp_path, argv, path, cure)
 
 
+def test_model_and_record_in_the_wrong_order(capsys, tmp_path, made):
+    model, record = made / 'model.yaml', made / 'sine.csv'
+    for argv in ([record, model], [record, record], [model, model], [tmp_path, record]):
+        refuse(capsys, tmp_path, ['predict', *argv], 'MODEL comes first: piezo_ident predict')
+
+
+def test_empty_names(capsys, tmp_path, made, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    record, model = made / 'record.npz', made / 'model.yaml'
+    for argv in (
+        ['identify', ''],
+        ['identify', record, '--model', ''],
+        ['identify', record, '--report', ''],
+        ['identify', record, '--validation', ''],
+        ['identify', record, '--namespace', ''],
+        ['identify', record, '--voltage-topic', ' '],
+        ['predict', '', record],
+        ['predict', model, ''],
+        ['predict', model, record, '--out', ''],
+        ['convert', record, ''],
+        ['simulate', ''],
+        ['simulate', '--config', '', 'r.csv'],
+        ['simulate', '--program', '', 'r.csv'],
+        ['demo', '--out', ''],
+    ):
+        refuse(capsys, tmp_path, argv, 'is empty; give a name')
+
+
+def test_links_that_lead_nowhere(capsys, tmp_path, made):
+    gone, loop = tmp_path / 'gone.csv', tmp_path / 'loop.yaml'
+    gone.symlink_to('nowhere.csv')
+    loop.symlink_to('loop.yaml')
+    record = made / 'record.npz'
+    for argv, said in (
+        (['identify', gone], 'gone.csv: is a link to nowhere.csv, which does not exist'),
+        (['convert', record, '--overwrite', gone], 'gone.csv: is a link to'),
+        (['predict', loop, record], 'loop.yaml: is a link that leads back to itself'),
+        (['simulate', '--config', loop, tmp_path / 'r.csv'], 'leads back to itself'),
+        (['identify', record, '--model', loop], 'leads back to itself'),
+        (['identify', record, '--report', gone], 'gone.csv: is a link to'),
+        (['identify', record, '--report', gone / 'below'], 'gone.csv: is a link to'),
+    ):
+        refuse(capsys, tmp_path, argv, said, 'mend the link')
+
+
 def test_model_of_another_rate(capsys, tmp_path, made):
     path = tmp_path / 'slow.csv'
     path.write_text(csv_text())
@@ -438,7 +525,9 @@ def test_misspelt_names(capsys, tmp_path, made):
     ('options', 'word'),
     [
         (['--thresholds', 'many'], '--thresholds'),
-        (['--thresholds', 1], 'thresholds'),
+        (['--thresholds', 1], "'1': give 2 to 400, or refined"),
+        (['--thresholds', -3], "'-3': give 2 to 400, or refined"),
+        (['--thresholds', 401], "'401': give 2 to 400, or refined"),
         (['--order', '3'], '--order'),
         (['--order', '3,0'], 'order'),
         (['--solver', 'magic'], '--solver'),
@@ -605,6 +694,116 @@ def test_interrupt_leaves_nothing(capsys, tmp_path):
     assert b'piezo_ident: interrupted' in after
     assert after.count(b'\n') == 1
     assert list(tmp_path.iterdir()) == [record]
+
+
+def program(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, '-c', f'import os, signal, sys, time\n{code}'],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+RAISE = 'os.kill(os.getpid(), signal.SIGINT); time.sleep(0.01)'
+INTERRUPTED = (130, '', 'piezo_ident: interrupted; nothing was left half written\n')
+
+
+@pytest.mark.parametrize('module', ['numpy', 'piezo_ident.cli.commands'])
+def test_interrupt_while_modules_are_imported(module):
+    # even where whoever imports takes every exception for his own
+    done = program(
+        'class Finder:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        f'        if name == {module!r}:\n'
+        '            try:\n'
+        f'                {RAISE}\n'
+        '            except BaseException:\n'
+        '                pass\n'
+        'sys.meta_path.insert(0, Finder())\n'
+        "sys.argv = ['piezo_ident', 'effects']\n"
+        'from piezo_ident.cli import main\n'
+        'sys.exit(main())\n'
+    )
+    assert (done.returncode, done.stdout, done.stderr) == INTERRUPTED
+
+
+def test_interrupt_that_is_lost_on_the_way_still_counts(tmp_path):
+    done = program(
+        'import piezo_ident.cli.commands as commands\n'
+        'def simulate(*args, f=commands.simulate, **more):\n'
+        '    try:\n'
+        f'        {RAISE}\n'
+        '    except BaseException:\n'
+        '        return f(*args, **more)\n'
+        'commands.simulate = simulate\n'
+        f"sys.argv = ['piezo_ident', 'simulate', {str(tmp_path / 'r.npz')!r}]\n"
+        'from piezo_ident.cli import main\n'
+        'sys.exit(main())\n'
+    )
+    assert (done.returncode, done.stdout, done.stderr) == INTERRUPTED
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('number', [0, 1, 2])
+def test_interrupt_while_files_are_replaced(tmp_path, made, number):
+    # whichever of the files it strikes, the report and the model are whole
+    (tmp_path / 'm.yaml').write_text('an older one')
+    argv = ['identify', made / 'record.npz', '--model', tmp_path / 'm.yaml', *FAST]
+    argv += ['--report', tmp_path / 'report']
+    done = program(
+        'replace, count = os.replace, [0]\n'
+        'def striking(*args, **more):\n'
+        f'    if count[0] == {number}:\n'
+        f'        {RAISE}\n'
+        '    count[0] += 1\n'
+        '    replace(*args, **more)\n'
+        'def armed(*args, **more):\n'
+        '    os.replace = striking\n'
+        '    return save(*args, **more)\n'
+        'import piezo_ident.report as report\n'
+        'save, report.write_report = report.write_report, armed\n'
+        f"sys.argv = ['piezo_ident', *{[str(a) for a in argv]!r}]\n"
+        'from piezo_ident.cli import main\n'
+        'sys.exit(main())\n'
+    )
+    assert (done.returncode, done.stdout, done.stderr) == INTERRUPTED
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['m.yaml', 'report']
+    names = {p.name for p in (tmp_path / 'report').iterdir()}
+    assert {'report.html', 'model.yaml', 'identification.json'} <= names
+    assert not any(name.startswith('.') for name in names)
+    assert load_model(tmp_path / 'm.yaml').delay.samples == 2
+
+
+def test_interrupt_behind_the_work_is_too_late():
+    done = program(
+        'import atexit\n'
+        f'atexit.register(lambda: {RAISE.replace(";", " or")})\n'
+        "sys.argv = ['piezo_ident', '--version']\n"
+        'from piezo_ident.cli import main\n'
+        'sys.exit(main())\n'
+    )
+    assert (done.returncode, done.stderr) == (0, '')
+    # in a process of somebody else, the signal stays his
+    done = program(
+        'from piezo_ident.cli import main\n'
+        "main(['--version'])\n"
+        'print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n'
+    )
+    assert done.stdout.endswith('True\n')
+
+
+def test_a_second_interrupt_does_not_wait():
+    with interrupts.handled(is_process=False):
+        with pytest.raises(KeyboardInterrupt), interrupts.waiting():
+            signal.raise_signal(signal.SIGINT)
+            # the same wish, pressed twice
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(1.1)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert interrupts.met
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_reader_that_leaves_is_no_error():

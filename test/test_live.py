@@ -260,6 +260,39 @@ def test_what_finds_no_partner_is_forgotten_and_counted():
     assert matcher.predicted(block(0, 100)) == []
 
 
+def test_runs_of_the_clock_are_not_mixed_up():
+    matcher = Matcher()
+    for k in range(0, 3000, 100):
+        matcher.predicted(block(k, 100, 1.0))  # never measured
+    # the new run is measured first, and has the times of the old one
+    assert matcher.measured(block(0, 100, 5.0)) != []
+    for k in range(100, 3000, 100):
+        matcher.measured(block(k, 100, 5.0))
+    assert matcher.measured(block(0, 100, 9.0)) == []
+    assert matcher.measured(block(100, 100, 9.0)) == []
+    pairs = matcher.predicted(block(0, 100, 2.0)) + matcher.predicted(block(100, 100, 2.0))
+    assert [p.residual.values[0] for p in pairs] == [7.0, 7.0]
+    # the next is predicted first
+    for k in range(200, 3000, 100):
+        matcher.predicted(block(k, 100, 2.0))
+    matcher.predicted(block(0, 100, 3.0))
+    (pair,) = matcher.measured(block(0, 100, 4.0))
+    assert pair.residual.values[0] == 1.0
+
+
+def test_streams_find_together_after_one_was_silent_at_a_restart():
+    matcher = Matcher()
+    matcher.measured(block(100, 100))
+    for first in (0, 0, 0):
+        for k in range(first, 3000, 100):
+            matcher.predicted(block(k, 100))
+    pairs = []
+    for k in range(3000, 18_000, 100):
+        matcher.predicted(block(k, 100))
+        pairs += matcher.measured(block(k, 100))
+    assert pairs and pairs[-1].t[-1] == 17_999 / RATE
+
+
 def test_preview_bins_hold_mean_least_and_largest():
     preview = Preview(50.0)
     t = np.arange(600) / RATE

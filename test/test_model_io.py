@@ -37,7 +37,7 @@ from piezo_ident.model_io import (
     SCHEMA_VERSION,
     write_text,
 )
-from piezo_ident.simulation import load_stage
+from piezo_ident.simulation import load_stage, stage_from_dict
 import pytest
 import yaml
 
@@ -143,6 +143,47 @@ def test_missing_part_is_named(key):
 def test_unknown_keys_are_named():
     with pytest.raises(ModelError, match=r'm.yaml: unknown keys 7, dynmics'):
         model_from_dict({**data(), 'dynmics': {}, 7: 1}, 'm.yaml')
+
+
+@pytest.mark.parametrize(
+    ('part', 'key', 'said'),
+    [
+        ('input', 'v', 'unknown key v in input; did you mean'),
+        ('output', 'y', 'unknown key y in output; did you mean'),
+        ('delay', 'sample', 'unknown key sample in delay; did you mean samples?'),
+        ('hysteresis', 'wieghts', 'unknown key wieghts in hysteresis; did you mean weights?'),
+        ('hysteresis', 'P1', 'unknown key P1 in hysteresis; did you mean p1?'),
+        ('hysteresis', 'zzz', 'it knows thresholds, weights, p1, p2'),
+        ('dynamics', 3, 'unknown key 3 in dynamics; it knows a, b'),
+    ],
+)
+def test_unknown_keys_inside_are_named(part, key, said):
+    d = data()
+    d[part][key] = 1.0
+    with pytest.raises(ModelError) as caught:
+        model_from_dict(d, 'm.yaml')
+    assert str(caught.value).startswith('m.yaml: ')
+    assert said in str(caught.value)
+
+
+def test_misspelt_keys_are_named_before_what_they_leave_out():
+    d = data()
+    d['hysteresis']['wieghts'] = d['hysteresis'].pop('weights')
+    with pytest.raises(ModelError, match=r'wieghts in hysteresis; did you mean weights\?'):
+        model_from_dict(d)
+    d = data()
+    d['dynmics'] = d.pop('dynamics')
+    with pytest.raises(ModelError, match=r'unknown key dynmics; did you mean dynamics\?'):
+        model_from_dict(d)
+    d = data()
+    d['effects'][0]['paramters'] = d['effects'][0].pop('parameters')
+    with pytest.raises(ModelError, match=r'paramters in effects; did you mean parameters\?'):
+        model_from_dict(d)
+
+
+def test_unknown_sensor_keys_are_named():
+    with pytest.raises(ConfigError, match=r'unknown noise_rsm in sensor; it knows noise_rms'):
+        stage_from_dict({**data(), 'sensor': {'noise_rsm': 1e-9}})
 
 
 HUGE = 10**400
@@ -284,6 +325,10 @@ def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
 
 
 def test_unreadable_files_are_named(tmp_path):
+    looped = tmp_path / 'loop.yaml'
+    looped.symlink_to('loop.yaml')
+    with pytest.raises(ConfigError, match='leads back to itself; mend the link'):
+        load_yaml(looped)
     with pytest.raises(ConfigError, match='no such file'):
         load_yaml(tmp_path / 'nothing.yaml')
     with pytest.raises(ConfigError, match='cannot be read'):

@@ -219,13 +219,24 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('', ['empty file']),
         ('t,v,y\n', ['no rows']),
         ('0,1,2\n1,2,3\n', ['no header line']),
+        ('0,1,2,noise\n1,2,3,noise\n', ["no header line; put 't,v,y,segment' on top"]),
+        ('0,1,2,3\n1,2,3,4\n', ["no header line; put 't,v,y', with a name for each further"]),
+        ('# by hand\n0,1,2\n1,2,3\n', ['no header line']),
+        ('# t,v,y\n', ['empty file']),
         ('t;v;y\n0;1;2\n', ['semicolons']),
         ('t\tv\ty\n0\t1\t2\n', ['tabs']),
         ('t,v\n0,1\n', ['y missing', 't [s], v [V] and y']),
         ('t,v,y,v\n0,1,2,3\n', ['column v stands there twice']),
         ('t,v,y\n0,1,2\n\n1,oops,3\n', ['line 4, column v', "'oops'"]),
         ('t,v,y\n0,1,2\n1,,3\n', ['line 3, column v', "''"]),
-        ('t,v,y\n0,1,2\n1,2\n', ['line 3 has 2 columns, the header has 3']),
+        ('t,v,y\n0,1,2\n1,2\n', ['line 3 has 2 columns, the header has 3; mend']),
+        ('t,v,y\n0,0,1,5,2,25e-6\n', ['line 2 has 6 columns', 'decimal commas', 'points']),
+        ('t,v,y\n0,0,0\n0,1,1,5,-2,2\n', ['line 3 has 6 columns', 'decimal commas']),
+        ('t,v,y,segment\n0,0,1,5,2,2,noise\n', ['line 2 has 7 columns', 'decimal commas']),
+        ('t,v,y\n0.0,1.5,2.5,2.0\n', ['line 2 has 4 columns', 'mend or delete']),
+        ('t,v,y\n"0,5","1,5","2,5e-6"\n', ["line 2, column t: '0,5'", 'decimal commas']),
+        ('# one\n\n# two\nt,v,y\n0,1,2\n1,oops,3\n', ['line 6, column v', "'oops'"]),
+        ('# one\n# t,v,y\n0,1,2\n1,oops,3\n', ['line 4, column v', "'oops'"]),
         ('t,v,y\n0,1,2\n1,"2,3\n', ['no CSV file']),
         ('t,v,y\n0,1,2\n1,\0,3\n', ['r.csv']),
     ],
@@ -234,6 +245,22 @@ def test_bad_csv(tmp_path, text, words):
     path = tmp_path / 'r.csv'
     path.write_text(text)
     refuse(path, *words)
+
+
+@pytest.mark.parametrize(
+    'above',
+    [
+        '# the "first", of "two"\n# again\n\nt,v,y\n',
+        '#made by hand\n# t, v,y\n',
+        '\ufeff# x\nt,v,y\n',
+    ],
+)
+def test_comments_above_the_header(tmp_path, above):
+    path = tmp_path / 'r.csv'
+    path.write_text(csv_text().replace('t,v,y\n', above, 1), encoding='utf-8')
+    got = read_record(path)
+    np.testing.assert_array_equal(got.pieces[0].y, table()['y'])
+    assert got.faults == ()
 
 
 def test_error_beyond_the_first_rows(tmp_path):
@@ -343,6 +370,20 @@ def test_what_is_not_there_or_unknown(tmp_path):
     refuse(tmp_path, 'metadata.yaml')
     (tmp_path / 'r.xls').touch()
     refuse(tmp_path / 'r.xls', 'unknown format .xls')
+
+
+@pytest.mark.parametrize('name', ['r.csv', 'r.mcap', 'bag'])
+def test_links_that_lead_nowhere(tmp_path, name):
+    path = tmp_path / name
+    path.symlink_to('gone')
+    refuse(path, 'is a link to gone, which does not exist', 'mend')
+    path.unlink()
+    path.symlink_to(name)
+    refuse(path, 'leads back to itself', 'mend')
+    (tmp_path / 'there.csv').write_text(csv_text())
+    path = tmp_path / 'link.csv'
+    path.symlink_to('there.csv')
+    assert read_record(path).n == 300
 
 
 # --- measured files

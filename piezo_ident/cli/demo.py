@@ -31,6 +31,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.errors import ConfigError
 from piezo_ident.identification import identify
 from piezo_ident.metrics import FORMULA
+from piezo_ident.nodes.starter import rclpy_is_there
 from piezo_ident.prediction import predict_record
 from piezo_ident.program import load_program
 from piezo_ident.record import Record
@@ -97,13 +98,8 @@ def demo(out: Path, asked: Path | None, console: Console) -> None:
 
 
 def _paper_stage(out: Path, console: Console) -> None:
-    stage = load_stage(find_config('stage_paper', 'stage'))
     console.say("1. The paper's stage, simulated, identified from voltage and displacement alone")
-    record = _play(stage, 'identification', 1)
-    found = _identify('ten thresholds', record, Settings(), console)
-    played = _play(stage, 'validation', 2)
-    _keep(found, out / 'stage_paper', console, record, played)
-    sines = sine_errors(found.model, played)
+    found, sines = _on_the_graph(out, console) if rclpy_is_there() else _offline(out, console)
     console.say(text_summary(found))
     console.say()
     console.say(f'Sines over the full range, not fitted: {FORMULA}, in %')
@@ -118,6 +114,31 @@ def _paper_stage(out: Path, console: Console) -> None:
         'just there.  They show that the three steps find a model that is there, no more.'
     )
     console.say()
+
+
+def _on_the_graph(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
+    from piezo_ident.cli.graph_demo import graph_demo
+
+    console.say('   six nodes over DDS: excitation, stage, identifier, model, recorder, player')
+    run = graph_demo(out, console)
+    console.say(
+        '   live, replayed from the bag, read from the bag: the largest relative difference of a '
+        f'parameter is {run.difference:.1e}'
+    )
+    for line in run.unclean or ('all nodes ended cleanly',):
+        console.say(f'   {line}')
+    _keep(run.found, out / 'stage_paper', console, run.record)
+    return run.found, run.sines
+
+
+def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
+    console.say('   without ROS (rclpy is not here): the same, without nodes')
+    stage = load_stage(find_config('stage_paper', 'stage'))
+    record = _play(stage, 'identification', 1)
+    found = _identify('ten thresholds', record, Settings(), console)
+    played = _play(stage, 'validation', 2)
+    _keep(found, out / 'stage_paper', console, record, played)
+    return found, sine_errors(found.model, played)
 
 
 def _dense_stage(out: Path, console: Console) -> None:

@@ -225,11 +225,11 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     stop = threading.Event()
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor()
-    guard = executor.create_task  # woken below, so that a silent node hears the signal at once
 
     def on_signal(*_: object) -> None:
         stop.set()
-        guard(lambda: None)
+        # a silent node would hear of it only at the end of its wait
+        executor.wake()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)

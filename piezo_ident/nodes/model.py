@@ -58,6 +58,7 @@ class ModelNode(LabNode):
         self._trouble, self._trouble_at = '', 0.0
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
+        self._models = 0
         self._texts: list[str] = []
         self._parsed: list[tuple[StageModel | None, str]] = []
         self._parsing: threading.Thread | None = None
@@ -136,6 +137,7 @@ class ModelNode(LabNode):
             self._refuse_model(f'{source}: {error}')
             return
         self._source, self._turned_down = source, ''
+        self._models += 1
         self._error.clear()
 
     def _refuse_model(self, reason: str) -> None:
@@ -240,7 +242,8 @@ class ModelNode(LabNode):
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
         text = '; '.join(filter(None, [message, *said]))
-        self.report_status(state, 0.0, text, WARN if any(said) else OK)
+        level = WARN if any(said) else OK
+        self.report_status(state, 0.0, text, level, models=self._models)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return how the prediction goes."""

@@ -31,10 +31,9 @@ from typing import Any
 from piezo_ident.bag_recovery import Bag, opened_bag, Stored
 from piezo_ident.errors import DataError, PiezoIdentError
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
-from piezo_ident.nodes.taps import message_class
+from piezo_ident.nodes.taps import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.replay import chosen_topics, ReplayClock
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
@@ -87,15 +86,7 @@ class PlayerNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse names that cannot be."""
-        if name == 'topics':
-            if not value:
-                return 'topics must name at least one'
-            for topic in value:
-                try:
-                    self.resolve_topic_name(topic)
-                except (InvalidTopicNameException, ValueError) as error:
-                    return f'topics: {topic!r} is no name of a topic ({error})'
-        return None
+        return topics_problem(value) if name == 'topics' else None
 
     # services
 
@@ -251,6 +242,7 @@ class PlayerNode(LabNode):
                 clock, first = ReplayClock(rate, stamp, now), stamp
             elif self.values['rate'] != clock.rate:
                 clock.change_rate(self.values['rate'], stamp, now)
+            clock.note(stamp, now)
             # in short waits, so that a pause in the recording neither hides a stop nor the status
             while True:
                 if now - told > TELL:
@@ -263,7 +255,6 @@ class PlayerNode(LabNode):
                     break
                 now = time.monotonic()
             senders[connection.topic].publish(raw)
-            clock.note(stamp, time.monotonic())
             replay.messages += 1
             replay.slipped = clock.slipped
             replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)

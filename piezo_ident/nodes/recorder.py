@@ -35,8 +35,7 @@ import piezo_ident
 from piezo_ident.bag_writer import BagWriter
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
-from piezo_ident.nodes.taps import Taps
-from rclpy.exceptions import InvalidTopicNameException
+from piezo_ident.nodes.taps import Taps, topics_problem
 
 __all__ = ['RecorderNode', 'main']
 
@@ -90,15 +89,7 @@ class RecorderNode(LabNode):
                 return 'output must name a folder'
             if value.endswith(('.mcap', '.db3')):
                 return f'output must name a folder, without .mcap or .db3, got {value!r}'
-        if name == 'topics':
-            if not value:
-                return 'topics must name at least one'
-            for topic in value:
-                try:
-                    self.resolve_topic_name(topic)
-                except (InvalidTopicNameException, ValueError) as error:
-                    return f'topics: {topic!r} is no name of a topic ({error})'
-        return None
+        return topics_problem(value) if name == 'topics' else None
 
     # services
 

@@ -25,7 +25,6 @@ from collections.abc import Mapping
 import ctypes
 import os
 from pathlib import Path
-import shutil
 import signal
 import subprocess
 import sys
@@ -36,7 +35,7 @@ from typing import Any
 from piezo_ident.errors import PiezoIdentError
 import yaml
 
-__all__ = ['Nodes']
+__all__ = ['Nodes', 'rclpy_is_there']
 
 _PR_SET_PDEATHSIG = 1
 #: how long a node may take to end after each signal [s]
@@ -180,4 +179,4 @@ def rclpy_is_there() -> bool:
     """Return whether nodes can run here."""
     from importlib.util import find_spec
 
-    return find_spec('rclpy') is not None and shutil.which(sys.executable) is not None
+    return find_spec('rclpy') is not None

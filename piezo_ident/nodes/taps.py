@@ -20,7 +20,7 @@ They are not spun by the executor, which would take 0.3 ms a message.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 import importlib
 import threading
@@ -32,8 +32,10 @@ from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.interfaces import ARRAY, TOPICS
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -43,7 +45,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-__all__ = ['Taps', 'message_class']
+__all__ = ['Taps', 'message_class', 'topics_problem']
 
 #: messages that a subscription keeps until it is emptied: five seconds of blocks
 DEPTH = 1000
@@ -78,6 +80,19 @@ def message_class(name: str) -> Any:
         return getattr(importlib.import_module(f'{package}.msg'), kind)
     except (ImportError, AttributeError, ValueError):
         raise PiezoIdentError(f'message type {name} is not installed; install {package}') from None
+
+
+def topics_problem(names: Sequence[str]) -> str | None:
+    """Return why these cannot be names of topics, None when they can."""
+    if not names:
+        return 'topics must name at least one'
+    for name in names:
+        try:
+            validate_topic_name(name)
+        except (InvalidTopicNameException, ValueError) as error:
+            reason = ' '.join(str(error).split())
+            return f'topics: {name!r} is no name of a topic ({reason})'
+    return None
 
 
 @dataclass(frozen=True)

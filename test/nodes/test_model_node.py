@@ -76,11 +76,11 @@ def lab():
 def fast():
     """Return a graph with a model node that outlives many tests; each begins with a restart."""
     with Graph() as g:
-        for topic in ('voltage', 'displacement', 'prediction', 'residual'):
+        for topic in ('prediction', 'residual'):
             g.collect(topic)
         g.start('model', params={'window': 0.2})
         g.publish_text('model', paper())
-        g.wait(lambda: g.status('model')['state'] == 'predicting', 10, 'model')
+        g.wait(lambda: g.status('model').get('models') == '1', 10, 'model')
         yield g
 
 
@@ -93,18 +93,9 @@ def heard(g, topic, since, count, timeout=10):
 
 def reset(g, text=None):
     """Set the model, and return how many blocks were heard."""
-    text = text or paper()
-    before = len(g.statuses('model'))
-    g.publish_text('model', text)
-    g.wait(
-        lambda: (
-            g.status('model')['message'].startswith('with topic model')
-            and 'refused' not in g.status('model')['message']
-            or len(g.statuses('model')) > before
-        ),
-        5,
-        'model',
-    )
+    taken = int(g.status('model')['models'])
+    g.publish_text('model', text or paper())
+    g.wait(lambda: int(g.status('model')['models']) > taken, 5, 'model')
     return {topic: len(g.collect(topic)) for topic in ('prediction', 'residual')}
 
 
@@ -187,10 +178,11 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
     fast.wait(lambda: fast.node.count_publishers('preview') == 1, 5, 'preview')
     time.sleep(0.3)  # nothing tells when a best-matched reader has been matched
     since = reset(fast)
-    send(fast, blocks(4000))
-    t, y = heard(fast, 'prediction', since['prediction'], 40)
-    for block, part in zip(blocks(4000), np.split(y, 40), strict=True):
-        fast.publish('displacement', Samples(block.t, part + 2e-9, block.segment, 'displacement'))
+    y = model_of(paper()).stream().process(sine(4000)[1], np.arange(4000) / FS)
+    for voltage, part in zip(blocks(4000), np.split(y, 40), strict=True):
+        fast.publish('voltage', voltage)
+        fast.publish('displacement', Samples(voltage.t, part + 2e-9, '', 'displacement'))
+        time.sleep(0.00125)
     heard(fast, 'residual', since['residual'], 40)
     names = [
         f'{quantity}/{what}'
@@ -242,7 +234,7 @@ def test_faults_of_the_stream_are_said_and_survived(fast):
     assert np.isfinite(y).all() and t[-1] == b[-1].t[-1]
     before = fast.diagnostics('model')
     fast.wait(lambda: fast.diagnostics('model') is not before, 3, 'diagnostics')
-    fast.wait(lambda: int(fast.diagnostics('model')['lost']) >= 200, 3, 'lost samples')
+    fast.wait(lambda: int(fast.diagnostics('model').get('lost', 0)) >= 200, 3, 'lost samples')
     assert int(fast.diagnostics('model')['unreadable']) >= 1
     assert int(fast.diagnostics('model')['late']) >= 200
     assert fast.status('model')['state'] == 'predicting'
@@ -274,7 +266,7 @@ def test_it_says_when_to_identify_again(fast):
         )
     d = fast.diagnostics('model')
     assert d['level'] == '1' and '0.5 % of stroke, 5.0 times' in d['message']
-    assert {'rate', 'load', 'lost', 'head_room', 'memory_known'} <= set(d)
+    assert {'rate', 'load', 'lost', 'memory_known'} <= set(d)
     assert fast.set('model', 'warn_ratio', 10.0) == (True, '')
     fast.wait(lambda: fast.diagnostics('model')['message'] == 'predicting', 5, 'taken back')
     assert fast.set('model', 'warn_ratio', 3.0) == (True, '')
@@ -288,7 +280,7 @@ def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
     said = 'the old model is kept: topic model: the stream is sampled at 20000 Hz'
     fast.wait(lambda: said in fast.status('model')['message'], 5, said)
     send(fast, blocks(500, 1000))
-    t, y = heard(fast, 'prediction', since['prediction'] + 10, 5)
+    _, y = heard(fast, 'prediction', since['prediction'] + 10, 5)
     _, v = sine(1500)
     whole = model_of(paper()).stream().process(v, np.arange(1500) / FS)
     np.testing.assert_array_equal(y, whole[1000:])

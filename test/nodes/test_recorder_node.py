@@ -34,7 +34,7 @@ from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
 from piezo_ident.wire_format import Samples
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 import yaml
@@ -60,7 +60,7 @@ class Source:
             for name in ('voltage', 'displacement')
         ]
         self.sent: list[float] = []
-        self.raw: list[tuple[bytes, bytes]] = []
+        self.messages: list[list[Float64MultiArray]] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._send, daemon=True)
 
@@ -79,7 +79,7 @@ class Source:
             messages = [to_message(s) for s in pair(k)]
             for publisher, message in zip(self.publishers, messages, strict=True):
                 publisher.publish(message)
-            self.raw.append(tuple(serialize_message(m) for m in messages))
+            self.messages.append(messages)
             self.sent.append(time.monotonic())
             k += 1
 
@@ -100,11 +100,15 @@ def contents(path: Path | str) -> dict[str, list[bytes]]:
     return found
 
 
+def arrays(found: list[bytes]) -> list[Float64MultiArray]:
+    return [deserialize_message(raw, Float64MultiArray) for raw in found]
+
+
 def test_record_stop_and_refusals(tmp_path):
     with Graph() as g:
         source = Source(g, '/a')
         model = g.node.create_publisher(String, '/a/model', LATCHED)
-        model.publish(String(data='before the recorder'))
+        model.publish(String(data='the first'))
         g.start('recorder', {'output': str(tmp_path / 'bag'), 'sample_rate': RATE}, 'a')
         assert g.call('a/recorder/stop') == (False, 'not recording; call start first')
         path = start(g, tmp_path, 'a/recorder')
@@ -140,13 +144,13 @@ def test_record_stop_and_refusals(tmp_path):
         assert 'cannot be written' in message
         g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), what='diagnostics')
     got = contents(tmp_path / 'bag')
-    assert got['/a/voltage'] == [v for v, _ in source.raw]
-    assert got['/a/displacement'] == [y for _, y in source.raw]
-    assert got['/a/model'] == [serialize_message(String(data='before the recorder'))]
-    assert got['/a/residual'] == [serialize_message(to_message(pair(0)[1]))]
+    assert arrays(got['/a/voltage']) == [v for v, _ in source.messages]
+    assert arrays(got['/a/displacement']) == [y for _, y in source.messages]
+    assert [deserialize_message(m, String).data for m in got['/a/model']] == ['the first']
+    assert arrays(got['/a/residual']) == [to_message(pair(0)[1])]
     record = read_bag(tmp_path / 'bag')
     n = BLOCK * len(source.sent)
-    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * np.arange(n) / RATE))
+    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * (np.arange(n) / RATE)))
     assert (record.n, record.faults) == (n, ())
     assert record.pieces[0].sample_rate == RATE
     info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
