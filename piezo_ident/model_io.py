@@ -222,9 +222,8 @@ def _refuse_unknown(unknown: list[str], known: Collection[str], where: str, name
         return
     meant = list(dict.fromkeys(filter(None, (_meant(key, known) for key in unknown))))
     cure = f'did you mean {", ".join(meant)}?' if meant else f'it knows {", ".join(known)}'
-    plural = 's' if len(unknown) > 1 else ''
     listed = ', '.join(key[:40] for key in unknown[:8])
-    raise ModelError(f'{name}: unknown key{plural} {listed}{where}; {cure}')
+    raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
 
 
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:

@@ -148,13 +148,13 @@ def test_unknown_keys_are_named():
 @pytest.mark.parametrize(
     ('part', 'key', 'said'),
     [
-        ('input', 'v', 'unknown key v in input; did you mean'),
-        ('output', 'y', 'unknown key y in output; did you mean'),
-        ('delay', 'sample', 'unknown key sample in delay; did you mean samples?'),
-        ('hysteresis', 'wieghts', 'unknown key wieghts in hysteresis; did you mean weights?'),
-        ('hysteresis', 'P1', 'unknown key P1 in hysteresis; did you mean p1?'),
+        ('input', 'v', 'unknown keys v in input; did you mean'),
+        ('output', 'y', 'unknown keys y in output; did you mean'),
+        ('delay', 'sample', 'unknown keys sample in delay; did you mean samples?'),
+        ('hysteresis', 'wieghts', 'unknown keys wieghts in hysteresis; did you mean weights?'),
+        ('hysteresis', 'P1', 'unknown keys P1 in hysteresis; did you mean p1?'),
         ('hysteresis', 'zzz', 'it knows thresholds, weights, p1, p2'),
-        ('dynamics', 3, 'unknown key 3 in dynamics; it knows a, b'),
+        ('dynamics', 3, 'unknown keys 3 in dynamics; it knows a, b'),
     ],
 )
 def test_unknown_keys_inside_are_named(part, key, said):
@@ -173,7 +173,7 @@ def test_misspelt_keys_are_named_before_what_they_leave_out():
         model_from_dict(d)
     d = data()
     d['dynmics'] = d.pop('dynamics')
-    with pytest.raises(ModelError, match=r'unknown key dynmics; did you mean dynamics\?'):
+    with pytest.raises(ModelError, match=r'unknown keys dynmics; did you mean dynamics\?'):
         model_from_dict(d)
     d = data()
     d['effects'][0]['paramters'] = d['effects'][0].pop('parameters')

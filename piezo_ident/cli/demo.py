@@ -125,6 +125,8 @@ def _on_the_graph(out: Path, console: Console) -> tuple[Identification, tuple[Si
         '   live, replayed from the bag, read from the bag: the largest relative difference of a '
         f'parameter is {run.difference:.1e}'
     )
+    if run.lost:
+        console.say(f'   {run.lost} samples were lost on the way: this machine was too busy')
     for line in run.unclean or ('all nodes ended cleanly',):
         console.say(f'   {line}')
     _keep(run.found, out / 'stage_paper', console, run.record)

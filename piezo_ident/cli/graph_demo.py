@@ -30,6 +30,7 @@ import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
+from piezo_ident.bridging import bridged
 from piezo_ident.cli.console import Console
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.identification import identify
@@ -62,6 +63,8 @@ class GraphRun:
         Errors of the live prediction.
     difference : float
         Largest relative difference of a parameter between live, replayed and offline model.
+    lost : int
+        Samples of the live prediction that did not arrive.
     unclean : tuple of str
         Nodes that did not end with exit code 0.
     """
@@ -70,6 +73,7 @@ class GraphRun:
     record: Record
     sines: tuple[SineError, ...]
     difference: float
+    lost: int
     unclean: tuple[str, ...]
 
 
@@ -169,24 +173,26 @@ def _session(nodes: Nodes, client: Client, folder: Path, console: Console) -> Gr
     with console.progress() as progress:
         found = identify(record, Settings(), progress=progress)
     difference = max(largest_difference(live, m) for m in (replayed, found.model))
-    sines = _live_errors(folder / 'validation', live)
+    sines, lost = _live_errors(folder / 'validation', live)
     unclean = tuple(f'{name}: exit code {code}' for name, code in codes.items() if code != 0)
-    return GraphRun(found, record, sines, difference, unclean)
+    return GraphRun(found, record, sines, difference, lost, unclean)
 
 
-def _live_errors(bag: Path, model: StageModel) -> tuple[SineError, ...]:
-    """Return the errors of what the model node predicted while the stage moved."""
+def _live_errors(bag: Path, model: StageModel) -> tuple[tuple[SineError, ...], int]:
+    """Return the errors of what the model node predicted live, and how many samples were lost."""
     measured, predicted = read_record(bag), read_record(bag, displacement_topic='/prediction')
-    static = model.without_dynamics()
-    runs = []
-    for piece, other in zip(measured, predicted, strict=True):
-        # the first blocks may have passed before the model node was ready for them
-        late = round((other.start_time - piece.start_time) * piece.sample_rate)
-        n = min(piece.n - late, other.n)
-        y_static = static.predict_piece(piece)
-        part = piece.cut(late, late + n)
-        runs.append(FreeRun(bag.name, part, other.y[:n], y_static[late : late + n]))
-    return sines_of(runs)
+    part = max(bridged(measured), key=lambda p: p.piece.n)
+    piece = part.piece
+    ticks = np.round((np.concatenate([p.t for p in predicted]) - piece.start_time) / piece.dt)
+    y_hat = np.full(piece.n, np.nan)
+    inside = (ticks >= 0) & (ticks < piece.n)
+    y_hat[ticks[inside].astype(np.int64)] = np.concatenate([p.y for p in predicted])[inside]
+    both = part.sound & np.isfinite(y_hat)
+    # what was lost on the way is left out of the comparison, on both sides alike
+    y_hat = np.where(both, y_hat, piece.y)
+    y_static = np.where(both, model.without_dynamics().predict_piece(piece), piece.y)
+    run = FreeRun(bag.name, piece, y_hat, y_static)
+    return sines_of([run]), int(piece.n - both.sum())
 
 
 def _ask(client: Client, service: str) -> None:
