@@ -147,8 +147,8 @@ def _stretches(
             elif same_time.any():
                 at = t[start:overlap][same_time][0]
                 raise DataError(
-                    f'{name}: two different samples at t = {at:.9g} s; keep one of them, or '
-                    'write t with more decimals'
+                    f'{name}: two different samples at t = {at:.9g} s; write t with more '
+                    'decimals, or keep one of them'
                 )
             else:
                 raise DataError(

@@ -28,7 +28,7 @@ from piezo_ident.dynamics import Dynamics
 from piezo_ident.metrics import FORMULA
 from piezo_ident.model_io import plain
 from piezo_ident.record import Record
-from piezo_ident.results import DelayResult, DynamicsResult, Identification, Steps
+from piezo_ident.results import DelayResult, DynamicsResult, ErrorRow, Identification, Steps
 from piezo_ident.validation import FreeRun, sines_of
 
 __all__ = [
@@ -135,6 +135,13 @@ def length(metres: float) -> str:
         if abs(metres) >= limit:
             return f'{number(metres * factor, 4)} {unit}'
     return f'{number(metres * 1e9, 4)} nm'
+
+
+def fit_share(row: ErrorRow) -> str:
+    """Return the NRMSE fit of a row, a dash where the stage rests."""
+    # there is nothing but noise to explain, and a good model looks like a bad one
+    rests = row.segment.partition(':')[0] == 'idle' or math.isinf(row.fit)
+    return share(math.nan if rests else row.fit)
 
 
 def verdict(identification: Identification) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.metrics import FORMULA
 from piezo_ident.record import Record
-from piezo_ident.report.numbers import KINDS, length, modes, moves, number, share
+from piezo_ident.report.numbers import fit_share, KINDS, length, modes, moves, number
 from piezo_ident.results import Identification
 from piezo_ident.validation import SineError
 
@@ -114,7 +114,7 @@ def error_tables(identification: Identification, sines: Sequence[SineError]) -> 
                     row.data,
                     number(row.percent),
                     number(row.static_percent),
-                    share(row.fit),
+                    fit_share(row),
                     str(row.n),
                 )
                 for row in rows

@@ -17,13 +17,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-import math
 import textwrap
 
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
-from piezo_ident.report.numbers import KINDS, length, moves, number, share, verdict
-from piezo_ident.results import ErrorRow, Identification
+from piezo_ident.report.numbers import fit_share, KINDS, length, moves, number, verdict
+from piezo_ident.results import Identification
 from piezo_ident.validation import sine_errors, SineError
 
 __all__ = ['error_table_for_sines', 'table_one', 'text_summary']
@@ -128,7 +127,7 @@ def text_summary(identification: Identification) -> str:
                         f'{name}, {kind}',
                         number(row.percent),
                         number(row.static_percent),
-                        _fit(row),
+                        fit_share(row),
                         str(row.n),
                     ]
                 )
@@ -138,12 +137,6 @@ def text_summary(identification: Identification) -> str:
     for said in identification.warnings:
         lines += _item(f'warning: {printable(said)}')
     return '\n'.join(lines)
-
-
-def _fit(row: ErrorRow) -> str:
-    # at rest there is nothing but noise to explain, and a good model looks like a bad one
-    rests = row.segment.partition(':')[0] == 'idle' or math.isinf(row.fit)
-    return share(math.nan if rests else row.fit)
 
 
 def _item(text: str) -> list[str]:
