@@ -9,7 +9,7 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
-.PHONY: demo test lint pytest test-jazzy bench study-identification colcon clean distclean
+.PHONY: demo test lint pytest test-graph test-jazzy bench study-identification colcon clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -23,11 +23,15 @@ lint: .venv/.test
 	.venv/bin/mypy
 
 pytest: .venv/.test
-	.venv/bin/pytest $(PYTEST_ARGS)
+	.venv/bin/pytest --ignore=test/nodes $(PYTEST_ARGS)
+
+# node processes over DDS; they mind what else the machine is doing
+test-graph: .venv/.graph
+	.venv/bin/pytest test/nodes $(PYTEST_ARGS)
 
 # the same tests on the versions that Jazzy stands on
 test-jazzy: .venv-jazzy/.test
-	.venv-jazzy/bin/pytest -p no:cacheprovider $(PYTEST_ARGS)
+	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
 
 bench: .venv/.demo
 	.venv/bin/python benchmarks/bench_prediction.py
@@ -45,9 +49,10 @@ colcon: .venv/.colcon
 
 # one environment, more of it as it is asked for
 .venv/.demo: EXTRAS := [ros]
-.venv/.test: EXTRAS := [ros,test]
+.venv/.test: EXTRAS := [test]
+.venv/.graph: EXTRAS := [ros,test]
 .venv/.colcon: EXTRAS := [colcon]
-.venv-jazzy/.test: EXTRAS := [ros,test]
+.venv-jazzy/.test: EXTRAS := [test]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
 
 .venv-jazzy/.test: constraints-jazzy.txt
@@ -56,7 +61,7 @@ colcon: .venv/.colcon
 	$(PYTHON) -m venv --clear $(@D)
 	touch $@
 
-.venv/.demo .venv/.test .venv/.colcon: .venv/.made $(DECLARED)
+.venv/.demo .venv/.test .venv/.graph .venv/.colcon: .venv/.made $(DECLARED)
 	.venv/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
 	touch $@
 

@@ -143,7 +143,9 @@ def _begins(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))
 
 
-def refuse_incomplete(record: Record, most: float = MAX_MISSING) -> None:
+def refuse_incomplete(
+    record: Record, sent: Mapping[str, float] | None = None, most: float = MAX_MISSING
+) -> None:
     """
     Refuse a record that lost too much of what the three steps stand on.
 
@@ -152,6 +154,9 @@ def refuse_incomplete(record: Record, most: float = MAX_MISSING) -> None:
     Parameters
     ----------
     record : Record
+    sent : mapping of str to float, optional
+        Time [s] of each kind of segment in the voltage: also what is missing at either end of
+        the record is then seen.
     most : float, optional
         Share of the segments of a kind that may be missing.
 
@@ -169,6 +174,7 @@ def refuse_incomplete(record: Record, most: float = MAX_MISSING) -> None:
         for kind in set(sides) & set(NEEDED):
             missing[kind] += gap
     for kind in NEEDED:
+        missing[kind] = max(missing[kind], (sent or {}).get(kind, 0.0) - present[kind])
         whole = present[kind] + missing[kind]
         if missing[kind] > most * whole:
             raise DataError(
@@ -250,6 +256,18 @@ class Snapshot:
         if not streams.get(APPLIED, streams['voltage']).n:
             del streams[APPLIED]
         return record_of_streams(streams, name=name, tolerance=self.tolerance, faults=self.faults)
+
+    def sent(self) -> dict[str, float]:
+        """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
+        stream = self.streams['voltage']
+        t = stream.rows[:, 0]
+        names, starts = stream.labels(np.arange(t.size))
+        times: dict[str, list[NDArray[np.float64]]] = {}
+        for name, start, stop in zip(names, starts, [*starts[1:], t.size], strict=True):
+            times.setdefault(name.partition(':')[0], []).append(t[start:stop])
+        step = np.diff(t)
+        period = float(np.median(step[step > 0.0])) if np.any(step > 0.0) else 0.0
+        return {kind: period * np.unique(np.concatenate(x)).size for kind, x in times.items()}
 
 
 class Capture:

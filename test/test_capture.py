@@ -240,5 +240,15 @@ def test_too_much_missing_in_a_segment_is_refused(record):
         refuse_incomplete(capture_of(edge).record())
 
 
+def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
+    late = without(blocks_of(record), *(('displacement', k) for k in range(30)))
+    snapshot = capture_of(late).snapshot()
+    refuse_incomplete(snapshot.record())
+    assert snapshot.sent() == pytest.approx({'step': 0.25, 'noise': 0.35, 'triangle': 0.4})
+    with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step segments are missing'):
+        refuse_incomplete(snapshot.record(), snapshot.sent())
+
+
 def test_runs_that_follow_each_other_miss_nothing(record):
-    refuse_incomplete(capture_of([*blocks_of(record), *blocks_of(record)]).record())
+    snapshot = capture_of([*blocks_of(record), *blocks_of(record)]).snapshot()
+    refuse_incomplete(snapshot.record(), snapshot.sent())

@@ -165,7 +165,8 @@ def _session(nodes: Nodes, client: Client, folder: Path, console: Console) -> Gr
     _ask(client, 'replay/player/start')
     _follow(nodes, client, console, 'replay/player', 'replay', 60.0)
     _ask(client, 'replay/identifier/identify')
-    client.wait(lambda: bool(again), 60.0, 'the model from the replay', nodes.check)
+    _follow(nodes, client, console, 'replay/identifier', 'replayed', 60.0)
+    client.wait(lambda: bool(again), 10.0, 'the model from the replay', nodes.check)
     replayed = _model(again[-1], 'the replayed model')
     codes = nodes.stop()
 

@@ -59,6 +59,8 @@ class Drive:
         On which clients and subscription are made.
     streams : callable
         Returns the `Streams` as they are.
+    missing : callable
+        Returns the topics to which nobody publishes yet, for people; empty when all is there.
     begin : callable
         Called right before the excitation is asked to start.
     ended : callable
@@ -69,10 +71,12 @@ class Drive:
         self,
         node: Node,
         streams: Callable[[], Streams],
+        missing: Callable[[], str],
         begin: Callable[[], None],
         ended: Callable[[str | None], None],
     ) -> None:
-        self._streams, self._begin, self._ended = streams, begin, ended
+        self._streams, self._missing = streams, missing
+        self._begin, self._ended = begin, ended
         self._set = node.create_client(SetParameters, 'excitation/set_parameters')
         self._start = node.create_client(Trigger, 'excitation/start')
         self._stop = node.create_client(Trigger, 'excitation/stop')
@@ -137,11 +141,15 @@ class Drive:
         return time.monotonic() - self._sign > self._limit
 
     def _finding(self) -> None:
-        if self._set.service_is_ready() and self._start.service_is_ready():
+        ready = self._set.service_is_ready() and self._start.service_is_ready()
+        missing = self._missing() if ready else ''
+        if ready and not missing:
             parameter = Parameter('program', value=self._program).to_parameter_msg()
             request = SetParameters.Request(parameters=[parameter])
             self._phase, self._sign = 'setting', time.monotonic()
             self._future = self._set.call_async(request)
+        elif missing and self._silent():
+            self._end(f'nobody publishes {missing} within {self._limit:g} s; start the stage')
         elif self._silent():
             self._end(
                 f"no excitation offers '{self._start.srv_name}' within {self._limit:g} s; start "

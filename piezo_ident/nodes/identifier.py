@@ -70,11 +70,12 @@ class IdentifierNode(LabNode):
         self._passed: dict[str, int] = {}
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
+        self._heard: dict[str, Any] = {}
         for key in ('voltage', 'displacement', APPLIED):
             self._listen(key, key)
         for topic in self.values['channels'].split():
             self._listen(topic, '')
-        self._drive = Drive(self, self._streams, self._begin_run, self._run_ended)
+        self._drive = Drive(self, self._streams, self._unheard, self._begin_run, self._run_ended)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
         self.offer('run', self._run)
@@ -89,7 +90,8 @@ class IdentifierNode(LabNode):
 
     def _listen(self, topic: str, key: str) -> None:
         take = functools.partial(self._take, topic, key)
-        self.create_subscription(Float64MultiArray, topic, take, STREAM)
+        subscription = self.create_subscription(Float64MultiArray, topic, take, STREAM)
+        self._heard[topic] = subscription
 
     def _take(
         self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
@@ -116,6 +118,14 @@ class IdentifierNode(LabNode):
             c.last_time('voltage'),
             self._passed.get('displacement', 0),
             c.last_time('displacement'),
+        )
+
+    def _unheard(self) -> str:
+        # what is sent before publisher and subscription have met is lost
+        return ', '.join(
+            topic
+            for topic, subscription in self._heard.items()
+            if topic not in ('voltage', APPLIED) and not subscription.get_publisher_count()
         )
 
     # state

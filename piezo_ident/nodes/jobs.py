@@ -117,7 +117,7 @@ def identify_job(
         tick('record', 0.0)
         record = snapshot.record('capture')
         tick('record', 0.01)
-        refuse_incomplete(record)
+        refuse_incomplete(record, snapshot.sent())
         records = [record]
         if which in ('delay', 'dynamics'):
             if which == 'delay':

@@ -387,9 +387,15 @@ def test_run_without_an_excitation_fails_with_the_reason(course):
     assert "no excitation offers 'excitation/start' within 1 s" in end['message']
 
 
+def test_run_without_a_stage_fails_with_the_reason(course):
+    course.start('excitation', params={'rate_factor': 4.0, 'subscribers': 2})
+    end = finish(course, 'identifier/run', 5)
+    assert end['state'] == 'failed'
+    assert 'nobody publishes displacement within 1 s' in end['message']
+
+
 def test_run_drives_the_excitation_and_identifies(course):
     course.start('stage', params={'seed': 3})
-    course.start('excitation', params={'rate_factor': 4.0, 'subscribers': 2})
     assert course.set('identifier', 'excitation_limit', 5.0)[0]
     assert course.set('identifier', 'program', 'nonsense')[0]
     end = finish(course, 'identifier/run', 10)
