@@ -28,7 +28,7 @@ import time
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.errors import ConfigError
+from piezo_ident.errors import ConfigError, PiezoIdentError
 from piezo_ident.identification import identify
 from piezo_ident.metrics import FORMULA
 from piezo_ident.nodes.starter import rclpy_is_there
@@ -99,7 +99,15 @@ def demo(out: Path, asked: Path | None, console: Console) -> None:
 
 def _paper_stage(out: Path, console: Console) -> None:
     console.say("1. The paper's stage, simulated, identified from voltage and displacement alone")
-    found, sines = _on_the_graph(out, console) if rclpy_is_there() else _offline(out, console)
+    if rclpy_is_there():
+        try:
+            found, sines = _on_the_graph(out, console)
+        except PiezoIdentError as error:
+            console.say(f'   the graph did not get through: {error}')
+            found, sines = _offline(out, console)
+    else:
+        console.say('   without ROS: rclpy is not here')
+        found, sines = _offline(out, console)
     console.say(text_summary(found))
     console.say()
     console.say(f'Sines over the full range, not fitted: {FORMULA}, in %')
@@ -134,7 +142,7 @@ def _on_the_graph(out: Path, console: Console) -> tuple[Identification, tuple[Si
 
 
 def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
-    console.say('   without ROS (rclpy is not here): the same, without nodes')
+    console.say('   the same, without nodes')
     stage = load_stage(find_config('stage_paper', 'stage'))
     record = _play(stage, 'identification', 1)
     found = _identify('ten thresholds', record, Settings(), console)
