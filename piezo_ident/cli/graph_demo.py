@@ -123,6 +123,8 @@ def _session(nodes: Nodes, client: Client, folder: Path, console: Console) -> Gr
     for node in ('stage', 'excitation', 'identifier', 'model', 'recorder'):
         client.follow(node)
     nodes.start('stage')
+    # early, so that it has met everybody when its turn comes
+    nodes.start('identifier', namespace='replay')
     nodes.start('identifier', parameters={'output': str(folder / 'live')})
     nodes.start('model')
     nodes.start('recorder', parameters={'output': str(folder / 'identification')})
@@ -156,11 +158,10 @@ def _session(nodes: Nodes, client: Client, folder: Path, console: Console) -> Gr
     for node in ('replay/identifier', 'replay/player'):
         client.follow(node)
     again = client.listen('replay/model')
-    nodes.start('identifier', namespace='replay')
     nodes.start(
         'player',
         namespace='replay',
-        parameters={'bag': str(folder / 'identification'), 'rate': 3.0},
+        parameters={'bag': str(folder / 'identification'), 'rate': 2.0},
     )
     _ask(client, 'replay/player/start')
     _follow(nodes, client, console, 'replay/player', 'replay', 60.0)
