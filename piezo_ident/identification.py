@@ -49,6 +49,7 @@ from piezo_ident.results import (
     ErrorRow,
     Identification,
     Progress,
+    rms_percent,
     Settings,
     silent,
     Steps,
@@ -308,7 +309,11 @@ def _unlabelled(
     fitted_error = [row for row in rows if row.data == 'fitted' and row.record == run.record]
     held_error = [row for row in rows if row.data == 'held out' and row.record == run.record]
     # a record without noise may be fitted exactly
-    ratio = _rms(held_error) / max(_rms(fitted_error), 1e-9) if fitted_error and held_error else 0
+    ratio = (
+        rms_percent(held_error) / max(rms_percent(fitted_error), 1e-9)
+        if fitted_error and held_error
+        else 0
+    )
     if ratio > 3.0:
         said.append(
             f'the held-out error is {ratio:.1f} times the fitted one: '
@@ -368,11 +373,6 @@ def _judged(result: Identification, pieces: Sequence[Piece]) -> list[str]:
 
 def _key(run: Run) -> tuple[str, float]:
     return run.record, run.piece.start_time
-
-
-def _rms(rows: Sequence[ErrorRow]) -> float:
-    n = sum(row.n for row in rows)
-    return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / n))
 
 
 def errors_of(

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +38,7 @@ __all__ = [
     'Progress',
     'Settings',
     'Steps',
+    'rms_percent',
     'silent',
 ]
 
@@ -229,6 +230,12 @@ class ErrorRow:
     data: str
 
 
+def rms_percent(rows: Sequence[ErrorRow]) -> float:
+    """Return the error over some rows together, weighted by samples; NaN without rows."""
+    n = sum(row.n for row in rows)
+    return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / n)) if n else float('nan')
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
     """
@@ -285,7 +292,4 @@ class Identification:
             for row in self.errors
             if row.data == data and row.segment.partition(':')[0] not in easy
         ]
-        if not rows:
-            return float('nan')
-        total = sum(row.n for row in rows)
-        return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / total))
+        return rms_percent(rows)
