@@ -65,6 +65,8 @@ GAIN = 0.005
 WARM_UP = 2000
 #: candidates that are refined and judged again
 CANDIDATES = 5
+#: what is slower than this is creep, not dynamics: it is filtered out before G is refined [Hz]
+SLOWEST = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,5 +359,9 @@ def _stretches(
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]
             part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
-            stretches.append(Stretch(delay.apply(H(run.u))[part], run.x[part], use[part]))
+            w, y = delay.apply(H(run.u))[part], run.x[part]
+            # both sides pass the same filter, so G is still what leads from one to the other
+            sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
+            w, y = signal.sosfilt(sos, w - w[0]), signal.sosfilt(sos, y - y[:20].mean())
+            stretches.append(Stretch(w, y, use[part]))
     return stretches

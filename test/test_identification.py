@@ -23,7 +23,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.identification import identify
-from piezo_ident.model import Scaling
+from piezo_ident.model import EffectSetting, Scaling
 from piezo_ident.model_io import load_model, model_from_dict, model_to_dict, save_model
 from piezo_ident.program import load_program, parse_program
 from piezo_ident.record import Piece, Record, Segment
@@ -483,3 +483,14 @@ def test_faults_of_a_file_become_warnings():
     )
     result = identify(short(stage), QUICK)
     assert any('clipping' in w for w in result.warnings)
+
+
+def test_creep_does_not_become_dynamics():
+    """Slow poles that stand for creep halved G at 80 Hz before slow motion was filtered out."""
+    setting = EffectSetting('creep', {'gain': [0.012] * 3, 'time_constant': [0.1, 1.0, 10.0]})
+    crept = replace(PAPER, model=replace(PAPER.model, effects=(setting,)))
+    record = simulate(crept, FULL.build(), np.random.default_rng(1), 'crept')
+    G = identify(record, QUICK).model.dynamics
+    f = np.array([10.0, 80.0, 300.0])
+    true = np.abs(PAPER.model.dynamics.normalised().response(f, 20_000.0))
+    np.testing.assert_allclose(np.abs(G.response(f, 20_000.0)), true, rtol=0.01)
