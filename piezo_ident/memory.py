@@ -127,7 +127,9 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
             # the play follows its start only while neither bound has caught it
             moved = np.clip(m, np.minimum(top - r, bottom), bottom)
             free = ((np.abs(moved - m) < 1e-12) & (top - r < bottom)).astype(np.float64)
-            filtered = filter_arx(model.dynamics.a, model.dynamics.b, model.delay.apply(free))
+            filtered = filter_arx(
+                model.dynamics.a, model.dynamics.b, model.total_delay.apply(free)
+            )
             columns.append(q * filtered[keep])
         J = np.array(columns).T
         pull = np.sqrt(PULL * e.size) * np.maximum(h.weights, 1e-3)

@@ -191,7 +191,8 @@ class StageModel:
         """
         in_slot: dict[str, list[EffectSetting]] = {}
         for setting in self.effects:
-            in_slot.setdefault(setting.slot, []).append(setting)
+            if not find_effect(setting.name).in_delay_line:
+                in_slot.setdefault(setting.slot, []).append(setting)
 
         def make(slot: str) -> list[Operator]:
             return [
@@ -207,11 +208,33 @@ class StageModel:
                 core,
                 *make('hidden'),
                 DynamicsOperator(self.dynamics),
-                DelayOperator(self.delay),
+                DelayOperator(self.total_delay),
                 *make('output'),
                 *make('acquisition'),
             )
         )
+
+    @property
+    def total_delay(self) -> Delay:
+        """
+        The delay line of the chain: the identified delay, and what effects change of it.
+
+        Raises
+        ------
+        ModelError
+            When that is less than none.
+        """
+        added = sum(find_effect(s.name).added_delay(s.parameters) for s in self.effects)
+        if added == 0.0:
+            return self.delay
+        total = self.delay.total + added
+        if total < 0.0:
+            raise ModelError(
+                f'model: a delay of {self.delay.total:g} samples cannot change by {added:g}; '
+                'no stage answers before its command'
+            )
+        whole = int(total)
+        return Delay(whole, total - whole)
 
     def stream(self, memory: ArrayLike | None = None) -> Stream:
         """Return a run of this model that takes the voltage block by block."""

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.dynamics import Delay, Dynamics
-from piezo_ident.effects import catalogue
+from piezo_ident.effects import catalogue, View
 from piezo_ident.errors import ModelError
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.model import CHUNK, EffectSetting, Scaling, StageModel
@@ -36,18 +36,30 @@ ROOT = Path(__file__).resolve().parents[1]
 PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
 
 
+#: what effects may know of the signals of this file
+VIEW = View(
+    sample_rate=FS,
+    low=0.0,
+    high=1.0,
+    speeds=np.linspace(10.0, 60.0, 8),
+    duration=1.0,
+    channels={'other_axis': (0.0, 1.0)},
+    lines=(50.0,),
+    modes=tuple(PAPER.dynamics.modes(FS)),
+    thresholds=PAPER.hysteresis.thresholds,
+)
+
+
 def inside(effect) -> dict:
     """Return a setting of any effect away from its neutral values, from what it declares."""
-    values = {}
-    for p in effect.parameters:
-        low, high = p.lower, p.upper
-        if np.isfinite(p.neutral):
-            # a hundredth of what is declared, but never far out
-            to = high if p.neutral < high else low
-            x = p.neutral + np.sign(to - p.neutral) * min(0.01, 0.01 * abs(to - p.neutral))
+    trial = effect.trials(VIEW)[0]
+    values = dict(trial.values)
+    for (name, index), step in zip(trial.moves, trial.steps, strict=True):
+        if index is None:
+            values[name] = values[name] + 3 * step
         else:
-            x = max(low, min(high, 1.0))
-        values[p.name] = [x] if p.vector else x
+            values[name] = np.array(values[name])
+            values[name][index] += 3 * step
     return values
 
 
@@ -75,10 +87,13 @@ def test_streamed_is_batch_with_every_effect_of_the_catalogue(cuts, names, d, fr
         effects=tuple(EffectSetting(name, EVERY[name]) for name in names),
     )
     v = long_signal(4000)
-    record = Record((Piece(v, np.zeros(v.size), FS),))
+    other = np.sin(np.arange(v.size) / 50)
+    record = Record((Piece(v, np.zeros(v.size), FS, channels={'other_axis': other}),))
     (batch,) = model.predict(record).pieces
-    stream = model.stream()
-    parts = [stream.process(v[a:b]) for a, b in pairwise([0, *sorted(cuts), v.size])]
+    stream, edges = model.stream(), [0, *sorted(cuts), v.size]
+    parts = [
+        stream.process(v[a:b], channels={'other_axis': other[a:b]}) for a, b in pairwise(edges)
+    ]
     assert_allclose(np.concatenate(parts), batch, rtol=0, atol=1e-12 * 75e-6)
     assert np.all(np.isfinite(batch))
 

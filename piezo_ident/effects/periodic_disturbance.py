@@ -20,8 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, Parameter
-from piezo_ident.errors import ModelError
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
 
 __all__ = ['PeriodicDisturbance']
 
@@ -42,22 +41,48 @@ class PeriodicDisturbance(Effect):
 
     name: ClassVar[str] = 'periodic_disturbance'
     slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = (
+        'lines in the displacement, from the mains or a machine; 0.01 .. 0.2 % of stroke'
+    )
+    needs: ClassVar[str] = 'an idle stretch of 2 s, or motion at frequencies other than the lines'
+    time_driven: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('frequency', 'Hz', 'base frequency f', float('nan'), 1e-3, 1e6),
-        Parameter('harmonic', '1', 'multiple m_i of f', float('nan'), 1.0, 1e3, vector=True),
-        Parameter('amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, vector=True),
-        Parameter('phase', 'rad', 'phase phi_i of each', float('nan'), -1e3, 1e3, vector=True),
+        Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='log'),
+        Parameter('harmonic', '1', 'multiple m_i of f', NAN, 1.0, 1e3, True, scale='fixed'),
+        Parameter(
+            'amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, True, default=0.0, step=1e-3
+        ),
+        Parameter(
+            'phase',
+            'rad',
+            'phase phi_i of each',
+            NAN,
+            -1e3,
+            1e3,
+            True,
+            default=0.0,
+            scale='fixed',
+        ),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
         self._lines = [self.array(name) for name in ('harmonic', 'amplitude', 'phase')]
-        sizes = {x.size for x in self._lines}
-        if len(sizes) > 1:
-            raise ModelError(
-                'effect periodic_disturbance: harmonic, amplitude and phase differ in length; '
-                'give one of each a line'
-            )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return one trial a line, with up to three harmonics as sine and cosine."""
+        found = []
+        for f in view.lines:
+            harmonics = [m for m in (1.0, 2.0, 3.0) if m * f < view.nyquist]
+            if f > 0 and harmonics:
+                shape = {
+                    'frequency': f,
+                    'harmonic': np.repeat(harmonics, 2),
+                    'phase': np.tile([0.0, np.pi / 2], len(harmonics)),
+                }
+                found.append(cls.trial(shape))
+        return tuple(found)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the mean of the disturbance is zero."""
@@ -68,5 +93,6 @@ class PeriodicDisturbance(Effect):
         y = block.x.copy()
         turn = 2 * np.pi * self.number('frequency')
         for m, amplitude, phase in zip(*self._lines, strict=True):
-            y += amplitude * np.sin(turn * m * block.t + phase)
+            if amplitude != 0.0:
+                y += amplitude * np.sin(turn * m * block.t + phase)
         return block.with_signal(y)

@@ -20,8 +20,8 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.block import Block, Operator, Slot
-from piezo_ident.effects.base import Effect, Parameter
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
 from piezo_ident.hysteresis import HysteresisOperator
 from piezo_ident.kernel import kernel
 
@@ -33,7 +33,11 @@ def _widened(
     v: NDArray[np.float64],
     r: NDArray[np.float64],
     q: NDArray[np.float64],
-    growth: NDArray[np.float64],
+    power: NDArray[np.float64],
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
     memory: NDArray[np.float64],
     still: NDArray[np.float64],
     out: NDArray[np.float64],
@@ -42,7 +46,9 @@ def _widened(
     n_r = r.size
     for k in range(v.size):
         x = v[k]
-        more = growth[k]
+        more = gain * power[k]
+        wide = 1.0 + stretch * power[k]
+        ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
         w = 0.0
         for i in range(n_r):
             low = x - r[i]
@@ -50,9 +56,12 @@ def _widened(
             g = x if g > x else g
             g = low if g < low else g
             still[i] = g
-            low = x - (r[i] + more)
+            width = r[i] * wide + more
+            low = x - (width if width > 0.0 else 0.0)
+            high = x + r[i] * ahead_wide + ahead
+            high = low if high < low else high
             f = memory[i]
-            f = x if f > x else f
+            f = high if f > high else f
             f = low if f < low else f
             memory[i] = f
             w += q[i] * (f - g)
@@ -78,11 +87,15 @@ class RateDependentHysteresis(Effect):
     """
     Prandtl-Ishlinskii plays whose thresholds grow with the speed of the input.
 
-    ``r_i(k) = r_i + beta |s(k)|^eps`` for every play of H, where ``s`` is the input's speed behind
-    a first-order low-pass.  The speed is filtered before its magnitude is taken, so that
-    converter steps and noise cancel instead of adding up.  Weights, p1 and p2 stay those of H;
-    what is added to the signal is the difference between the widened plays and the fixed ones,
-    so the effect stacks with others of its slot in any order.
+    ``r_i(k) = r_i (1 + sigma |s(k)|^eps) + beta |s(k)|^eps`` for every play of H, never below
+    zero, where ``s`` is the input's speed behind a first-order low-pass: beta makes all plays
+    wider by the same, sigma each in proportion to itself.  The band of a play of H reaches from
+    v - r to v; its upper edge may move out as well, to ``v + (lambda_0 + lambda_1 r_i)
+    |s(k)|^eps``, so that a band that widens evenly to both sides is a case of it.
+    The speed is filtered before its magnitude is taken, so that converter steps and noise cancel
+    instead of adding up.  Weights,
+    p1 and p2 stay those of H; what is added to the signal is the difference between the widened
+    plays and the fixed ones, so the effect stacks with others of its slot in any order.
 
     Notes
     -----
@@ -94,10 +107,53 @@ class RateDependentHysteresis(Effect):
 
     name: ClassVar[str] = 'rate_dependent_hysteresis'
     slot: ClassVar[Slot] = 'hysteresis'
+    description: ClassVar[str] = (
+        'loops that widen with speed; 10 .. 30 % a decade of frequency above 10 .. 50 Hz'
+    )
+    needs: ClassVar[str] = 'two amplitudes at one fast frequency, and a slow sweep'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('gain', 's^eps', 'growth beta of the thresholds with speed', 0.0, 0.0, 1.0),
-        Parameter('exponent', '1', 'power eps of the speed', float('nan'), 0.05, 2.0),
-        Parameter('cutoff', 'Hz', 'low-pass of the speed', float('nan'), 1.0, 1e5),
+        Parameter(
+            'gain',
+            's^eps',
+            'growth beta of the thresholds with speed',
+            0.0,
+            -1.0,
+            1.0,
+            default=0.0,
+            step=1e-5,
+        ),
+        Parameter('exponent', '1', 'power eps of the speed', NAN, 0.05, 2.0, scale='log'),
+        Parameter('cutoff', 'Hz', 'low-pass of the speed', NAN, 1e-3, 1e5, scale='log'),
+        Parameter(
+            'stretch',
+            's^eps',
+            'relative growth sigma of the thresholds',
+            0.0,
+            -1.0,
+            10.0,
+            default=0.0,
+            step=1e-4,
+        ),
+        Parameter(
+            'lead',
+            's^eps',
+            'growth lambda_0 of the upper edge with speed',
+            0.0,
+            -1.0,
+            1.0,
+            default=0.0,
+            step=1e-5,
+        ),
+        Parameter(
+            'lead_stretch',
+            's^eps',
+            'growth lambda_1 of the upper edge, in proportion to the threshold',
+            0.0,
+            -1.0,
+            10.0,
+            default=0.0,
+            step=1e-4,
+        ),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:
@@ -107,12 +163,24 @@ class RateDependentHysteresis(Effect):
         self._still = self._memory.copy()
         self._speed = np.zeros(2)
 
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return powers of the speed from 0.3 to 1.5, growth below alone and on both sides."""
+        if not np.any(view.thresholds > 0):
+            return ()
+        cutoff, found = min(view.sample_rate / 10, 2000.0), []
+        for exponent in (0.3, 0.5, 0.75, 1.0, 1.5):
+            unit = 1.0 / max(view.speed, *view.speeds) ** exponent
+            small, large = min(0.1, 2e-3 * unit), min(0.5, 1e-2 * unit)
+            steps = {'gain': small, 'stretch': large, 'lead': small, 'lead_stretch': large}
+            shape = {'exponent': exponent, 'cutoff': cutoff}
+            found += [cls.trial(shape, ['gain', 'stretch'], steps), cls.trial(shape, steps=steps)]
+        return tuple(found)
+
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: no speed, and the plays where H has them."""
         w = self.inner.reset(v0, x0)
-        plays: Operator = self.inner
-        while isinstance(plays, Effect):
-            plays = plays.inner
+        plays = self.core
         if isinstance(plays, HysteresisOperator):
             self._memory = plays.memory.copy()
         else:
@@ -125,8 +193,22 @@ class RateDependentHysteresis(Effect):
         """Return the block with H applied and its plays widened."""
         h, v = self.hysteresis, np.ascontiguousarray(block.x)
         speed = _low_pass(v, self._pole, self.sample_rate, self._speed)
-        growth = self.number('gain') * np.abs(speed) ** self.number('exponent')
+        power = np.abs(speed)
+        if self.number('exponent') != 1.0:
+            power **= self.number('exponent')
         more = np.empty(v.size)
-        _widened(v, h.thresholds, h.weights, growth, self._memory, self._still, more)
+        _widened(
+            v,
+            h.thresholds,
+            h.weights,
+            power,
+            self.number('gain'),
+            self.number('stretch'),
+            self.number('lead'),
+            self.number('lead_stretch'),
+            self._memory,
+            self._still,
+            more,
+        )
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)

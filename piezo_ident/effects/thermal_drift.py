@@ -20,7 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, Parameter
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
 
 __all__ = ['ThermalDrift']
 
@@ -32,7 +32,8 @@ class ThermalDrift(Effect):
     ``d(t) = b t + c (1 - exp(-t / tau))``: a steady drift, and a first-order approach to a new
     temperature, as after switching on.  Time is that of the sample clock, which starts with the
     record, and not the time since the last reset: a gap in a record does not stop the drift.
-    Before zero there is none.
+    Before zero there is none.  Rate and size hold for one record: what drifts in another, or after
+    the end, does not follow from them.
 
     Notes
     -----
@@ -42,11 +43,45 @@ class ThermalDrift(Effect):
 
     name: ClassVar[str] = 'thermal_drift'
     slot: ClassVar[Slot] = 'output'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0),
-        Parameter('amplitude', '1', 'final size c of the approach', 0.0, -1.0, 1.0),
-        Parameter('time_constant', 's', 'tau of the approach', float('nan'), 1e-3, 1e7),
+    description: ClassVar[str] = (
+        'displacement that grows with time whatever the voltage does; 1 .. 100 nm/min'
     )
+    needs: ClassVar[str] = 'idle stretches at one voltage at the start and at the end'
+    time_driven: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0, default=0.0, step=1e-4),
+        Parameter(
+            'amplitude',
+            '1',
+            'final size c of the approach',
+            0.0,
+            -1.0,
+            1.0,
+            default=0.0,
+            step=1e-3,
+        ),
+        Parameter(
+            'time_constant',
+            's',
+            'tau of the approach',
+            NAN,
+            1e-3,
+            1e7,
+            default=60.0,
+            scale='log',
+        ),
+    )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return the steady drift, approaches to a new temperature, and both."""
+        long = max(view.duration, 1e-2)
+        steps = {'rate': min(0.1, 1e-3 / long)}
+        found = [cls.trial({'time_constant': long}, ['rate'], steps)]
+        for moved in (['amplitude'], ['rate', 'amplitude']):
+            for share in (0.1, 1 / 3, 1.0):
+                found.append(cls.trial({'time_constant': share * long}, moved, steps))
+        return tuple(found)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: nothing has drifted yet."""

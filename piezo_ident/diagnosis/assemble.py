@@ -1,0 +1,326 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The findings put together: refined model, errors before and after, parameters and words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.diagnosis.errors_of import errors_of, held_out_residual
+from piezo_ident.diagnosis.fit import Fitted
+from piezo_ident.diagnosis.results import (
+    Diagnosis,
+    DiagnosisSettings,
+    FoundEffect,
+    FoundParameter,
+    Residual,
+)
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.search import Round
+from piezo_ident.diagnosis.simulator import Added, Simulator, State
+from piezo_ident.diagnosis.verdict import (
+    candidates_of,
+    Findings,
+    percent,
+    SMALLEST,
+    untestable_of,
+)
+from piezo_ident.effects import find_effect
+from piezo_ident.model import StageModel
+from piezo_ident.residual.faults import FaultSearch
+from piezo_ident.residual.floor import NoiseFloor
+
+__all__ = ['assemble']
+
+#: held-out gain of the refitted base below which the model stays as it was given
+WORTH_REFIT = 0.05
+#: a weight below this is left out of the refined model, normalised
+NOTHING = 1e-9
+
+
+def assemble(
+    simulator: Simulator,
+    given: State,
+    base: Fitted,
+    fitted: Fitted,
+    rounds: Sequence[Round],
+    taken: Sequence[Round],
+    findings: Findings,
+    floor: NoiseFloor,
+    noise: float,
+    faults: FaultSearch,
+    settings: DiagnosisSettings,
+) -> Diagnosis:
+    """
+    Return the diagnosis.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    given : State
+        The model as it was given.
+    base, fitted : Fitted
+        Refitted without and with what was found.
+    rounds, taken : sequence of Round
+        All, and those whose best contender was added.
+    findings : Findings
+    floor : NoiseFloor
+    noise : float
+        Mean square of the noise of a row.
+    faults : FaultSearch
+    settings : DiagnosisSettings
+    """
+    rows, model = simulator.rows, simulator.model
+    span = abs(model.scaling.Y)
+    rms = None if not floor.known else max(floor.rms or 0.0, faults.quantum / np.sqrt(12.0))
+    # what single samples have more of noise than rows
+    lost = 0.0 if rms is None else max((rms / span) ** 2 - noise, 0.0)
+    e_given = rows.x - simulator.run(given)
+    before = errors_of(rows, e_given, lost)
+    refit = errors_of(rows, held_out_residual(rows, base), lost)
+    after = errors_of(rows, held_out_residual(rows, fitted), lost)
+    if not findings.effects and refit.overall > (1.0 - WORTH_REFIT) * before.overall:
+        state, refined, after = given, model, before
+    else:
+        state, refined = fitted.state, _refined(simulator, fitted.state, findings)
+    full = [simulator.full(s) for s in (given, base.state, state)]
+    residuals = tuple(
+        Residual(
+            run.record,
+            run.piece,
+            given=(run.x - full[0][i]) * model.scaling.Y,
+            before=(run.x - full[1][i]) * model.scaling.Y,
+            after=(run.x - full[2][i]) * model.scaling.Y,
+            sound=run.known,
+        )
+        for i, run in enumerate(rows.runs)
+    )
+    effects = _effects(rows, base, fitted, taken, findings, noise)
+    smallest = _smallest(rows, base, rounds)
+    rest = replace(findings.unexplained, description=_rest(findings, smallest))
+    warnings = _warnings(rows, fitted.state, findings, floor)
+    result = Diagnosis(
+        verdict=findings.verdict,
+        sentence='',
+        given=model,
+        model=refined,
+        effects=effects,
+        group=findings.group,
+        unexplained=rest,
+        candidates=candidates_of(rows, rounds, findings, noise),
+        before=before,
+        refit=refit,
+        after=after,
+        noise_floor=None if rms is None else 100.0 * rms / (rows.stroke * span),
+        noise_source=floor.source,
+        smallest_detectable=smallest,
+        untestable=untestable_of(rounds, settings),
+        faults=faults.faults,
+        residuals=residuals,
+        records=rows.names,
+        blocks=int(rows.fold.size),
+        warnings=warnings,
+        settings=settings,
+    )
+    return replace(result, sentence=_sentence(result, findings))
+
+
+def _refined(simulator: Simulator, state: State, findings: Findings) -> StageModel:
+    """Return the model of a state, in the record that holds the most rows."""
+    rows = simulator.rows
+    k = int(np.bincount(rows.of_record, minlength=len(rows.names)).argmax())
+    h = state.hysteresis
+    alive = h.weights > NOTHING
+    slim = replace(h, thresholds=h.thresholds[alive], weights=h.weights[alive])
+    kept = tuple(_lasting(added) for added in state.effects)
+    model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
+    scaling = model.scaling
+    low = min(scaling.range[0], *(float(run.piece.v.min()) for run in rows.runs))
+    high = max(scaling.range[1], *(float(run.piece.v.max()) for run in rows.runs))
+    moved = replace(
+        scaling, y0=scaling.y0 + float(state.offsets[k]) * scaling.Y, range=(low, high)
+    )
+    story = dict(model.identification)
+    story['diagnosis'] = {
+        'verdict': findings.verdict,
+        'effects': list(findings.effects),
+        'records': list(rows.names),
+    }
+    return replace(model, scaling=moved, identification=story)
+
+
+def _lasting(added: Added) -> Added:
+    """Return an effect as the model keeps it: what belongs to one record is set to nothing."""
+    if not added.effect.time_driven:
+        return added
+    return Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
+
+
+def _effects(
+    rows: Rows,
+    base: Fitted,
+    fitted: Fitted,
+    taken: Sequence[Round],
+    findings: Findings,
+    noise: float,
+) -> tuple[FoundEffect, ...]:
+    explainable = max(base.mean_square - noise, 1e-300)
+    std = _deviations(rows, fitted)
+    longest = int(np.bincount(rows.of_record).argmax())
+    found = []
+    level = base.mean_square
+    for i, name in enumerate(findings.effects):
+        last = i == len(findings.effects) - 1
+        after = (fitted if last else taken[i].contenders[0].fitted).mean_square
+        gain = max(level - after, 0.0)
+        level = after
+        added = fitted.state.effects[i]
+        parameters = {}
+        for p in added.effect.parameters:
+            value = added.values[longest][p.name]
+            spread = [
+                std.get((i, k, p.name, index))
+                for index in (range(np.size(value)) if p.vector else [None])
+                for k in ([longest] if (i, longest, p.name, index) in std else [None])
+            ]
+            numbers = tuple(0.0 if s is None else s for s in spread)
+            known = any(s is not None for s in spread)
+            parameters[p.name] = FoundParameter(
+                value=_plain(value),
+                unit=p.unit,
+                std=None if not known else numbers if p.vector else numbers[0],
+            )
+        found.append(
+            FoundEffect(
+                name=name,
+                slot=find_effect(name).slot,
+                share=float(np.clip(gain / explainable, 0.0, 1.0)),
+                rms_percent=percent(rows, gain),
+                parameters=parameters,
+            )
+        )
+    return tuple(found)
+
+
+def _plain(value: object) -> float | str | tuple[float, ...]:
+    if isinstance(value, str):
+        return value
+    array = np.asarray(value, dtype=np.float64)
+    return tuple(float(x) for x in array) if array.ndim else float(array)
+
+
+def _deviations(
+    rows: Rows, fitted: Fitted
+) -> dict[tuple[int | None, int | None, str, int | None], float]:
+    """Return the standard deviation of each handle; neighbouring rows count once a block."""
+    M = fitted.J[:, fitted.free]
+    size = np.linalg.norm(M, axis=0)
+    A = M.T @ M / np.outer(size, size)
+    A[np.diag_indices_from(A)] += 1e-10
+    # sandwich over blocks: what one block pulls is one observation, however many rows it has
+    pull = np.stack(
+        [
+            M[start:stop].T @ fitted.e[start:stop] / size
+            for start, stop in zip(rows.edges[:-1], rows.edges[1:], strict=True)
+        ]
+    )
+    inverse = np.linalg.pinv(A, hermitian=True)
+    covariance = inverse @ (pull.T @ pull) @ inverse
+    deviation = np.full(fitted.free.size, np.nan)
+    deviation[fitted.free] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
+    found = {}
+    first = fitted.J.shape[1] - len(fitted.handles)
+    for j, handle in enumerate(fitted.handles, start=first):
+        if np.isfinite(deviation[j]):
+            # of a logarithm, so relative
+            factor = abs(handle.get(fitted.state)) if handle.logarithmic else 1.0
+            key = (handle.effect, handle.record, handle.name, handle.index)
+            found[key] = float(deviation[j]) * factor
+    return found
+
+
+def _smallest(rows: Rows, base: Fitted, rounds: Sequence[Round]) -> float:
+    """Return the rms of the smallest effect that would have been taken, % of stroke."""
+    chance = max(rounds[0].chance.values(), default=0.0)
+    return max(SMALLEST, percent(rows, chance) if rounds[0].before.mean_square else 0.0)
+
+
+def _rest(findings: Findings, smallest: float) -> str:
+    left = findings.unexplained.rms_percent
+    if left < smallest:
+        return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
+    if not findings.effects:
+        return 'structure that no candidate of the catalogue accounts for'
+    return 'structure that the effects added do not account for'
+
+
+def _warnings(rows: Rows, state: State, findings: Findings, floor: NoiseFloor) -> tuple[str, ...]:
+    said = []
+    if not floor.known:
+        said.append(f'{floor.source}: every share counts the noise as unexplained')
+    if findings.effects and any(state.retuning):
+        said.append(
+            'the dynamics were retuned along with the effect, which had bent them at the '
+            f'identification: about {-state.retuning[0]:.2g} samples of delay'
+        )
+    driven = [n for n in findings.effects if find_effect(n).time_driven]
+    for name in driven:
+        said.append(
+            f'{name} follows time and not the voltage: what was found holds in its own record '
+            'alone, so the refined model carries the effect switched off'
+        )
+    return tuple(said)
+
+
+def _sentence(result: Diagnosis, findings: Findings) -> str:
+    before, after = result.before, result.after
+    errors = (
+        f'the error on held-out data falls from {before.overall:.3g} to {after.overall:.3g} % of '
+        'stroke'
+    )
+    names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
+    rest = result.unexplained.rms_percent
+    if result.verdict == 'named':
+        verb = 'explains' if len(result.effects) == 1 else 'explain'
+        return _capital(f'{names} {verb} {findings.share:.0%} of what the model missed; {errors}.')
+    if result.verdict == 'class' and result.group is not None:
+        group = ' or '.join(n.replace('_', ' ') for n in result.group.names)
+        return _capital(
+            f'{group}: these data do not tell which; {names} was added and explains '
+            f'{findings.share:.0%} of what the model missed; {errors}.'
+        )
+    if result.verdict == 'partly_explained':
+        return _capital(
+            f'{names} explains {findings.share:.0%} of what the model missed, {rest:.2g} % of '
+            f'stroke stays unexplained; {errors}.'
+        )
+    if result.verdict == 'unexplained':
+        tail = f'; refitting the hysteresis alone: {errors}' if after is not before else ''
+        return (
+            f'The model misses {rest:.2g} % of stroke that no candidate explains: unexplained'
+            f'{tail}.'
+        )
+    tail = f'; after a refit of the hysteresis {errors}' if after is not before else ''
+    smallest = result.smallest_detectable or 0.0
+    return (
+        f'No effect is missing that these data could show; the smallest would be {smallest:.2g} % '
+        f'of stroke{tail}.'
+    )
+
+
+def _capital(text: str) -> str:
+    return text[0].upper() + text[1:]

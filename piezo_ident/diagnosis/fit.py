@@ -1,0 +1,372 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The joint fit: weights of H, offsets and effects together, by free-run error (Gauss-Newton).
+
+G and the delay stay: they came from records of their own, and a change in them is a candidate of
+its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.diagnosis.gain import gram_of, held_out_errors
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.errors import ModelError
+from piezo_ident.hysteresis import Hysteresis
+from scipy.optimize import lsq_linear
+
+__all__ = ['Fitted', 'Handle', 'base_thresholds', 'fit_base', 'fit_jointly', 'handles_of']
+
+#: how far a weight of H may be expected to move, normalised: what keeps collinear plays quiet
+WEIGHT_SPREAD = 0.1
+ITERATIONS, ATTEMPTS, TOLERANCE = 8, 5, 1e-3
+#: how far G may be retuned: about samples of delay, and their squares
+RETUNING = (5.0, 200.0)
+#: relative size of a finite difference in the logarithm of a parameter
+LOG_STEP = 1e-2
+
+
+@dataclass(frozen=True)
+class Handle:
+    """
+    One number that the fit may move.
+
+    Of an effect, in one record or (None) in all; or of the retuning of G, when `effect` is None.
+    """
+
+    effect: int | None
+    record: int | None
+    name: str
+    index: int | None
+    logarithmic: bool
+    step: float
+    lower: float
+    upper: float
+    is_amplitude: bool
+
+    def get(self, state: State) -> float:
+        """Return its value."""
+        if self.effect is None:
+            return state.retuning[self.index or 0]
+        value = state.effects[self.effect].values[self.record or 0][self.name]
+        return float(value if self.index is None else value[self.index])
+
+    def set(self, state: State, value: float) -> State:
+        """Return the state with another value, kept within its bounds."""
+        value = float(np.clip(value, self.lower, self.upper))
+        if self.effect is None:
+            retuning = list(state.retuning)
+            retuning[self.index or 0] = value
+            return replace(state, retuning=tuple(retuning))
+        effects = list(state.effects)
+        effects[self.effect] = effects[self.effect].changed(
+            self.record, self.name, self.index, value
+        )
+        return replace(state, effects=tuple(effects))
+
+    def moved(self, state: State, delta: float) -> State:
+        """Return the state after a step; for a logarithmic handle the step is relative."""
+        value = self.get(state)
+        if self.logarithmic:
+            return self.set(state, value * float(np.exp(np.clip(delta, -1.0, 1.0))))
+        return self.set(state, value + delta)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """
+    Result of a joint fit.
+
+    Attributes
+    ----------
+    state : State
+    e : ndarray, shape (n,)
+        Residual of the rows, measured minus predicted, normalised.
+    J : ndarray, shape (n, p)
+        Derivatives of the prediction: weights, p1, p2, offsets, then the handles.
+    free : ndarray of bool, shape (p,)
+        Columns that are not on a bound.
+    handles : tuple of Handle
+    prior : ndarray, shape (p,)
+    errors, transfer : ndarray, shape (blocks,)
+        Sum of squares of each block, held out in spread sets and in whole kinds.
+    """
+
+    state: State
+    e: NDArray[np.float64]
+    J: NDArray[np.float64]
+    free: NDArray[np.bool_]
+    handles: tuple[Handle, ...]
+    prior: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    transfer: NDArray[np.float64]
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square error of the blocks held out in spread sets, normalised."""
+        return float(self.errors.sum() / self.e.size)
+
+    @property
+    def transfer_mean_square(self) -> float:
+        """Mean square error of whole kinds held out."""
+        return float(self.transfer.sum() / self.e.size)
+
+
+def base_thresholds(swing: float) -> NDArray[np.float64]:
+    """Return twenty even thresholds over the swing, and four fine ones near zero."""
+    fine = np.array([0.005, 0.012, 0.025, 0.037])
+    return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
+
+
+def fit_base(
+    simulator: Simulator, state: State, thresholds: NDArray[np.float64]
+) -> tuple[State, NDArray[np.float64]]:
+    """
+    Return H refitted on other thresholds by bounded least squares, and the columns used.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    state : State
+        Its effects are kept as they are.
+    thresholds : ndarray, shape (m,)
+    """
+    rows = simulator.rows
+    columns = simulator.base_columns(thresholds)
+    own = simulator.base_columns(state.hysteresis.thresholds)
+    h = state.hysteresis
+    linear = own @ np.concatenate([h.weights, [h.p1, h.p2]])
+    target = rows.x - (simulator.run(state) - state.offsets[rows.of_record] - linear)
+    offsets = _offset_columns(rows)
+    M = np.hstack([columns, offsets])
+    lower = np.full(M.shape[1], -np.inf)
+    lower[: thresholds.size] = 0.0
+    theta = _Normal(M, target, np.zeros(M.shape[1])).solve(lower, np.full(M.shape[1], np.inf))
+    m = thresholds.size
+    new = Hysteresis(thresholds, theta[:m], float(theta[m]), float(theta[m + 1]))
+    return replace(state, hysteresis=new, offsets=theta[m + 2 :]), columns
+
+
+def handles_of(state: State, records: int) -> tuple[Handle, ...]:
+    """Return every number of G's retuning and of the effects that the fit may move."""
+    handles = [
+        Handle(None, None, 'retuning', i, False, 10.0**i * 0.01, -RETUNING[i], RETUNING[i], True)
+        for i in range(len(state.retuning))
+    ]
+    for i, added in enumerate(state.effects):
+        effect = added.effect
+        for p in effect.parameters:
+            value = added.values[0][p.name]
+            if p.scale == 'fixed' or p.kind == 'text':
+                continue
+            is_amplitude = p.step > 0.0
+            per_record = effect.time_driven and is_amplitude
+            for k in range(records) if per_record else (None,):
+                for index in range(np.size(value)) if p.vector else (None,):
+                    number = float(value if index is None else value[index])
+                    if not np.isfinite(number) or (p.scale == 'log' and number <= 0.0):
+                        continue
+                    handles.append(
+                        Handle(
+                            effect=i,
+                            record=k,
+                            name=p.name,
+                            index=index,
+                            logarithmic=p.scale == 'log',
+                            step=LOG_STEP if p.scale == 'log' else (p.step or 1e-3),
+                            lower=p.lower,
+                            upper=p.upper,
+                            is_amplitude=is_amplitude,
+                        )
+                    )
+    return tuple(handles)
+
+
+def fit_jointly(
+    simulator: Simulator,
+    state: State,
+    columns: NDArray[np.float64],
+    *,
+    iterations: int = ITERATIONS,
+    tick: Callable[[], None] = lambda: None,
+) -> Fitted:
+    """
+    Fit everything that a state holds by the free-run error.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    state : State
+        Where to start; its thresholds stay.
+    columns : ndarray, shape (n, m + 2)
+        `Simulator.base_columns` of its thresholds.
+    iterations : int, optional
+    tick : callable, optional
+        Called between the steps; may raise `piezo_ident.errors.Cancelled`.
+    """
+    rows = simulator.rows
+    handles = handles_of(state, len(rows.names))
+    m = state.hysteresis.thresholds.size
+    fixed = np.hstack([columns, _offset_columns(rows)])
+    damping = 1e-4
+    prediction = simulator.remember(state)
+    e = rows.x - prediction
+    J = np.hstack([fixed, _derivatives(simulator, state, handles, prediction)])
+    for _ in range(iterations):
+        tick()
+        before = float(e @ e)
+        lower, upper = _room(state, handles, J.shape[1])
+        normal = _Normal(J, e, _prior(rows, e, J.shape[1], m))
+        found = None
+        for _ in range(ATTEMPTS):
+            step = normal.solve(lower, upper, damping)
+            try:
+                trial = _moved(state, handles, step)
+                left = rows.x - simulator.run(trial)
+            except ModelError:
+                damping *= 10.0
+                continue
+            after = float(left @ left)
+            if np.isfinite(after) and after < before:
+                found = trial
+                break
+            damping *= 10.0
+        if found is None:
+            break
+        damping = max(damping / 10.0, 1e-8)
+        state = found
+        prediction = simulator.remember(state)
+        e = rows.x - prediction
+        J = np.hstack([fixed, _derivatives(simulator, state, handles, prediction)])
+        if after > (1.0 - TOLERANCE) * before:
+            break
+    lower, upper = _room(state, handles, J.shape[1])
+    free = (lower < -1e-12) & (upper > 1e-12) & (np.abs(J).max(axis=0) > 0.0)
+    prior = _prior(rows, e, J.shape[1], m)
+    gram = gram_of(rows, J[:, free], e)
+    return Fitted(
+        state=state,
+        e=e,
+        J=J,
+        free=free,
+        handles=handles,
+        prior=prior,
+        errors=held_out_errors(gram, rows.fold, prior[free]),
+        transfer=held_out_errors(gram, rows.group, prior[free]),
+    )
+
+
+def _offset_columns(rows: Rows) -> NDArray[np.float64]:
+    of = rows.of_record[:, None] == np.arange(len(rows.names))
+    return np.asarray(of, dtype=np.float64)
+
+
+def _prior(rows: Rows, e: NDArray[np.float64], p: int, m: int) -> NDArray[np.float64]:
+    prior = np.zeros(p)
+    # neighbouring residuals are alike: a block counts as a few observations, not as thousands
+    count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
+    prior[: m + 2] = float(e @ e) / count / WEIGHT_SPREAD**2
+    return prior
+
+
+def _derivatives(
+    simulator: Simulator,
+    state: State,
+    handles: tuple[Handle, ...],
+    prediction: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    columns = np.zeros((prediction.size, len(handles)))
+    for j, handle in enumerate(handles):
+        value = handle.get(state)
+        step = handle.step
+        top = handle.upper / value if handle.logarithmic else handle.upper - value
+        if (handle.logarithmic and top < np.exp(step)) or (not handle.logarithmic and top < step):
+            step = -step
+        try:
+            moved = handle.moved(state, step)
+            effect = None if handle.effect is None else state.effects[handle.effect].effect
+            columns[:, j] = (simulator.varied(moved, effect) - prediction) / step
+        except ModelError:
+            # a bound that depends on other parameters: this one stays
+            continue
+    return columns
+
+
+def _room(
+    state: State, handles: tuple[Handle, ...], p: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
+    m = state.hysteresis.thresholds.size
+    lower[:m] = -state.hysteresis.weights
+    for j, handle in enumerate(handles, start=p - len(handles)):
+        value = handle.get(state)
+        if handle.logarithmic:
+            lower[j] = max(-1.0, np.log(max(handle.lower, 1e-300) / value))
+            upper[j] = min(1.0, np.log(handle.upper / value))
+        else:
+            lower[j], upper[j] = handle.lower - value, handle.upper - value
+    return np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+
+
+def _moved(state: State, handles: tuple[Handle, ...], step: NDArray[np.float64]) -> State:
+    h = state.hysteresis
+    m, k = h.thresholds.size, state.offsets.size
+    new = replace(
+        state,
+        hysteresis=Hysteresis(
+            h.thresholds,
+            np.maximum(h.weights + step[:m], 0.0),
+            h.p1 + float(step[m]),
+            h.p2 + float(step[m + 1]),
+        ),
+        offsets=state.offsets + step[m + 2 : m + 2 + k],
+    )
+    for handle, delta in zip(handles, step[m + 2 + k :], strict=True):
+        new = handle.moved(new, float(delta))
+    return new
+
+
+class _Normal:
+    """Normal equations of a step, scaled to columns of length one."""
+
+    def __init__(
+        self, J: NDArray[np.float64], e: NDArray[np.float64], prior: NDArray[np.float64]
+    ) -> None:
+        size = np.linalg.norm(J, axis=0)
+        self._size = np.where(size > 0.0, size, 1.0)
+        self._A = J.T @ J / np.outer(self._size, self._size)
+        self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
+        self._b = J.T @ e / self._size
+
+    def solve(
+        self, lower: NDArray[np.float64], upper: NDArray[np.float64], damping: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Return the bounded step; damping is a share of each column's own energy."""
+        A = self._A.copy()
+        A[np.diag_indices_from(A)] += damping
+        wide = upper > lower
+        L = np.linalg.cholesky(A)
+        # what stays where it is adds nothing to the right-hand side
+        target = np.linalg.solve(L, self._b)
+        x = np.zeros(self._size.size)
+        bounds = ((lower * self._size)[wide], (upper * self._size)[wide])
+        x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        return np.clip(x / self._size, lower, upper)

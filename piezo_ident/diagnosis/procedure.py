@@ -1,0 +1,195 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+From a model and measured data to the effect that the model lacks.
+
+Data faults first; then the base model is refitted by free-run error, so that no physics is blamed
+for a weight of H; then candidates are added one after another as long as data that were not
+fitted gain; and then comes the judgement.
+
+An effect that was there when G was identified has bent G a little.  Unless a linear change is the
+larger part of the story, G is therefore retuned along with the candidates, by a factor
+``1 + c_1 (1 - z^-1) + c_2 (1 - z^-1)^2``, which no candidate gets credit for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.diagnosis.assemble import assemble
+from piezo_ident.diagnosis.fit import base_thresholds, fit_base, fit_jointly, Fitted, RETUNING
+from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis.rows import make_rows
+from piezo_ident.diagnosis.search import drop_needless, Round, search_round
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
+from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.model import StageModel
+from piezo_ident.record import Record
+from piezo_ident.residual.faults import FaultSearch, find_faults
+from piezo_ident.residual.floor import noise_floor, NoiseFloor
+from piezo_ident.residual.lines import find_lines
+from piezo_ident.residual.stretches import ResidualPart, stretches_of
+from piezo_ident.results import Progress, silent
+
+__all__ = ['diagnose']
+
+#: share of the explainable part from which a linear change is a finding, not a side effect
+LINEAR = 0.5
+#: samples with a fault are left out up to this share; beyond it they are all there is
+FAULTY = 0.02
+
+
+def diagnose(
+    model: StageModel,
+    records: Sequence[Record] | Record,
+    settings: DiagnosisSettings | None = None,
+    *,
+    progress: Progress = silent,
+) -> Diagnosis:
+    """
+    Find what a model lacks, add it, and say how sure that is.
+
+    Parameters
+    ----------
+    model : StageModel
+        From `piezo_ident.identification.identify`; it may hold effects already.
+    records : sequence of Record, or Record
+        Measured data that the model was not identified from, of its sampling rate.
+    settings : DiagnosisSettings, optional
+    progress : callable, optional
+        Called with the name of the step and the share done; may raise `Cancelled`.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    IdentificationError
+        When the records carry nothing to judge.
+    """
+    settings = settings or DiagnosisSettings()
+    records = [records] if isinstance(records, Record) else list(records)
+    progress('residual', 0.0)
+    rows = make_rows(model, records)
+    given = State(model.hysteresis, np.zeros(len(rows.names)))
+    faults = find_faults(_parts(Simulator(model, rows), given))
+    if any(bad.any() and bad.mean() < FAULTY for bad in faults.bad):
+        rows = make_rows(
+            model, records, [bad if bad.mean() < FAULTY else None for bad in faults.bad]
+        )
+    simulator = Simulator(model, rows)
+    progress('residual', 0.5)
+    base, columns = _base(simulator, given)
+    parts = _parts(simulator, base.state)
+    stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
+    floor = noise_floor(parts, stretches)
+    noise = row_noise(floor, faults, rows.m, abs(model.scaling.Y))
+    lines = find_lines(parts, stretches).lines
+    progress('residual', 1.0)
+    frequencies = [line.frequency for line in lines]
+    start = _start(simulator, base, columns, noise)
+    rounds, taken, fitted = _search(
+        simulator, start, columns, frequencies, noise, settings, progress
+    )
+    if not taken:
+        fitted = base
+    findings = judge(rows, base, fitted, taken, noise)
+    progress('verdict', 0.0)
+    result = assemble(
+        simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings
+    )
+    progress('verdict', 1.0)
+    return result
+
+
+def _parts(simulator: Simulator, state: State) -> list[ResidualPart]:
+    """Return the residual of each run at the full rate [m]."""
+    Y = simulator.model.scaling.Y
+    return [
+        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.known)
+        for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
+    ]
+
+
+def _base(simulator: Simulator, given: State) -> tuple[Fitted, NDArray[np.float64]]:
+    """Return the base model refitted on a fine grid of thresholds, and the columns of it."""
+    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
+    state, columns = fit_base(simulator, given, base_thresholds(swing))
+    return fit_jointly(simulator, state, columns), columns
+
+
+def row_noise(floor: NoiseFloor, faults: FaultSearch, m: int, span: float) -> float:
+    """Return the mean square of the noise of a row, normalised by the span [m]."""
+    rms = floor.at(m) or 0.0
+    # a reading that rests on one step of the converter hides its rounding
+    rounding = faults.quantum / np.sqrt(12.0 * m)
+    return float(max(rms, rounding) / span) ** 2
+
+
+def _start(
+    simulator: Simulator, base: Fitted, columns: NDArray[np.float64], noise: float
+) -> Fitted:
+    """Return what the candidates are added to: the base, with G retuned where that is minor."""
+    state = replace(base.state, retuning=(0.0,) * len(RETUNING))
+    retuned = fit_jointly(simulator, state, columns)
+    explainable = max(base.mean_square - noise, 1e-300)
+    if base.mean_square - retuned.mean_square > LINEAR * explainable:
+        return base
+    return retuned
+
+
+def _search(
+    simulator: Simulator,
+    start: Fitted,
+    columns: NDArray[np.float64],
+    lines: Sequence[float],
+    noise: float,
+    settings: DiagnosisSettings,
+    progress: Progress,
+) -> tuple[list[Round], list[Round], Fitted]:
+    """Add effects one after another as long as held-out data gain."""
+    rng = np.random.default_rng(settings.seed)
+    names = settings.effects or tuple(catalogue())
+    candidates = [find_effect(name) for name in names if name not in settings.without]
+    rounds: list[Round] = []
+    taken: list[Round] = []
+    fitted = start
+    explainable = max(start.mean_square - noise, 0.0)
+    have = {setting.name for setting in simulator.model.effects}
+    total = settings.most_effects
+    while len(taken) < total:
+        left = [effect for effect in candidates if effect.name not in have]
+        done = len(rounds)
+
+        def tick(share: float, done: int = done) -> None:
+            progress('candidates', (done + share) / (total + 1))
+
+        this = search_round(simulator, fitted, columns, left, lines, noise, rng, tick)
+        rounds.append(this)
+        if not takes(simulator.rows, this, noise, explainable, first=not taken):
+            break
+        taken.append(this)
+        least = (SMALLEST * simulator.rows.stroke / 100.0) ** 2
+        fitted, dropped = drop_needless(simulator, this.contenders[0].fitted, columns, least)
+        for i in dropped:
+            del taken[i]
+        have.add(this.contenders[0].name)
+    progress('candidates', 1.0)
+    return rounds, taken, fitted

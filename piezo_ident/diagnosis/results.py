@@ -1,0 +1,261 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a diagnosis is asked for, and what it gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.effects import find_effect
+from piezo_ident.errors import ConfigError, ModelError
+from piezo_ident.model import StageModel
+from piezo_ident.record import Fault, Piece
+
+__all__ = [
+    'FORMULA',
+    'Candidate',
+    'Class',
+    'Diagnosis',
+    'DiagnosisSettings',
+    'Errors',
+    'FoundEffect',
+    'FoundParameter',
+    'Residual',
+    'Unexplained',
+    'Untestable',
+]
+
+FORMULA = (
+    '100 rms(y - y_hat) / (max y - min y), free run; before: the model as it was given; after: '
+    'each block of data with the parameters fitted to the others'
+)
+
+
+@dataclass(frozen=True)
+class DiagnosisSettings:
+    """
+    How to diagnose.
+
+    Attributes
+    ----------
+    effects : tuple of str, optional
+        Candidates; the whole catalogue when absent.
+    without : tuple of str
+        Candidates to leave out.
+    most_effects : int
+        Effects that are added at most.
+    seed : int
+        For everything that is drawn by chance.
+
+    Raises
+    ------
+    ConfigError
+        When a name is not in the catalogue, or a number out of range.
+    """
+
+    effects: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
+    most_effects: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in (*(self.effects or ()), *self.without):
+            try:
+                find_effect(name)
+            except ModelError as error:
+                raise ConfigError(str(error)) from None
+        if not 1 <= self.most_effects <= 10:
+            raise ConfigError(f'most_effects must be 1 to 10, got {self.most_effects}')
+        if self.seed < 0:
+            raise ConfigError(f'seed must not be negative, got {self.seed}')
+
+
+@dataclass(frozen=True)
+class FoundParameter:
+    """A fitted parameter: value, unit, and standard deviation where there is one."""
+
+    value: float | str | tuple[float, ...]
+    unit: str
+    std: float | tuple[float, ...] | None
+
+
+@dataclass(frozen=True, eq=False)
+class FoundEffect:
+    """
+    An effect that was added to the model.
+
+    Attributes
+    ----------
+    name, slot : str
+    share : float
+        Of the explainable part of the residual, 0 .. 1.
+    rms_percent : float
+        Of what it explains, % of stroke.
+    parameters : mapping of str to FoundParameter
+    """
+
+    name: str
+    slot: str
+    share: float
+    rms_percent: float
+    parameters: Mapping[str, FoundParameter]
+
+
+@dataclass(frozen=True)
+class Class:
+    """Effects that these data cannot tell apart, and the experiment that would."""
+
+    names: tuple[str, ...]
+    separating_experiment: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """
+    A candidate that was not added.
+
+    Attributes
+    ----------
+    name : str
+    share : float
+        Of the explainable part, when it is added alone.
+    why_not : str
+    """
+
+    name: str
+    share: float
+    why_not: str
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is left beyond the noise: share of the explainable part, rms [% of stroke], words."""
+
+    share: float
+    rms_percent: float
+    description: str
+
+
+@dataclass(frozen=True)
+class Untestable:
+    """An effect that these data cannot show, and what would."""
+
+    name: str
+    needs: str
+
+
+@dataclass(frozen=True)
+class Errors:
+    """
+    Free-run errors in % of stroke.
+
+    Attributes
+    ----------
+    overall : float
+    by_segment : mapping of str to float
+        By segment label.
+    by_frequency : mapping of str to float
+        By the frequency of a sine [Hz].
+    """
+
+    overall: float
+    by_segment: Mapping[str, float]
+    by_frequency: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """
+    One piece with its residuals, for pictures.
+
+    Attributes
+    ----------
+    record : str
+    piece : Piece
+    given, before, after : ndarray, shape (n,)
+        Measured minus predicted [m]: by the model as given, by the base model refitted, and by
+        the refined model.
+    sound : ndarray of bool, shape (n,)
+        Samples that count.
+    """
+
+    record: str
+    piece: Piece
+    given: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    sound: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """
+    Result of a diagnosis.
+
+    Attributes
+    ----------
+    verdict : {'named', 'class', 'partly_explained', 'unexplained', 'none'}
+    sentence : str
+        The verdict for a reader.
+    given, model : StageModel
+        The model that was judged, and the refined one.
+    effects : tuple of FoundEffect
+        In the order in which they were found.
+    group : Class or None
+    unexplained : Unexplained
+    candidates : tuple of Candidate
+        Best first.
+    before, refit, after : Errors
+        Of the model as given, of the base model refitted (held out), of the refined model (held
+        out).
+    noise_floor : float or None
+        Rms of single samples, % of stroke.
+    noise_source : str
+    smallest_detectable : float or None
+        Rms of the smallest effect that would have been taken, % of stroke.
+    untestable : tuple of Untestable
+    faults : tuple of Fault
+    residuals : tuple of Residual
+    records : tuple of str
+    blocks : int
+        How many blocks were held out in turn.
+    warnings : tuple of str
+    settings : DiagnosisSettings
+    """
+
+    verdict: str
+    sentence: str
+    given: StageModel
+    model: StageModel
+    effects: tuple[FoundEffect, ...]
+    group: Class | None
+    unexplained: Unexplained
+    candidates: tuple[Candidate, ...]
+    before: Errors
+    refit: Errors
+    after: Errors
+    noise_floor: float | None
+    noise_source: str
+    smallest_detectable: float | None
+    untestable: tuple[Untestable, ...]
+    faults: tuple[Fault, ...]
+    residuals: tuple[Residual, ...]
+    records: tuple[str, ...]
+    blocks: int
+    warnings: tuple[str, ...]
+    settings: DiagnosisSettings

@@ -1,0 +1,261 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Records as rows of a regression, cut into blocks that can be held out.
+
+A row is the mean over a few neighbouring samples, so that a minute at 20 kHz stays a small matrix.
+The model runs at the full rate before it is averaged, so nothing is aliased.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import IdentificationError
+from piezo_ident.memory import fit_memory, is_at_rest
+from piezo_ident.model import StageModel
+from piezo_ident.play import initial_memory
+from piezo_ident.record import Record
+from piezo_ident.runs import Run, runs_of
+
+__all__ = ['Rows', 'make_rows']
+
+#: rows a second that keep what steps and noise excite, and the most rows altogether
+ROW_RATE, MOST_ROWS = 5000.0, 200_000
+#: blocks altogether, about, and how many sets of them are held out in turn
+BLOCKS, FOLDS = 80, 5
+#: whole stretches of one kind that are held out in turn, at most
+GROUPS = 8
+
+Memory = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """
+    Records ready for a regression.
+
+    Attributes
+    ----------
+    runs : tuple of Run
+        Uniformly sampled pieces, normalised by the model's scaling.
+    record : ndarray of int, shape (runs,)
+        The record that each run belongs to.
+    names : tuple of str
+        Names of the records.
+    memories : tuple of callable
+        Play outputs at the start of each run, as a function of the thresholds.
+    m : int
+        Samples in a row.
+    keep : tuple of ndarray of bool
+        For each run, which rows count: sound, and the start forgotten or known.
+    x : ndarray, shape (n,)
+        Measured displacement of the rows, normalised.
+    block, of_record : ndarray of int, shape (n,)
+        Block and record of each row.
+    fold, group : ndarray of int, shape (blocks,)
+        Which blocks are held out together: spread over all data, and whole stretches of a kind.
+    label : tuple of str
+        Segment label of each block.
+    labels : tuple of str
+        Name of each group.
+    stroke : float
+        Largest minus smallest displacement of the records, normalised.
+    """
+
+    runs: tuple[Run, ...]
+    record: NDArray[np.int64]
+    names: tuple[str, ...]
+    memories: tuple[Memory, ...]
+    m: int
+    keep: tuple[NDArray[np.bool_], ...]
+    x: NDArray[np.float64]
+    block: NDArray[np.int64]
+    of_record: NDArray[np.int64]
+    fold: NDArray[np.int64]
+    group: NDArray[np.int64]
+    label: tuple[str, ...]
+    labels: tuple[str, ...]
+    stroke: float
+
+    @property
+    def n(self) -> int:
+        """Number of rows."""
+        return int(self.x.size)
+
+    @property
+    def edges(self) -> NDArray[np.int64]:
+        """First row of each block, and the end; shape (blocks + 1,)."""
+        starts = np.flatnonzero(np.diff(self.block, prepend=-1))
+        return np.append(starts, self.n)
+
+    def of(self, signals: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """
+        Return the rows of signals given at the full rate.
+
+        Parameters
+        ----------
+        signals : sequence of ndarray
+            One a run.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        parts = [means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
+        return np.concatenate(parts)
+
+
+def means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
+    """Return the means over each m neighbours; what is left at the end is dropped."""
+    n = x.size // m
+    return np.asarray(x[: n * m].reshape(n, m).mean(axis=1))
+
+
+def make_rows(
+    model: StageModel,
+    records: Sequence[Record],
+    bad: Sequence[NDArray[np.bool_] | None] | None = None,
+) -> Rows:
+    """
+    Cut records into rows and blocks.
+
+    Parameters
+    ----------
+    model : StageModel
+        Its scaling and sampling rate hold.
+    records : sequence of Record
+    bad : sequence of (ndarray of bool or None), optional
+        For each run, samples that are not used.
+
+    Raises
+    ------
+    IdentificationError
+        When no record has the model's sampling rate, or nothing is left to judge.
+    """
+    runs = runs_of(records, model.sample_rate, model.scaling)
+    if not runs:
+        rates = sorted({p.sample_rate for record in records for p in record})
+        raise IdentificationError(
+            f'no record is sampled at the {model.sample_rate:g} Hz of the model (they have '
+            f'{", ".join(f"{r:g}" for r in rates)} Hz); record at that rate, or identify again'
+        )
+    names = tuple(dict.fromkeys(run.record for run in runs))
+    use = [
+        run.known if out is None else run.known & ~out
+        for run, out in zip(runs, bad or [None] * len(runs), strict=True)
+    ]
+    samples = sum(int(known.sum()) for known in use)
+    m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
+    keep = tuple(means(known.astype(np.float64), m) == 1.0 for known in use)
+    kept = sum(int(k.sum()) for k in keep)
+    if kept < 500:
+        raise IdentificationError(
+            f'{", ".join(names)}: {samples} samples follow from a known start; give a longer '
+            'record that drives the stage over its range'
+        )
+    longest = max(1, kept // BLOCKS)
+    blocks: list[NDArray[np.int64]] = []
+    labels: list[str] = []
+    first = 0
+    for run, good in zip(runs, keep, strict=True):
+        number = np.full(good.size, -1)
+        for label, start, stop in _stretches(run, m):
+            count = max(1, round((stop - start) / longest))
+            for part in np.array_split(np.arange(start, stop), count):
+                if good[part].any():
+                    number[part] = first
+                    labels.append(label)
+                    first += 1
+        blocks.append(number[good])
+    x = [means(run.x, m)[good] for run, good in zip(runs, keep, strict=True)]
+    record = np.array([names.index(run.record) for run in runs])
+    of_record = np.concatenate(
+        [np.full(int(good.sum()), k) for good, k in zip(keep, record, strict=True)]
+    )
+    block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+    group, group_labels = _groups(labels, np.bincount(block))
+    all_y = np.concatenate([run.x for run in runs])
+    return Rows(
+        runs=tuple(runs),
+        record=record,
+        names=names,
+        memories=tuple(_memory(model, run) for run in runs),
+        m=m,
+        keep=keep,
+        x=np.concatenate(x),
+        block=block,
+        of_record=of_record,
+        fold=np.arange(block.max() + 1) % FOLDS,
+        group=group,
+        label=tuple(labels),
+        labels=group_labels,
+        stroke=float(np.ptp(all_y)),
+    )
+
+
+def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
+    """Return label, first and last row of the segments of a run; everything belongs to one."""
+    n = run.piece.n // m
+    if not run.piece.segments:
+        # without labels, fifths of the time stand for kinds
+        edges = np.linspace(0, n, 6).astype(int)
+        names = [f'{run.record}, part {i + 1}' for i in range(5)]
+        return [
+            (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
+        ]
+    found: list[tuple[str, int, int]] = []
+    end = 0
+    for s in run.piece.segments:
+        start, stop = max(end, s.start // m), min(n, s.stop // m)
+        if start > end:
+            found.append(('ramp', end, start))
+        if stop > start:
+            found.append((s.label, start, stop))
+            end = stop
+    if end < n:
+        found.append(('ramp', end, n))
+    return found
+
+
+def _groups(
+    labels: Sequence[str], sizes: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Return which blocks make a stretch of one kind; the smallest kinds are put together."""
+    size: dict[str, int] = {}
+    for label, n in zip(labels, sizes, strict=True):
+        size[label] = size.get(label, 0) + int(n)
+    large = sorted(size, key=lambda label: -size[label])
+    large = [label for label in large if label.partition(':')[0] not in ('idle', 'ramp')]
+    names = large if len(large) < GROUPS else large[: GROUPS - 1]
+    number = {label: i for i, label in enumerate(names)}
+    rest = len(names)
+    group = np.array([number.get(label, rest) for label in labels])
+    if np.any(group == rest):
+        names = [*names, 'the rest']
+    return group, tuple(names)
+
+
+def _memory(model: StageModel, run: Run) -> Memory:
+    u0 = float(run.u[0])
+    if is_at_rest(model, run.piece):
+        return lambda r: initial_memory(u0, r)
+    at = np.concatenate([[0.0], model.hysteresis.thresholds])
+    value = np.concatenate([[u0], fit_memory(model, run.piece)])
+    # a play output falls by at most its threshold; between known ones it is interpolated
+    return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)

@@ -1,0 +1,224 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The search: which effects, added one after another, lower the error on data that were not fitted.
+
+A round scores every candidate on the residual, fits the most promising ones together with
+everything else, takes the best, and tries whether an earlier one can go.  What random residuals
+of the same colour would gain sets the bar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
+from piezo_ident.diagnosis.fit import fit_jointly, Fitted
+from piezo_ident.diagnosis.gain import gram_of
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.effects import Effect
+from piezo_ident.errors import ModelError
+
+__all__ = ['Contender', 'Round', 'Tick', 'drop_needless', 'search_round']
+
+#: called with the share of the round that is done; may raise `Cancelled`
+Tick = Callable[[float], None]
+
+#: candidates of a round that are fitted jointly, at most, and the share that makes them worth it
+JOINT, WORTH = 5, 0.05
+#: iterations of their first fit, and how many are fitted to the end
+FIRST, FINAL = 4, 2
+#: a simpler effect goes first when it leaves no more than this times what the best one leaves
+SIMPLER = 1.3
+#: turned residuals that say what chance gains
+TURNS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """
+    A candidate that was fitted together with everything else.
+
+    Attributes
+    ----------
+    effect : type of Effect
+    scored : Scored
+        Its best trial, before the joint fit.
+    fitted : Fitted
+    """
+
+    effect: type[Effect]
+    scored: Scored
+    fitted: Fitted
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """
+    One round of the search.
+
+    Attributes
+    ----------
+    before : Fitted
+        What the candidates were added to.
+    best : dict of str to Scored
+        The best trial of every candidate that could be tried.
+    contenders : tuple of Contender
+        Those that were fitted jointly, best first.
+    chance : dict of str to float
+        Mean square that a candidate gains on residuals that have nothing to do with it, at best.
+    visible : dict of str to float
+        Share of a candidate's own columns that a refit of the rest does not swallow.
+    """
+
+    before: Fitted
+    best: dict[str, Scored]
+    contenders: tuple[Contender, ...]
+    chance: dict[str, float]
+    visible: dict[str, float]
+
+
+def search_round(
+    simulator: Simulator,
+    before: Fitted,
+    columns: NDArray[np.float64],
+    effects: Sequence[type[Effect]],
+    lines: Sequence[float],
+    noise: float,
+    rng: np.random.Generator,
+    tick: Tick,
+) -> Round:
+    """
+    Score all candidates and fit the best of them jointly.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    before : Fitted
+    columns : ndarray
+        `Simulator.base_columns` of the thresholds in use.
+    effects : sequence of type of Effect
+        Candidates.
+    lines : sequence of float
+        Lines in the residual [Hz].
+    noise : float
+        Mean square of the noise of a row.
+    rng : numpy.random.Generator
+        Turns the residuals.
+    tick : callable
+    """
+    rows = simulator.rows
+    now = simulator.remember(before.state)
+    M = before.J[:, before.free]
+    prior = before.prior[before.free]
+    turns = rng.integers(rows.n // 20, rows.n - rows.n // 20, TURNS)
+    turned = np.stack([np.roll(before.e, int(k)) for k in turns], axis=1)
+    base = (M, gram_of(rows, M, before.e), prior)
+    best: dict[str, Scored] = {}
+    chance: dict[str, float] = {}
+    visible: dict[str, float] = {}
+    for scored in score_trials(
+        simulator,
+        effects,
+        view_of(simulator, lines),
+        base,
+        before.e,
+        now,
+        turned,
+        lambda share: tick(0.5 * share),
+    ):
+        name = scored.effect.name
+        chance[name] = max(chance.get(name, 0.0), float(scored.chance.max()) / rows.n)
+        visible[name] = max(visible.get(name, 0.0), scored.visible)
+        if name not in best or scored.errors.sum() < best[name].errors.sum():
+            best[name] = scored
+    explainable = max(float(before.errors.sum()) - noise * rows.n, 1e-300)
+    ranked = sorted(best.values(), key=lambda s: float(s.errors.sum()))
+    promising = [s for s in ranked if before.errors.sum() - s.errors.sum() > WORTH * explainable][
+        :JOINT
+    ]
+    contenders = []
+    for i, scored in enumerate(promising):
+        tick(0.5 + 0.5 * i / len(promising))
+        state = before.state.with_effect(started(rows, scored))
+        try:
+            fitted = fit_jointly(simulator, state, columns, iterations=FIRST)
+        except ModelError:
+            continue
+        contenders.append(Contender(scored.effect, scored, fitted))
+    contenders.sort(key=lambda c: c.fitted.mean_square)
+    for i, contender in enumerate(contenders[:FINAL]):
+        better = fit_jointly(simulator, contender.fitted.state, columns)
+        contenders[i] = replace(contender, fitted=better)
+    contenders.sort(key=lambda c: c.fitted.mean_square)
+    contenders = _simplest_first(contenders, noise)
+    tick(1.0)
+    return Round(
+        before=before,
+        best=best,
+        contenders=tuple(contenders),
+        chance=chance,
+        visible=visible,
+    )
+
+
+def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender]:
+    """Move the effect with the fewest parameters to the front of those that fit as well."""
+    if not contenders:
+        return contenders
+    limit = SIMPLER * max(contenders[0].fitted.mean_square - noise, 0.0) + noise
+    good = [c for c in contenders if c.fitted.mean_square <= limit]
+    simplest = min(good, key=lambda c: len(c.fitted.handles))
+    return [simplest, *(c for c in contenders if c is not simplest)]
+
+
+def drop_needless(
+    simulator: Simulator, fitted: Fitted, columns: NDArray[np.float64], least: float
+) -> tuple[Fitted, tuple[int, ...]]:
+    """
+    Take out effects that later ones have made needless.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    fitted : Fitted
+        Whose last effect stays.
+    columns : ndarray
+        As in `search_round`.
+    least : float
+        Mean square that an effect must be worth.
+
+    Returns
+    -------
+    fitted : Fitted
+    dropped : tuple of int
+        Places of the effects that went.
+    """
+    dropped: list[int] = []
+    for i in range(len(fitted.state.effects) - 2, -1, -1):
+        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+        without = fit_jointly(simulator, replace(fitted.state, effects=rest), columns)
+        if without.mean_square - fitted.mean_square < least:
+            fitted = without
+            dropped.append(i)
+    return fitted, tuple(dropped)

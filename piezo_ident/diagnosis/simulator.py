@@ -1,0 +1,270 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The whole model over the rows, again and again with a little changed.
+
+Candidates, finite differences and the joint fit all ask the same question: what would the model
+say with these weights and these effects?  What lies before the change in the chain is kept from
+the run before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Operator
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
+from piezo_ident.effects import Effect, find_effect
+from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
+from piezo_ident.model import EffectSetting, StageModel
+from piezo_ident.play import play_columns
+
+__all__ = ['Added', 'Simulator', 'State', 'retuned']
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """
+    An effect in the model under study.
+
+    Attributes
+    ----------
+    name : str
+    values : tuple of mapping
+        Parameters in each record; the same in all, unless the effect is driven by time.
+    """
+
+    name: str
+    values: tuple[Mapping[str, Any], ...]
+
+    def __post_init__(self) -> None:
+        frozen = tuple(MappingProxyType(dict(v)) for v in self.values)
+        object.__setattr__(self, 'values', frozen)
+
+    @property
+    def effect(self) -> type[Effect]:
+        """Its class."""
+        return find_effect(self.name)
+
+    def changed(self, record: int | None, name: str, index: int | None, value: float) -> Added:
+        """Return the effect with one number changed, in one record or in all."""
+        values = []
+        for k, old in enumerate(self.values):
+            if record not in (None, k):
+                values.append(old)
+                continue
+            if index is None:
+                values.append({**old, name: value})
+            else:
+                vector = np.array(old[name], dtype=np.float64)
+                vector[index] = value
+                values.append({**old, name: vector})
+        return Added(self.name, tuple(values))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    What is fitted: H, the offset of each record, and the effects added.
+
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+    offsets : ndarray, shape (records,)
+        Added to the displacement, normalised.
+    effects : tuple of Added
+    retuning : tuple of float
+        Coefficients c_1, c_2, ... of ``1 + sum c_i (1 - z^-1)^i``, by which G is multiplied; empty
+        where G stays as it is.  G(1) stays 1.
+    """
+
+    hysteresis: Hysteresis
+    offsets: NDArray[np.float64]
+    effects: tuple[Added, ...] = ()
+    retuning: tuple[float, ...] = ()
+
+    def with_effect(self, added: Added) -> State:
+        """Return the state with one more effect."""
+        return replace(self, effects=(*self.effects, added))
+
+
+class Simulator:
+    """
+    Runs of a model over rows.
+
+    Parameters
+    ----------
+    model : StageModel
+        Its G, delay and scaling stay as they are, and so do the effects that it has.
+    rows : Rows
+    """
+
+    def __init__(self, model: StageModel, rows: Rows) -> None:
+        self.model = model
+        self.rows = rows
+        self._state: State | None = None
+        self._inputs: list[list[Block]] = []
+
+    def model_of(self, state: State, record: int = 0) -> StageModel:
+        """Return the model that a state stands for, with the effects as in one record."""
+        settings = [EffectSetting(a.name, a.values[record]) for a in state.effects]
+        return replace(
+            self.model,
+            hysteresis=state.hysteresis,
+            dynamics=retuned(self.model.dynamics, state.retuning),
+            effects=(*self.model.effects, *settings),
+        )
+
+    def base_columns(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """
+        Return ``[G F_r | G v^3 | G v]`` as rows; shape (n, m + 2).
+
+        Effects are left out of these columns: they change them by a few percent, and only the
+        path to the optimum depends on that.
+        """
+        G, delay = self.model.dynamics, self.model.delay
+        columns = []
+        for j in range(thresholds.size + 2):
+            signals = []
+            for run, memory in zip(self.rows.runs, self.rows.memories, strict=True):
+                if j < thresholds.size:
+                    r = thresholds[j : j + 1]
+                    raw = play_columns(run.u, r, memory(r))[0]
+                else:
+                    raw = run.u ** (3 if j == thresholds.size else 1)
+                signals.append(filter_arx(G.a, G.b, delay.apply(raw)))
+            columns.append(self.rows.of(signals))
+        return np.stack(columns, axis=1)
+
+    def run(self, state: State) -> NDArray[np.float64]:
+        """Return the predicted rows; shape (n,)."""
+        return self.rows.of(self._signals(state, keep=False)) + state.offsets[self.rows.of_record]
+
+    def full(self, state: State) -> list[NDArray[np.float64]]:
+        """Return the prediction of each run at the full rate, normalised."""
+        return [
+            x + state.offsets[k]
+            for x, k in zip(self._signals(state, keep=False), self.rows.record, strict=True)
+        ]
+
+    def remember(self, state: State) -> NDArray[np.float64]:
+        """Return the predicted rows, and keep what runs between the links for `added`."""
+        self._state = state
+        return self.rows.of(self._signals(state, keep=True)) + state.offsets[self.rows.of_record]
+
+    def added(self, effect: Added) -> NDArray[np.float64]:
+        """Return the predicted rows of the remembered state with one more effect in its slot."""
+        return self.varied(self._remembered.with_effect(effect), effect.effect)
+
+    def varied(self, state: State, effect: type[Effect] | None) -> NDArray[np.float64]:
+        """
+        Return the predicted rows of a state that differs from the remembered one in one place.
+
+        Parameters
+        ----------
+        state : State
+        effect : type of Effect or None
+            The one that was added or changed, None for G; the chain is only run from there.
+        """
+        signals = []
+        for i, (run, k) in enumerate(zip(self.rows.runs, self.rows.record, strict=True)):
+            operators = self._operators(state, i)
+            start = _place(effect, operators)
+            self._rest(operators, run.u)
+            block = self._inputs[i][start]
+            for operator in operators[start:]:
+                block = operator.process(block)
+            signals.append(block.x + state.offsets[k])
+        return self.rows.of(signals)
+
+    @property
+    def _remembered(self) -> State:
+        if self._state is None:
+            raise ValueError('remember a state first')
+        return self._state
+
+    def _operators(self, state: State, run_index: int) -> tuple[Operator, ...]:
+        k = int(self.rows.record[run_index])
+        model = self.model_of(state, k)
+        memory = self.rows.memories[run_index](state.hysteresis.thresholds)
+        return model.chain(memory).operators
+
+    @staticmethod
+    def _rest(operators: Sequence[Operator], u: NDArray[np.float64]) -> None:
+        x0 = u0 = float(u[0])
+        for operator in operators:
+            x0 = operator.reset(u0, x0)
+
+    def _signals(self, state: State, *, keep: bool) -> list[NDArray[np.float64]]:
+        signals = []
+        if keep:
+            self._inputs = []
+        for i, run in enumerate(self.rows.runs):
+            operators = self._operators(state, i)
+            self._rest(operators, run.u)
+            block = Block(t=run.piece.t, v=run.u, x=run.u, channels=run.piece.channels)
+            inputs = []
+            for operator in operators:
+                inputs.append(block)
+                block = operator.process(block)
+            if keep:
+                self._inputs.append([*inputs, block])
+            signals.append(block.x)
+        return signals
+
+
+def retuned(dynamics: Dynamics, retuning: Sequence[float]) -> Dynamics:
+    """
+    Return G multiplied by ``1 + sum c_i (1 - z^-1)^i``.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+    retuning : sequence of float
+        c_1, c_2, ...; c_1 acts like minus a delay in samples at low frequencies.
+    """
+    factor, difference = np.array([1.0]), np.array([1.0])
+    for c in retuning:
+        difference = np.convolve(difference, [1.0, -1.0])
+        factor = np.pad(factor, (0, difference.size - factor.size)) + c * difference
+    return replace(dynamics, b=np.convolve(dynamics.b, factor)) if retuning else dynamics
+
+
+def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
+    """Return the first link whose output depends on an effect, or on G."""
+    if effect is None:
+        return next(i for i, op in enumerate(operators) if isinstance(op, DynamicsOperator))
+    if effect.slot == 'hysteresis':
+        return next(i for i, operator in enumerate(operators) if _is_core(operator))
+    for i in range(len(operators) - 1, -1, -1):
+        if type(operators[i]) is effect:
+            return i
+    # no link of its own: it is part of the delay
+    return next(i for i, operator in enumerate(operators) if isinstance(operator, DelayOperator))
+
+
+def _is_core(operator: Operator) -> bool:
+    inner = operator
+    while isinstance(inner, Effect):
+        if inner.slot != 'hysteresis':
+            return False
+        inner = inner.inner
+    return isinstance(inner, HysteresisOperator)

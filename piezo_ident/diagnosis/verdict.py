@@ -1,0 +1,242 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The verdict: what was found, how sure that is, and what the data cannot tell.
+
+A name needs nearly all that can be explained, and must be clearly ahead of every other candidate;
+otherwise the names that remain are reported as a class, or the residual as partly explained or
+unexplained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from piezo_ident.diagnosis.fit import Fitted
+from piezo_ident.diagnosis.results import (
+    Candidate,
+    Class,
+    DiagnosisSettings,
+    Unexplained,
+    Untestable,
+)
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.search import Contender, Round
+from piezo_ident.effects import catalogue, find_effect
+
+__all__ = ['Findings', 'candidates_of', 'judge', 'rivals_of', 'takes', 'untestable_of']
+
+#: least share of the explainable part that a name stands for; below the second nothing is added
+NAMED, ADDED = 0.85, 0.5
+#: a gain below this share of what is left, or below this rms [% of stroke], is no effect
+LEAST_GAIN, SMALLEST = 0.10, 0.05
+#: how much better than on turned residuals a gain must be
+BEYOND_CHANCE = 1.5
+#: what a further effect must explain of what the ones before it left
+FURTHER = 0.6
+#: how much an effect may raise the error of any kind of excitation
+HARM = 1.25
+#: a rival that leaves less than this times what the best one leaves is not told from it
+AHEAD = 1.6
+#: a rival with more parameters must leave less than this times what the best one leaves
+BOUGHT = 0.9
+#: what two effects may leave without a difference, % of stroke: H is never right to more than that
+INDISTINCT = 0.01
+#: a candidate is not testable when a refit of the base swallows all but this share of it
+SWALLOWED = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """
+    The judgement in numbers and names.
+
+    Attributes
+    ----------
+    verdict : str
+    share : float
+        Of the explainable part, by everything that was added.
+    effects : tuple of str
+        Added, in order.
+    group : Class or None
+    unexplained : Unexplained
+    """
+
+    verdict: str
+    share: float
+    effects: tuple[str, ...]
+    group: Class | None
+    unexplained: Unexplained
+
+
+def percent(rows: Rows, mean_square: float) -> float:
+    """Return a mean square as rms in % of stroke."""
+    return 100.0 * float(np.sqrt(max(mean_square, 0.0))) / rows.stroke
+
+
+def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: bool) -> bool:
+    """
+    Return whether the best contender of a round is an effect.
+
+    Parameters
+    ----------
+    rows : Rows
+    this : Round
+    noise : float
+        Mean square of the noise of a row.
+    explainable : float
+        Mean square that was there to be explained before anything was added.
+    first : bool
+        Whether nothing was added before.
+    """
+    if not this.contenders:
+        return False
+    best = this.contenders[0]
+    before, after = this.before.mean_square, best.fitted.mean_square
+    gain, left = before - after, max(before - noise, 1e-300)
+    if percent(rows, gain) < SMALLEST or gain < LEAST_GAIN * explainable:
+        return False
+    if gain < BEYOND_CHANCE * this.chance.get(best.name, 0.0):
+        return False
+    if gain < (ADDED if first else FURTHER) * left:
+        return False
+    return not _harms(rows, this.before, best.fitted, noise)
+
+
+def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
+    """Return whether the error grows where it was no trifle."""
+    kinds = np.unique(rows.group)
+    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
+    one = np.bincount(rows.group, before.errors) / counts
+    other = np.bincount(rows.group, after.errors) / counts
+    trifle = noise + (SMALLEST * rows.stroke / 100.0) ** 2
+    return bool(np.any(other > HARM**2 * one + trifle))
+
+
+def rivals_of(rows: Rows, this: Round, noise: float) -> tuple[Contender, ...]:
+    """Return the contenders that the data do not tell from the best one."""
+    best, *others = this.contenders
+    floor = (INDISTINCT * rows.stroke / 100.0) ** 2
+    left = max(best.fitted.mean_square - noise, 0.0) + floor
+    size = len(best.fitted.handles)
+    return tuple(
+        c
+        for c in others
+        # more parameters should have bought something
+        if max(c.fitted.mean_square - noise, 0.0) + floor
+        <= left * (AHEAD if len(c.fitted.handles) <= size else BOUGHT)
+    )
+
+
+def judge(
+    rows: Rows,
+    base: Fitted,
+    fitted: Fitted,
+    taken: Sequence[Round],
+    noise: float,
+) -> Findings:
+    """
+    Return the verdict.
+
+    Parameters
+    ----------
+    rows : Rows
+    base, fitted : Fitted
+        Before and after everything that was added.
+    taken : sequence of Round
+        The rounds whose best contender was added.
+    noise : float
+        Mean square of the noise of a row.
+    """
+    explainable = max(base.mean_square - noise, 0.0)
+    left = max(fitted.mean_square - noise, 0.0)
+    size = percent(rows, explainable)
+    if not taken:
+        rest = Unexplained(1.0 if explainable else 0.0, size, '')
+        small = size < SMALLEST
+        return Findings('none' if small else 'unexplained', 0.0, (), None, rest)
+    share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))
+    effects = tuple(this.contenders[0].name for this in taken)
+    rest = Unexplained(1.0 - share, percent(rows, left), '')
+    groups = [
+        (this.contenders[0].name, *(c.name for c in rivals_of(rows, this, noise)))
+        for this in taken
+    ]
+    if share < NAMED:
+        return Findings('partly_explained', share, effects, None, rest)
+    for names in groups:
+        if len(names) > 1:
+            return Findings('class', share, effects, _class(names[:3]), rest)
+    return Findings('named', share, effects, None, rest)
+
+
+def _class(names: Sequence[str]) -> Class:
+    needs = dict.fromkeys(find_effect(name).needs for name in names)
+    return Class(tuple(names), 'record ' + '; and '.join(n for n in needs if n))
+
+
+def candidates_of(
+    rows: Rows, rounds: Sequence[Round], findings: Findings, noise: float
+) -> tuple[Candidate, ...]:
+    """Return every candidate that was not added, its share when added alone, and why not."""
+    first, last = rounds[0], rounds[-1]
+    left = max(first.before.mean_square - noise, 1e-300)
+    shares = {
+        name: (first.before.errors.sum() - s.errors.sum()) / rows.n / left
+        for name, s in first.best.items()
+    }
+    for c in first.contenders:
+        gain = (first.before.mean_square - c.fitted.mean_square) / left
+        shares[c.name] = max(shares[c.name], gain)
+    found = []
+    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
+        if name in findings.effects:
+            continue
+        value = float(np.clip(share, 0.0, 1.0))
+        found.append(Candidate(name, value, _why_not(name, value, findings, last)))
+    return tuple(found)
+
+
+def _why_not(name: str, share: float, findings: Findings, last: Round) -> str:
+    best = ' and '.join(findings.effects)
+    if findings.group and name in findings.group.names:
+        return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
+    if not findings.effects:
+        if share < LEAST_GAIN:
+            return 'explains nothing beyond chance'
+        return f'explains {share:.0%} of what could be explained, too little for a cause'
+    if share < LEAST_GAIN:
+        return 'explains nothing beyond chance'
+    gain = last.before.mean_square
+    if name in last.best and gain > 0.0:
+        more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
+        if more < LEAST_GAIN:
+            return f'{best} explains more; nothing is left for it after that'
+    return f'{best} explains more'
+
+
+def untestable_of(rounds: Sequence[Round], settings: DiagnosisSettings) -> tuple[Untestable, ...]:
+    """Return the candidates that these data cannot show."""
+    first = rounds[0]
+    found = []
+    for name in settings.effects or catalogue():
+        if name in settings.without:
+            continue
+        effect = find_effect(name)
+        if name not in first.best or first.visible.get(name, 0.0) < SWALLOWED:
+            found.append(Untestable(name, effect.needs or 'data in which it shows'))
+    return tuple(found)

@@ -1,0 +1,102 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Amplifier lag: the voltage on the piezo follows the command with a delay of its own."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, Parameter, Trial, View
+from piezo_ident.effects.trials import ladder
+from piezo_ident.kernel import kernel
+
+__all__ = ['AmplifierLag']
+
+
+@kernel
+def _follow(x: NDArray[np.float64], pole: float, state: float) -> NDArray[np.float64]:
+    out = np.empty(x.size)
+    y, share = state, 1.0 - pole
+    for k in range(x.size):
+        y += share * (x[k] - y)
+        out[k] = y
+    return out
+
+
+class AmplifierLag(Effect):
+    """
+    First-order lag of the amplifier, in front of H.
+
+    ``va(k) = a va(k-1) + (1 - a) v(k)`` with ``a = exp(-1 / (f_s tau))``: output resistance of the
+    amplifier times the capacitance of the piezo, tau = R C.  G, which is identified with the lag
+    in place, takes in most of it; what is left over is that the loops of H follow the lagged
+    voltage.
+
+    Notes
+    -----
+    Amplifier and capacitive load: A. J. Fleming and K. K. Leang, "Design, Modeling and Control of
+    Nanopositioning Systems", Springer, 2014, doi:10.1007/978-3-319-06617-2.  The filter is the
+    exact response of the continuous lag to a command held between samples, seen at the end of
+    each hold.
+    """
+
+    name: ClassVar[str] = 'amplifier_lag'
+    slot: ClassVar[Slot] = 'input'
+    description: ClassVar[str] = (
+        'RC lag of amplifier and piezo before the hysteresis; corner at 0.5 .. 10 kHz'
+    )
+    needs: ClassVar[str] = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'time_constant',
+            's',
+            'time constant tau',
+            0.0,
+            0.0,
+            1.0,
+            default=0.0,
+            step=1e-4,
+            scale='linear',
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        tau = self.number('time_constant')
+        self._pole = float(np.exp(-1.0 / (self.sample_rate * tau))) if tau > 0.0 else 0.0
+        self._state = 0.0
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return lags from about a sample to a millisecond: small ones are not to scale."""
+        sample = 1.0 / view.sample_rate
+        lags = ladder(0.7 * sample, max(1e-3, 10.0 * sample), 4)
+        return tuple(cls.trial({}, steps={'time_constant': min(tau, 0.5)}) for tau in lags)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: the amplifier has caught up."""
+        self._state = x0
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block with its signal lagged."""
+        if self._pole == 0.0 or block.x.size == 0:
+            return block
+        y = _follow(np.ascontiguousarray(block.x), self._pole, self._state)
+        self._state = float(y[-1])
+        return block.with_signal(y)

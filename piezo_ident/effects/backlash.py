@@ -1,0 +1,97 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Backlash: a guide or a joint that gives way before it takes the motion along."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
+from piezo_ident.effects.trials import ladder
+from piezo_ident.kernel import kernel
+
+__all__ = ['Backlash']
+
+
+@kernel
+def _play(x: NDArray[np.float64], width: float, state: float) -> NDArray[np.float64]:
+    out = np.empty(x.size)
+    p = state
+    for k in range(x.size):
+        if p < x[k] - width:
+            p = x[k] - width
+        if p > x[k] + width:
+            p = x[k] + width
+        out[k] = p
+    return out
+
+
+class Backlash(Effect):
+    """
+    A play on the displacement.
+
+    ``y = x + g (P[x] - x)`` with the symmetric play ``P(k) = max(x(k) - rho, min(x(k) + rho,
+    P(k-1)))`` of half-width rho; g = 1 is pure backlash, a smaller g the share of the stage that
+    hangs behind it.  After each turn of the displacement, not of the voltage, a way of 2 rho is
+    lost.
+
+    Notes
+    -----
+    M. Nordin and P.-O. Gutman, "Controlling mechanical systems with backlash - a survey",
+    Automatica 38(10), 2002, doi:10.1016/S0005-1098(02)00047-X.  Dry friction on an elastic guide
+    gives the same loop.
+    """
+
+    name: ClassVar[str] = 'backlash'
+    slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = (
+        'lost motion after each turn of the displacement; 0.1 .. 2 % of stroke'
+    )
+    needs: ClassVar[str] = 'sweeps with turns, both slow and near the first resonance'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('width', '1', 'half-width rho of the play', NAN, 0.0, 2.0, scale='log'),
+        Parameter(
+            'gain', '1', 'share g that hangs in it', 0.0, -100.0, 100.0, default=0.0, step=0.1
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        self._state = 0.0
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return widths from 0.2 % to 10 % of the range."""
+        if view.span <= 0.0:
+            return ()
+        widths = ladder(0.002 * view.span, 0.1 * view.span, 6)
+        return tuple(cls.trial({'width': w}, steps={'gain': min(0.5, 1e-3 / w)}) for w in widths)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest in the middle of the play."""
+        self._state = x0
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block with its motion lost in part."""
+        gain = self.number('gain')
+        if block.x.size == 0:
+            return block
+        p = _play(np.ascontiguousarray(block.x), self.number('width'), self._state)
+        self._state = float(p[-1])
+        return block.with_signal(p if gain == 1.0 else block.x + gain * (p - block.x))

@@ -1,0 +1,109 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Changed dynamics: a resonance that was added, or has moved, since G was identified."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
+from piezo_ident.effects.second_order import Section
+from piezo_ident.effects.trials import ladder
+
+__all__ = ['ChangedDynamics']
+
+
+class ChangedDynamics(Effect):
+    """
+    Modes in parallel with what G makes, without a change of its static gain.
+
+    ``y = x + sum_m g_m (M_m - 1) x + k_m R_m x`` with ``M = w^2 / D``, ``R = w s / D`` and
+    ``D = s^2 + 2 zeta w s + w^2``, each by the bilinear transform, prewarped at its own frequency.
+
+    A resonance that moved from (w, zeta) to (w', zeta') is exactly of this form, with the new
+    frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: then
+    the old mode times the effect is the new one.  A mode that was added with a share g has k = 0.
+
+    Notes
+    -----
+    A load m_L on a stage of moving mass m lowers its resonance by ``sqrt(m / (m + m_L))``.  Modes
+    as second-order sections: S. Devasia, E. Eleftheriou and S. O. R. Moheimani, "A survey of
+    control issues in nanopositioning", IEEE Trans. Control Syst. Technol. 15(5), 2007,
+    pp. 802-823.  Bilinear transform with prewarping: A. V. Oppenheim and R. W. Schafer,
+    "Discrete-Time Signal Processing".
+    """
+
+    name: ClassVar[str] = 'changed_dynamics'
+    slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = (
+        'a resonance added or moved since G was identified, as by a load; linear, the static gain '
+        'stays'
+    )
+    needs: ClassVar[str] = 'a multisine or noise, or steps, across the resonance'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('frequency', 'Hz', 'frequency of mode m', NAN, 1e-3, 1e6, True, scale='log'),
+        Parameter('damping', '1', 'damping ratio zeta_m', NAN, 1e-4, 10.0, True, scale='log'),
+        Parameter('gain', '1', 'share g_m', 0.0, -100.0, 100.0, True, default=0.0, step=1e-3),
+        Parameter(
+            'rate_gain',
+            '1',
+            'share k_m of the rate',
+            0.0,
+            -100.0,
+            100.0,
+            True,
+            default=0.0,
+            step=1e-3,
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        columns = zip(*(self.array(p.name).tolist() for p in self.parameters), strict=True)
+        self._sections = [Section(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns]
+        self._silent = not np.any([self.array('gain'), self.array('rate_gain')])
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return the lowest modes of G, moved a little, and a few new ones about the band."""
+        top, band = 0.45 * view.sample_rate, max(view.max_frequency, 5.0 / view.duration)
+        lowest = sorted(m for m in view.modes if m[0] < top and m[1] < 0.9)[:2]
+        tried = [(min(c * f, top), z) for f, z in lowest for c in (0.9, 1.0, 1.1)]
+        new = ladder(min(band / 4, top / 2), min(20.0 * band, top), 5)
+        tried += [(f, z) for f in new for z in (0.02, 0.1)]
+        found = []
+        for f, z in tried:
+            # far below a mode M - 1 goes with the square of the frequency, and R with itself
+            far = max(1.0, f / band)
+            steps = {'gain': min(1.0, 1e-3 * far**2), 'rate_gain': min(1.0, 1e-3 * far)}
+            found.append(cls.trial({'frequency': [f], 'damping': [z]}, steps=steps))
+        return tuple(found)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: no mode moves, and the static gain is one."""
+        for section in self._sections:
+            section.reset(x0)
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block with the modes added."""
+        if self._silent:
+            return block
+        y = block.x.copy()
+        for section in self._sections:
+            y += section.process(block.x)
+        return block.with_signal(y)

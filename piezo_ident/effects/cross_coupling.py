@@ -1,0 +1,126 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Cross-coupling: another axis moves this one a little."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
+from piezo_ident.effects.second_order import Section, slope_of_mode
+from piezo_ident.errors import ModelError
+
+__all__ = ['CrossCoupling']
+
+
+class CrossCoupling(Effect):
+    """
+    Another axis's logged voltage, through a second-order low-pass, added to the displacement.
+
+    ``y = x + (g + g' d/dt) M(s) (c - c0)`` with ``M = w^2 / (s^2 + 2 zeta w s + w^2)`` by the
+    bilinear transform, prewarped at w, and the rate exact at low frequencies.  c is a further
+    channel of the record in its own unit, c0 its value that counts as none.  Before the first
+    sample the channel is taken to have rested at it.
+
+    Notes
+    -----
+    Coupling between the axes of a scanner: A. J. Fleming and K. K. Leang, "Design, Modeling and
+    Control of Nanopositioning Systems", Springer, 2014, doi:10.1007/978-3-319-06617-2.
+    """
+
+    name: ClassVar[str] = 'cross_coupling'
+    slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = (
+        "motion that follows another axis's voltage; 0.5 .. 3 % of that axis's stroke"
+    )
+    needs: ClassVar[str] = "a further channel with the other axis's voltage while that axis moves"
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'channel',
+            'name',
+            'further channel of the record: x_<name> without its x_',
+            NAN,
+            -np.inf,
+            np.inf,
+            kind='text',
+            scale='fixed',
+        ),
+        Parameter('gain', '1/unit', 'static gain g', 0.0, -1e9, 1e9, default=0.0, step=1e-3),
+        Parameter(
+            'rate_gain', 's/unit', "gain g' of its rate", 0.0, -1e9, 1e9, default=0.0, step=1e-5
+        ),
+        Parameter('frequency', 'Hz', 'corner of the low-pass', NAN, 1e-3, 1e6, scale='log'),
+        Parameter('damping', '1', 'its damping', NAN, 1e-3, 100.0, default=0.7, scale='log'),
+        Parameter(
+            'offset', 'unit', 'value c0 without effect', NAN, -1e9, 1e9, default=0.0, scale='fixed'
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        frequency, gain = self.number('frequency'), self.number('gain')
+        # g M + g' s M = g + g (M - 1) + g' (s/S) R; s/S as it is at low frequencies, where the
+        # rate is that of the channel whatever the prewarping
+        slope = 2.0 * self.sample_rate / slope_of_mode(frequency, self.sample_rate)
+        rate = self.number('rate_gain') * slope
+        self._section = Section(frequency, self.number('damping'), gain, rate, self.sample_rate)
+        self._gain = gain
+        self._started = False
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return every channel that moves, with three corners."""
+        found = []
+        for name, (mean, std) in view.channels.items():
+            if not (np.isfinite(std) and std > 0):
+                continue
+            for f in (10.0, 100.0, 1000.0):
+                if f >= 0.4 * view.sample_rate:
+                    continue
+                shape = {'channel': name, 'frequency': f, 'damping': 0.7, 'offset': mean}
+                steps = {'gain': 1e-3 / std, 'rate_gain': 1e-3 / (2 * np.pi * f * std)}
+                found.append(cls.trial(shape, steps=steps))
+        return tuple(found)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest; the channel's rest value is known with its first sample only."""
+        self._started = False
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """
+        Return the block with the other axis's share added.
+
+        Raises
+        ------
+        ModelError
+            When the block lacks the channel.
+        """
+        name = self.text('channel')
+        if name not in block.channels:
+            has = ', '.join(sorted(block.channels)) or 'none'
+            raise ModelError(
+                f'effect cross_coupling needs the further channel {name!r}; the data have {has}; '
+                'record that channel, or take the effect out of the model'
+            )
+        if block.x.size == 0:
+            return block
+        c = np.asarray(block.channels[name], dtype=np.float64) - self.number('offset')
+        if not self._started:
+            self._section.reset(float(c[0]))
+            self._started = True
+        return block.with_signal(block.x + (self._gain * c + self._section.process(c)))

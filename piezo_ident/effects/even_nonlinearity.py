@@ -1,0 +1,78 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Even nonlinearity: the part of the static curve that H, odd in the voltage, cannot have."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, Parameter, Trial, View
+
+__all__ = ['EvenNonlinearity']
+
+
+class EvenNonlinearity(Effect):
+    """
+    Even powers of the voltage beside H.
+
+    ``w = H[v] + p0 v^2 + p4 v^4 + p6 v^6``.  The static part of H is ``p1 v^3 + p2 v``, odd
+    about v = 0; electrostriction, which goes with the square of the field, and the unequal
+    stiffness of a preloaded stack are not.
+
+    Notes
+    -----
+    Electrostriction as a square beside the linear piezoelectric effect: D. Damjanovic,
+    "Ferroelectric, dielectric and piezoelectric properties of ferroelectric thin films and
+    ceramics", Rep. Prog. Phys. 61, 1998, doi:10.1088/0034-4885/61/9/002.  H without even terms:
+    Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, eqs. 3 and 6.
+    """
+
+    name: ClassVar[str] = 'even_nonlinearity'
+    slot: ClassVar[Slot] = 'hysteresis'
+    description: ClassVar[str] = (
+        'even powers of the voltage in the static curve; 0.1 .. 2 % of stroke'
+    )
+    needs: ClassVar[str] = 'slow sweeps over the full range with minor loops at several biases'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'square', '1', 'coefficient p0 of v^2', 0.0, -10.0, 10.0, default=0.0, step=1e-3
+        ),
+        Parameter(
+            'fourth', '1', 'coefficient p4 of v^4', 0.0, -10.0, 10.0, default=0.0, step=1e-3
+        ),
+        Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -10.0, 10.0, default=0.0, step=1e-3),
+    )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return the square alone, with the fourth power, and all."""
+        return cls.trial({}, ['square']), cls.trial({}, ['square', 'fourth']), cls.trial({})
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest; the effect itself has no memory."""
+        return self.inner.reset(v0, x0) + float(self._even(np.array([x0]))[0])
+
+    def process(self, block: Block) -> Block:
+        """Return the block with H applied and the even powers added."""
+        inner = self.inner.process(block)
+        return inner.with_signal(inner.x + self._even(block.x))
+
+    def _even(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        p0, p4, p6 = (self.number(name) for name in ('square', 'fourth', 'sixth'))
+        square = x * x
+        return square * (p0 + square * (p4 + square * p6))

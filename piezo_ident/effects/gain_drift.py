@@ -1,0 +1,98 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Gain drift: the sensitivity of piezo or sensor wanders with temperature and age."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.errors import ModelError
+
+__all__ = ['GainDrift']
+
+
+class GainDrift(Effect):
+    """
+    A gain that changes slowly with time.
+
+    ``y = x (1 + a(t))`` with a piecewise linear between knots and constant beyond them.  Time is
+    that of the sample clock.  The knots hold for one record: what the gain does in another record,
+    or beyond the last knot, does not follow from them.
+
+    Notes
+    -----
+    Dependence of sensitivity on temperature: A. J. Fleming, "A review of nanometer resolution
+    position sensors: operation and performance", Sensors and Actuators A 190, 2013,
+    doi:10.1016/j.sna.2012.10.016.  Piecewise linear functions between knots are splines of the
+    first degree: C. de Boor, "A Practical Guide to Splines", Springer, 1978.
+    """
+
+    name: ClassVar[str] = 'gain_drift'
+    slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = 'a gain that wanders during the record with temperature or age'
+    needs: ClassVar[str] = 'the same motion at the start and at the end of a long record'
+    time_driven: ClassVar[bool] = True
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'time', 's', 'time of each knot, ascending', NAN, -1e9, 1e9, True, scale='fixed'
+        ),
+        Parameter(
+            'gain',
+            '1',
+            'change a of the gain there',
+            0.0,
+            -1.0,
+            10.0,
+            True,
+            default=0.0,
+            step=1e-3,
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        self._time, self._gain = self.array('time'), self.array('gain')
+
+    @classmethod
+    def agree(cls, values: Mapping[str, Value]) -> None:
+        """Refuse knots that do not ascend; see `Effect.agree`."""
+        super().agree(values)
+        time = np.atleast_1d(np.asarray(values['time'], dtype=np.float64))
+        if time.size == 0 or np.any(np.diff(time) <= 0):
+            raise ModelError('effect gain_drift: give at least one time, and times that ascend')
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return one, three and six stretches; the first knot stays, as a constant gain is H's."""
+        found = []
+        for stretches in (1, 3, 6):
+            knots = np.linspace(0.0, max(view.duration, 1e-6), stretches + 1)
+            full = cls.trial({'time': knots})
+            found.append(Trial(full.values, full.moves[1:], full.steps[1:]))
+        return tuple(found)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: the gain as it is before the first knot."""
+        return x0 * (1.0 + float(self._gain[0]))
+
+    def process(self, block: Block) -> Block:
+        """Return the block with the gain of each moment."""
+        if not self._gain.any():
+            return block
+        return block.with_signal(block.x * (1.0 + np.interp(block.t, self._time, self._gain)))

@@ -1,0 +1,81 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Input feed-through: the drive leaks into the sensor's electronics."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, Parameter, Trial, View
+
+__all__ = ['InputFeedthrough']
+
+
+class InputFeedthrough(Effect):
+    """
+    The command, and its rate, in the reading without any delay.
+
+    ``y = x + k0 v + k1 dv/dt``, the rate as a backward difference: a resistive and a capacitive
+    path from the drive into the sensor's electronics.  It arrives before the displacement does,
+    at lags shorter than the delay.
+
+    Notes
+    -----
+    Capacitive coupling C into an input of resistance R reads R C dv/dt, common ground a share of
+    v: H. W. Ott, "Electromagnetic Compatibility Engineering", Wiley, 2009, chapters 2 and 3.
+    """
+
+    name: ClassVar[str] = 'input_feedthrough'
+    slot: ClassVar[Slot] = 'acquisition'
+    description: ClassVar[str] = (
+        'the drive leaks into the reading, ahead of the motion; up to 0.5 % of stroke'
+    )
+    needs: ClassVar[str] = 'steps, or wide-band noise, sampled faster than the delay'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'gain', '1', 'share k0 of the command', 0.0, -10.0, 10.0, default=0.0, step=1e-3
+        ),
+        Parameter(
+            'rate_gain', 's', 'share k1 of its rate', 0.0, -1.0, 1.0, default=0.0, step=1e-6
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        self._last = 0.0
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return both paths together."""
+        return (cls.trial({}, steps={'rate_gain': min(0.1, 1e-3 / view.speed)}),)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: the command has no rate."""
+        self._last = v0
+        return x0 + self.number('gain') * v0
+
+    def process(self, block: Block) -> Block:
+        """Return the block with the command's share added."""
+        if block.v.size == 0:
+            return block
+        k0, k1 = self.number('gain'), self.number('rate_gain') * self.sample_rate
+        before, self._last = self._last, float(block.v[-1])
+        y = block.x + k0 * block.v
+        if k1 != 0.0:
+            y[0] += k1 * (block.v[0] - before)
+            y[1:] += k1 * np.diff(block.v)
+        return block.with_signal(y)

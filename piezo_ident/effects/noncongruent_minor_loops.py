@@ -1,0 +1,136 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Noncongruent minor loops: loops of one width differ with the bias at which they are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.errors import ModelError
+from piezo_ident.hysteresis import HysteresisOperator
+from piezo_ident.kernel import kernel
+from piezo_ident.play import initial_memory
+
+__all__ = ['NoncongruentMinorLoops']
+
+
+@kernel
+def _tilted(
+    v: NDArray[np.float64],
+    r: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    bias: float,
+    memory: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    out = np.empty(v.size)
+    for k in range(v.size):
+        x = v[k]
+        w = 0.0
+        for i in range(r.size):
+            f = memory[i]
+            f = x if f > x else f
+            low = x - r[i]
+            f = low if f < low else f
+            memory[i] = f
+            w += slope[i] * f
+        out[k] = (x - bias) * w
+    return out
+
+
+class NoncongruentMinorLoops(Effect):
+    """
+    Plays whose weight depends on the voltage.
+
+    ``w = H[v] + sum_j kappa_j (v - c) F_rho_j[v]``.  In a Prandtl-Ishlinskii operator all minor
+    loops between the same two voltages are congruent, and so are, but for the cubic, those of one
+    width at different biases; a weight that grows with the voltage takes that away.  The plays
+    have thresholds and a memory of their own.
+
+    After `reset` each play is where H would have one of its threshold: at the state of a stage
+    that last came down to zero (`Hysteresis.initial_memory`), unless H was given another memory.
+    Then the play takes what lies between those of H, whose outputs are a continuous function of
+    the threshold that starts at F_0 = v and is flat beyond the largest.
+
+    Notes
+    -----
+    Congruency, and models without it: I. D. Mayergoyz, "Mathematical Models of Hysteresis",
+    Springer, 1991, doi:10.1007/978-1-4612-3028-1.
+    """
+
+    name: ClassVar[str] = 'noncongruent_minor_loops'
+    slot: ClassVar[Slot] = 'hysteresis'
+    description: ClassVar[str] = (
+        'minor loops of one width that differ with the bias; 0.3 .. 2 % of stroke'
+    )
+    needs: ClassVar[str] = 'equal minor loops at three biases'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='log'),
+        Parameter(
+            'slope', '1', 'growth kappa_j', 0.0, -10.0, 10.0, vector=True, default=0.0, step=2e-3
+        ),
+        Parameter(
+            'bias', '1', 'voltage c without a change', NAN, -10.0, 10.0, default=0.5, scale='fixed'
+        ),
+    )
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        self._r, self._slope = self.array('threshold'), self.array('slope')
+        self._memory = initial_memory(0.0, self._r)
+
+    @classmethod
+    def agree(cls, values: Mapping[str, Value]) -> None:
+        """Refuse an empty list; see `Effect.agree`."""
+        super().agree(values)
+        if not np.size(values['threshold']):
+            raise ModelError('effect noncongruent_minor_loops: give at least one threshold')
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return narrow, middling and wide plays, together and the middling alone."""
+        bias = (view.low + view.high) / 2
+        return tuple(
+            cls.trial({'threshold': np.array(widths) * view.span, 'bias': bias})
+            for widths in ([0.05, 0.15, 0.4], [0.15])
+        )
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest, with the plays where H would have them."""
+        w = self.inner.reset(v0, x0)
+        memory, core = initial_memory(x0, self._r), self.core
+        if isinstance(core, HysteresisOperator):
+            h = core.hysteresis
+            if not np.array_equal(core.memory, h.initial_memory(x0)):
+                r, f = np.append(0.0, h.thresholds), np.append(x0, core.memory)
+                memory = np.clip(np.interp(self._r, r, f), x0 - self._r, x0)
+        self._memory = memory
+        return w + float(self._more(np.array([x0]))[0])
+
+    def process(self, block: Block) -> Block:
+        """Return the block with H applied and the plays added."""
+        more = self._more(np.ascontiguousarray(block.x))
+        inner = self.inner.process(block)
+        return inner.with_signal(inner.x + more)
+
+    def _more(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        out: NDArray[np.float64] = _tilted(
+            x, self._r, self._slope, self.number('bias'), self._memory
+        )
+        return out

@@ -1,0 +1,71 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Preload loss: below some voltage the spring no longer holds the stack."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
+
+__all__ = ['PreloadLoss']
+
+
+class PreloadLoss(Effect):
+    """
+    A kink in the static curve where the preload runs out.
+
+    ``x = h - k max(0, theta - v)``: below theta the joint opens, its stiffness is another, and the
+    displacement follows the command with another slope.  The kink is at a voltage, whatever the
+    loops do.
+
+    Notes
+    -----
+    A stack takes no tension, hence the preload: A. J. Fleming and K. K. Leang, "Design, Modeling
+    and Control of Nanopositioning Systems", Springer, 2014, doi:10.1007/978-3-319-06617-2.  The
+    two stiffnesses joined at theta are the piecewise linear spring of a contact.
+    """
+
+    name: ClassVar[str] = 'preload_loss'
+    slot: ClassVar[Slot] = 'hidden'
+    description: ClassVar[str] = (
+        'another slope below the voltage at which the preload runs out; 0.1 .. 2 % of stroke'
+    )
+    needs: ClassVar[str] = (
+        'slow sweeps over the full range and minor loops on both sides of the kink'
+    )
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            'gain', '1', 'loss k of slope below theta', 0.0, -10.0, 10.0, default=0.0, step=3e-3
+        ),
+        Parameter('threshold', '1', 'voltage theta of the kink', NAN, -10.0, 10.0),
+    )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return kinks at seven places within the range."""
+        places = view.low + view.span * np.arange(1, 8) / 8
+        return tuple(cls.trial({'threshold': float(theta)}) for theta in places)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest; the effect has no memory."""
+        return x0 - self.number('gain') * max(0.0, self.number('threshold') - v0)
+
+    def process(self, block: Block) -> Block:
+        """Return the block with the loss below the kink."""
+        loss = np.maximum(0.0, self.number('threshold') - block.v)
+        return block.with_signal(block.x - self.number('gain') * loss)

@@ -1,0 +1,119 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Saturation: the amplifier runs out of voltage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import exp, inf, log1p
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.errors import ModelError
+from piezo_ident.kernel import kernel
+
+__all__ = ['Saturation']
+
+#: beyond this many knees from an end, rounding changes nothing that a float can hold
+FAR = 40.0
+
+
+@kernel
+def _soften(x: NDArray[np.float64], low: float, high: float, knee: float) -> NDArray[np.float64]:
+    out = np.empty(x.size)
+    for k in range(x.size):
+        v = x[k]
+        y = v
+        z = (v - high) / knee
+        if z > FAR:
+            y = high
+        elif z > -FAR:
+            y = v - knee * (log1p(exp(z)) if z < 0.0 else z + log1p(exp(-z)))
+        z = (low - v) / knee
+        if z > FAR:
+            y += low - v
+        elif z > -FAR:
+            y += knee * (log1p(exp(z)) if z < 0.0 else z + log1p(exp(-z)))
+        out[k] = y
+    return out
+
+
+class Saturation(Effect):
+    """
+    The voltage stays between two ends, reached sharply or round a knee.
+
+    ``va = v - k L((v - high)/k) + k L((low - v)/k)`` with ``L(z) = ln(1 + exp z)`` and k the knee:
+    a straight line of slope one between the ends and flat beyond them, rounded over a few k.  For
+    k = 0 it is ``clip(v, low, high)``; an end at infinity is not there.
+
+    Notes
+    -----
+    L is the smooth maximum of 0 and z: C. Chen and O. L. Mangasarian, "A class of smoothing
+    functions for nonlinear and mixed complementarity problems", Comput. Optim. Appl. 5, 1996.
+    Voltage ends of amplifiers for piezo actuators: A. J. Fleming and K. K. Leang, "Design,
+    Modeling and Control of Nanopositioning Systems", Springer, 2014,
+    doi:10.1007/978-3-319-06617-2.
+    """
+
+    name: ClassVar[str] = 'saturation'
+    slot: ClassVar[Slot] = 'input'
+    description: ClassVar[str] = (
+        'the amplifier goes flat at the ends of its range; nothing elsewhere, large there'
+    )
+    needs: ClassVar[str] = 'a slow sweep over the full range, out to both of its ends'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('low', '1', 'lower end', -inf, -inf, inf, default=-inf),
+        Parameter('high', '1', 'upper end', inf, -inf, inf, default=inf),
+        Parameter('knee', '1', 'width k of the rounding', NAN, 0.0, 10.0, default=0.0),
+    )
+
+    @classmethod
+    def agree(cls, values: Mapping[str, Value]) -> None:
+        """Refuse ends in the wrong order; see `Effect.agree`."""
+        super().agree(values)
+        low, high = values['low'], values['high']
+        if not low < high:  # type: ignore[operator]
+            raise ModelError(f'effect saturation: low = {low} must lie below high = {high}')
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return one end at a time, at several places near it, sharp and round."""
+        found = []
+        for inside in (0.02, 0.05, 0.1, 0.2, 0.3):
+            for knee in (0.02, 0.2):
+                round_off = {'knee': knee * view.span}
+                found.append(cls.trial({'high': view.high - inside * view.span, **round_off}))
+                found.append(cls.trial({'low': view.low + inside * view.span, **round_off}))
+        return tuple(found)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest; the effect has no memory."""
+        return float(self._limited(np.array([x0]))[0])
+
+    def process(self, block: Block) -> Block:
+        """Return the block with its signal limited."""
+        return block.with_signal(self._limited(block.x))
+
+    def _limited(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        low, high, knee = (self.number(name) for name in ('low', 'high', 'knee'))
+        if low == -inf and high == inf:
+            return x
+        if knee == 0.0:
+            return np.clip(x, low, high)
+        out: NDArray[np.float64] = _soften(np.ascontiguousarray(x), low, high, knee)
+        return out

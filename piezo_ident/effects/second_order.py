@@ -1,0 +1,109 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Second-order sections that effects are made of, by the bilinear transform."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import ModelError
+from piezo_ident.kernel import kernel
+
+__all__ = ['Section', 'slope_of_mode']
+
+
+@kernel
+def _run(
+    x: NDArray[np.float64], c: NDArray[np.float64], state: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    # c: n0, n1, a1, a2; state: the last input and two numbers of the transposed direct form.
+    # The filter works on differences of its input, so that it is at rest to the last bit.
+    n0, n1, a1, a2 = c[0], c[1], c[2], c[3]
+    last, s0, s1 = state[0], state[1], state[2]
+    out = np.empty(x.size)
+    for k in range(x.size):
+        d = x[k] - last
+        last = x[k]
+        y = n0 * d + s0
+        s0 = n1 * d - a1 * y + s1
+        s1 = -a2 * y
+        out[k] = y
+    state[0], state[1], state[2] = last, s0, s1
+    return out
+
+
+def slope_of_mode(frequency: float, sample_rate: float) -> float:
+    """
+    Return c in ``s/w -> c (1 - z^-1)/(1 + z^-1)``, exact at the mode's own frequency w.
+
+    Raises
+    ------
+    ModelError
+        When the frequency is not below half the sampling rate.
+    """
+    if not frequency < sample_rate / 2.0:
+        raise ModelError(
+            f'a mode at {frequency:g} Hz needs more than {2 * frequency:g} samples a second, '
+            f'and there are {sample_rate:g}; lower its frequency'
+        )
+    return float(1.0 / np.tan(np.pi * frequency / sample_rate))
+
+
+class Section:
+    """
+    ``g (M(s) - 1) + k R(s)`` with M = w^2/D, R = w s/D and D = s^2 + 2 zeta w s + w^2.
+
+    With S = s/w the sum is ``(-g (S^2 + 2 zeta S) + k S) / (S^2 + 2 zeta S + 1)``: it has a zero
+    at rest, which is taken out as a difference of the input.
+
+    Parameters
+    ----------
+    frequency, damping : float
+        w / 2 pi [Hz] and zeta.
+    gain, rate_gain : float
+        g and k.
+    sample_rate : float
+        [Hz]
+
+    Raises
+    ------
+    ModelError
+        When the frequency is not below half the sampling rate.
+    """
+
+    def __init__(
+        self, frequency: float, damping: float, gain: float, rate_gain: float, sample_rate: float
+    ) -> None:
+        c = slope_of_mode(frequency, sample_rate)
+        a0 = c * c + 2 * damping * c + 1.0
+        self._c = np.array(
+            [
+                -gain * (c * c + 2 * damping * c) + rate_gain * c,
+                gain * (c * c - 2 * damping * c) + rate_gain * c,
+                2.0 - 2.0 * c * c,
+                c * c - 2 * damping * c + 1.0,
+            ]
+        )
+        self._c /= a0
+        self._state = np.zeros(3)
+
+    def reset(self, x0: float) -> None:
+        """Come to rest under a constant input; the output is zero then."""
+        self._state = np.array([x0, 0.0, 0.0])
+
+    def process(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the filtered signal, shape (n,)."""
+        out: NDArray[np.float64] = _run(np.ascontiguousarray(x), self._c, self._state)
+        return out

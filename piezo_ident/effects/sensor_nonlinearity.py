@@ -1,0 +1,72 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sensor nonlinearity: what is read is a curved function of what is there."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.block import Block, Slot
+from piezo_ident.effects.base import Effect, Parameter, Trial, View
+
+__all__ = ['SensorNonlinearity']
+
+
+class SensorNonlinearity(Effect):
+    """
+    A polynomial between displacement and reading.
+
+    ``y = x + c2 x^2 + c3 x^3 + c4 x^4``, with x and y as shares of the output span.  The error
+    is one and the same function of the displacement at every frequency, behind G and the delay;
+    close to a resonance that tells it from a curvature in front of G.
+
+    Notes
+    -----
+    Strain gauges are off by 0.1 .. 1 % of full scale, capacitive sensors by 0.01 .. 0.1 %:
+    A. J. Fleming, "A review of nanometer resolution position sensors: operation and performance",
+    Sensors and Actuators A 190, 2013, doi:10.1016/j.sna.2012.10.016, where the
+    curve is a mapping from displacement to reading, and what calibration leaves of it the error.
+    """
+
+    name: ClassVar[str] = 'sensor_nonlinearity'
+    slot: ClassVar[Slot] = 'output'
+    description: ClassVar[str] = (
+        'a curved characteristic of the sensor; strain gauge 0.1 .. 1 %, capacitive 0.01 .. 0.1 %'
+    )
+    needs: ClassVar[str] = 'the full range both slowly and near the first resonance'
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -1.0, 1.0, default=0.0, step=1e-3),
+        Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -1.0, 1.0, default=0.0, step=1e-3),
+        Parameter('fourth', '1', 'coefficient c4 of x^4', 0.0, -1.0, 1.0, default=0.0, step=1e-3),
+    )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """Return the square alone, with the cubic, and all."""
+        return cls.trial({}, ['square']), cls.trial({}, ['square', 'cubic']), cls.trial({})
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest; the effect has no memory."""
+        return float(self._read(np.array([x0]))[0])
+
+    def process(self, block: Block) -> Block:
+        """Return the block as the sensor reads it."""
+        return block.with_signal(self._read(block.x))
+
+    def _read(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))
+        return x + x * x * (c2 + x * (c3 + x * c4))

@@ -1,0 +1,128 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The settings at which an effect is tried on given data, and what it may know of these data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ['Trial', 'View', 'ladder']
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """
+    What an effect may know of the data before it is tried on them.
+
+    Attributes
+    ----------
+    sample_rate : float
+        [Hz]
+    low, high : float
+        Range of the normalised command u.
+    speeds : ndarray, shape (n,)
+        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 over the part that moves.  One more
+        entry, the largest of all, may follow.
+    duration : float
+        Length of the longest record [s].
+    channels : mapping of str to (float, float)
+        Mean and standard deviation of each further channel, in its own unit.
+    lines : tuple of float
+        Frequencies [Hz] of the lines that were found in the residual.
+    modes : tuple of (float, float)
+        Natural frequency [Hz] and damping ratio of each mode of G.
+    max_frequency : float
+        Highest frequency at which the command has power [Hz].
+    thresholds : ndarray, shape (m,)
+        Thresholds of H.
+    """
+
+    sample_rate: float
+    low: float
+    high: float
+    speeds: NDArray[np.float64]
+    duration: float
+    channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    lines: tuple[float, ...] = ()
+    modes: tuple[tuple[float, float], ...] = ()
+    max_frequency: float = 100.0
+    thresholds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def span(self) -> float:
+        """Width of the range of u."""
+        return self.high - self.low
+
+    @property
+    def speed(self) -> float:
+        """A speed that is fast for these data [1/s], never zero."""
+        moving = self.speeds[self.speeds > 0]
+        return max(1e-6, float(np.quantile(moving, 0.75)) if moving.size else self.span)
+
+    @property
+    def nyquist(self) -> float:
+        """Half the sampling rate [Hz]."""
+        return self.sample_rate / 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """
+    One way to try an effect: where it starts, and which amplitudes move.
+
+    Attributes
+    ----------
+    values : mapping
+        One value for each parameter; amplitudes are neutral.
+    moves : tuple of (str, int or None)
+        The amplitudes that are moved, one column each: a name, and the place in it where it is a
+        list.  Empty for an effect without an amplitude: then it is switched on in `values`, and
+        the column is the whole difference between on and off.
+    steps : tuple of float
+        How far each is moved.
+    """
+
+    values: Mapping[str, Any]
+    moves: tuple[tuple[str, int | None], ...] = ()
+    steps: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'values', MappingProxyType(dict(self.values)))
+
+    def settings(self) -> list[dict[str, Any]]:
+        """Return one complete set of parameters for each column."""
+        if not self.moves:
+            return [dict(self.values)]
+        found = []
+        for (name, index), step in zip(self.moves, self.steps, strict=True):
+            values = dict(self.values)
+            if index is None:
+                values[name] = values[name] + step
+            else:
+                values[name] = np.array(values[name], dtype=np.float64)
+                values[name][index] += step
+            found.append(values)
+        return found
+
+
+def ladder(low: float, high: float, count: int) -> list[float]:
+    """Return `count` numbers from `low` to `high` in equal ratios."""
+    return [float(x) for x in np.geomspace(low, max(low, high), count)]

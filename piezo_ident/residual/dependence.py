@@ -1,0 +1,366 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""On what a residual depends: its mean over voltage, speed, time since a turn or a step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
+
+__all__ = ['Curve', 'curves_of']
+
+#: samples after averaging, bins of a curve, bins a decade of time or speed
+SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
+#: stretches of time that count as independent: so many, but none shorter than this [s]
+CHUNKS, CHUNK_TIME = 120, 0.05
+#: fewest samples and chunks of a bin that is shown
+FEWEST, VISITS = 8, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """
+    Mean residual over bins of one quantity.
+
+    Attributes
+    ----------
+    against : {'v', 'dv/dt', 'time since the turn', 'time since the step'}
+    branch : {'up', 'down', 'both'}
+        Direction of the drive.  'both': the residual is multiplied by the direction, and for the
+        step also by its share of the largest, so that what follows the drive adds up.
+    unit : str
+        Of x.
+    x : ndarray, shape (m,)
+        Mean of the quantity in each bin.
+    mean, std : ndarray, shape (m,)
+        Mean residual and its standard deviation [m]; whole stretches of time count as one
+        observation, so correlated samples do not make it look better known than it is.
+    count : ndarray of int, shape (m,)
+        Samples after averaging.
+    share : float
+        Share of the residual's variance, where the quantity is defined, that the curve (both
+        branches together) fitted to every other stretch of time explains in the rest; 0..1.
+    per_decade, per_decade_std : float
+        Slope over lg t [m a decade], and its standard deviation; NaN over v and dv/dt.
+    """
+
+    against: str
+    branch: str
+    unit: str
+    x: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+    count: NDArray[np.int64]
+    share: float
+    per_decade: float = float('nan')
+    per_decade_std: float = float('nan')
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Averaged samples of the motions."""
+
+    e: NDArray[np.float64]
+    v: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    since: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    chunk: NDArray[np.int64]
+
+
+def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
+    """
+    Return the mean residual over v, dv/dt, and the time since the last turn and the last step.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+    stretches : sequence of Stretch
+
+    Returns
+    -------
+    tuple of Curve
+        Those for which there are data.
+    """
+    found: list[Curve] = []
+    motion = _motions(parts, stretches)
+    if motion is not None:
+        found += _against_v(motion)
+        found += _against_speed(motion)
+        found += _since_turn(motion)
+    found += _since_step(parts, stretches)
+    return tuple(found)
+
+
+def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Motion | None:
+    moving = [s for s in stretches if s.kind != 'rest']
+    total = sum(s.n for s in moving)
+    if total == 0:
+        return None
+    m = max(1, -(-total // SAMPLES))
+    columns: list[list[NDArray[np.float64]]] = [[] for _ in range(5)]
+    chunks: list[NDArray[np.int64]] = []
+    seconds = sum(s.n / parts[s.part].piece.sample_rate for s in moving)
+    chunk_time = max(CHUNK_TIME, seconds / CHUNKS)
+    number = 0
+    for s in moving:
+        piece, rate = parts[s.part].piece, parts[s.part].piece.sample_rate
+        v = piece.v[s.start : s.stop]
+        speed = np.gradient(v) * rate
+        averaged = [block_means(x, m) for x in (parts[s.part].e[s.start : s.stop], v, speed)]
+        direction = np.sign(averaged[2])
+        since = _since(direction) * m / rate
+        for column, x in zip(columns, (*averaged, since, direction), strict=True):
+            column.append(x)
+        chunk = np.arange(averaged[0].size) * m / rate // chunk_time
+        chunks.append(number + chunk.astype(np.int64))
+        number = int(chunks[-1][-1]) + 1 if chunk.size else number
+    e, v, speed, since, direction = (np.concatenate(column) for column in columns)
+    return _Motion(e, v, speed, since, direction, np.concatenate(chunks))
+
+
+def _since(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how many samples ago the direction changed; NaN before it first did."""
+    turns = np.flatnonzero(np.diff(direction) != 0.0) + 1
+    k = np.arange(direction.size)
+    last = np.searchsorted(turns, k, side='right') - 1
+    if turns.size == 0:
+        return np.full(direction.size, np.nan)
+    return np.where(last >= 0, k - turns[np.maximum(last, 0)] + 0.5, np.nan)
+
+
+def _against_v(motion: _Motion) -> list[Curve]:
+    ends = np.linspace(motion.v.min(), motion.v.max() + 1e-12, BINS + 1)
+    bins = np.clip(np.searchsorted(ends, motion.v, side='right') - 1, 0, BINS - 1)
+    bins = bins + BINS * (motion.direction < 0.0)
+    share = _held_out(motion.e, bins, motion.chunk, np.ones(motion.e.size))
+    return [
+        _curve('v', branch, 'V', motion.v, motion.e, bins, motion.chunk, own, share)
+        for branch, own in (('up', motion.direction > 0.0), ('down', motion.direction < 0.0))
+    ]
+
+
+def _against_speed(motion: _Motion) -> list[Curve]:
+    # speeds span decades, and a triangle has only one
+    moving = np.abs(motion.speed) > 1e-6 * np.abs(motion.speed).max()
+    if moving.sum() < 4 * BINS:
+        return []
+    bins = np.zeros(motion.speed.size, dtype=np.int64)
+    bins[moving] = _decades(np.abs(motion.speed[moving]))
+    bins = 2 * bins + (motion.speed < 0.0)
+    share = _held_out(
+        motion.e[moving], bins[moving], motion.chunk[moving], np.ones(int(moving.sum()))
+    )
+    return [
+        _curve('dv/dt', branch, 'V/s', motion.speed, motion.e, bins, motion.chunk, own, share)
+        for branch, own in (
+            ('up', moving & (motion.speed > 0.0)),
+            ('down', moving & (motion.speed < 0.0)),
+        )
+    ]
+
+
+def _since_turn(motion: _Motion) -> list[Curve]:
+    known = np.isfinite(motion.since) & (motion.direction != 0.0)
+    if known.sum() < 4 * BINS:
+        return []
+    x, sign = motion.since[known], motion.direction[known]
+    bins = _decades(x)
+    e, chunk = motion.e[known] * sign, motion.chunk[known]
+    share = _held_out(motion.e[known], bins, chunk, sign)
+    curve = _curve(
+        'time since the turn', 'both', 's', x, e, bins, chunk, np.ones(x.size, bool), share
+    )
+    return [_with_slope(curve)] if curve.x.size > 1 else []
+
+
+def _decades(t: NDArray[np.float64]) -> NDArray[np.int64]:
+    k = np.floor(PER_DECADE * np.log10(t)).astype(np.int64)
+    return np.asarray(k - k.min())
+
+
+def _curve(
+    against: str,
+    branch: str,
+    unit: str,
+    x: NDArray[np.float64],
+    e: NDArray[np.float64],
+    bins: NDArray[np.int64],
+    chunk: NDArray[np.int64],
+    own: NDArray[np.bool_],
+    share: float,
+) -> Curve:
+    bins, x, e, chunk = bins[own], x[own], e[own], chunk[own]
+    size = int(bins.max(initial=0)) + 1
+    count = np.bincount(bins, minlength=size)
+    filled = np.maximum(count, 1)
+    centre = np.bincount(bins, x, size) / filled
+    mean = np.bincount(bins, e, size) / filled
+    # a stretch of time enters with the sum of what it brings to a bin
+    pair, visit = np.unique(bins * (int(chunk.max(initial=0)) + 1) + chunk, return_inverse=True)
+    sums = np.bincount(visit, e - mean[bins])
+    home = pair // (int(chunk.max(initial=0)) + 1)
+    visits = np.bincount(home, minlength=size)
+    spread = np.bincount(home, sums * sums, size)
+    correction = visits / np.maximum(visits - 1, 1)
+    std = np.sqrt(spread * correction) / filled
+    shown = np.flatnonzero((count >= FEWEST) & (visits >= VISITS))
+    shown = shown[np.argsort(centre[shown])]
+    return Curve(
+        against, branch, unit, centre[shown], mean[shown], std[shown], count[shown], share
+    )
+
+
+def _held_out(
+    e: NDArray[np.float64],
+    bins: NDArray[np.int64],
+    chunk: NDArray[np.int64],
+    weight: NDArray[np.float64],
+) -> float:
+    """Return the share of the variance of e that bin means times weight explain, held out."""
+    left = whole = 0.0
+    size = int(bins.max(initial=0)) + 1
+    for fold in (0, 1):
+        test = chunk % 2 == fold
+        fit = ~test
+        if not (test.any() and fit.any()):
+            return 0.0
+        centre = float(e[fit].mean())
+        # what e has to offer without the curve is its mean over the other half
+        top = np.bincount(bins[fit], weight[fit] * (e[fit] - centre), size)
+        bottom = np.bincount(bins[fit], weight[fit] ** 2, size)
+        value = np.where(bottom > 0.0, top / np.maximum(bottom, 1e-300), 0.0)
+        rest = e[test] - centre
+        whole += float(rest @ rest)
+        rest = rest - weight[test] * value[bins[test]]
+        left += float(rest @ rest)
+    return float(np.clip(1.0 - left / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+
+
+def _with_slope(curve: Curve) -> Curve:
+    slope, std = _slope(np.log10(curve.x), curve.mean, curve.std)
+    return Curve(
+        curve.against,
+        curve.branch,
+        curve.unit,
+        curve.x,
+        curve.mean,
+        curve.std,
+        curve.count,
+        curve.share,
+        slope,
+        std,
+    )
+
+
+def _slope(
+    x: NDArray[np.float64], y: NDArray[np.float64], std: NDArray[np.float64]
+) -> tuple[float, float]:
+    known = std > 0.0
+    if known.sum() < 3:
+        return float('nan'), float('nan')
+    x, y, w = x[known], y[known], 1.0 / std[known] ** 2
+    mean = float(np.average(x, weights=w))
+    power = float(np.sum(w * (x - mean) ** 2))
+    if power <= 0.0:
+        return float('nan'), float('nan')
+    slope = float(np.sum(w * (x - mean) * y)) / power
+    rest = y - float(np.average(y, weights=w)) - slope * (x - mean)
+    # a curve that is no line knows its slope less well than its points say
+    excess = max(1.0, float(np.sum(w * rest**2)) / max(int(known.sum()) - 2, 1))
+    return slope, float(np.sqrt(excess / power))
+
+
+def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
+    """Return the residual of the holds over lg t, each hold with an offset of its own."""
+    holds = [s for s in stretches if s.kind == 'rest' and s.step != 0.0]
+    if len(holds) < 2:
+        return []
+    largest = max(abs(s.step) for s in holds)
+    rows: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], float]] = []
+    first = min(2.0 / parts[s.part].piece.sample_rate for s in holds)
+    for s in holds:
+        rate = parts[s.part].piece.sample_rate
+        t = (np.arange(s.n) + 0.5) / rate
+        k = np.floor(PER_DECADE * np.log10(t / first)).astype(np.int64)
+        count = np.bincount(np.maximum(k, 0))
+        sums = np.bincount(np.maximum(k, 0), parts[s.part].e[s.start : s.stop])
+        used = np.flatnonzero(count)
+        rows.append((used, sums[used] / count[used], count[used], s.step / largest))
+    size = max(int(r[0][-1]) for r in rows) + 1
+    curve, _ = _common(rows, size)
+    left = whole = 0.0
+    for fold in (0, 1):
+        test = rows[fold::2]
+        other, known = _common(rows[1 - fold :: 2], size)
+        for k, e, _, weight in test:
+            own = known[k]
+            if own.sum() < 2:
+                continue
+            rest = e[own] - e[own].mean()
+            whole += float(rest @ rest)
+            fitted = weight * other[k[own]]
+            rest = rest - (fitted - fitted.mean())
+            left += float(rest @ rest)
+    share = float(np.clip(1.0 - left / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+    x = first * 10.0 ** ((np.arange(size) + 0.5) / PER_DECADE)
+    top, bottom, count = np.zeros(size), np.zeros(size), np.zeros(size, dtype=np.int64)
+    visits = np.zeros(size, dtype=np.int64)
+    for k, e, n, weight in rows:
+        fitted = weight * curve[k]
+        rest = e - fitted
+        rest = rest - rest.mean()
+        top[k] += (weight * rest) ** 2
+        bottom[k] += weight**2
+        count[k] += n
+        visits[k] += 1
+    shown = visits >= 2
+    correction = visits / np.maximum(visits - 1, 1)
+    std = np.sqrt(top * correction) / np.maximum(bottom, 1e-300)
+    origin = float(curve[shown][0]) if shown.any() else 0.0
+    made = Curve(
+        'time since the step',
+        'both',
+        's',
+        x[shown],
+        curve[shown] - origin,
+        std[shown],
+        count[shown],
+        share,
+    )
+    return [_with_slope(made)] if made.x.size > 1 else []
+
+
+def _common(
+    rows: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], float]],
+    size: int,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the curve g that fits e = offset of the hold + weight g(bin) best, and its bins."""
+    n = sum(k.size for k, _, _, _ in rows)
+    A, b = np.zeros((n, size + len(rows))), np.zeros(n)
+    at = 0
+    for i, (k, e, _, weight) in enumerate(rows):
+        places = np.arange(at, at + k.size)
+        A[places, k] = weight
+        A[places, size + i] = 1.0
+        b[places] = e
+        at += k.size
+    known = np.asarray(np.abs(A[:, :size]).sum(axis=0) > 0.0)
+    g = np.linalg.lstsq(A, b, rcond=1e-9)[0][:size]
+    return np.asarray(g), known

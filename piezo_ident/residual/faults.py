@@ -1,0 +1,343 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Faults of the data that a residual lays open: repeats, jitter, a comb, spikes, flat ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record import Fault
+from piezo_ident.residual.scatter import Scatter, scatter_of
+from piezo_ident.residual.stretches import ResidualPart, strokes_of
+from scipy.ndimage import binary_dilation, maximum_filter1d
+
+__all__ = ['FaultSearch', 'find_faults']
+
+#: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
+CHANCE, MOVED = 0.01, 3e-5
+#: repeats in a moving signal: at least so many, and this share of the samples that move
+REPEATS, REPEATED = 4, 2e-4
+#: share of the repeats behind which the signal makes up for them; share of a sensor that is slow
+MADE_UP, HELD = 0.7, 0.2
+#: a quantum is named above so many times the rest of the noise, and this share of the stroke
+COARSE, COARSE_SHARE = 2.0, 1e-4
+#: deviations of an outlier, and the largest share of it that its surroundings may show
+FAR, QUIET = 8.0, 0.35
+#: samples at the end of a clipped range, deviations by which the model leaves it meanwhile
+FLAT, LEFT = 5, 6.0
+#: jitter: deviations of the slope, least growth of the variance, blocks of samples
+SURE, GROWTH, CHUNK = 5.0, 1.4, 64
+
+
+@dataclass(frozen=True, eq=False)
+class FaultSearch:
+    """
+    Faults found.
+
+    Attributes
+    ----------
+    faults : tuple of Fault
+        ``missed_samples``, ``timing_jitter``, ``quantisation``, ``outliers``, ``clipping``.
+    bad : tuple of ndarray of bool
+        For each part the samples that are missed, outliers or clipped, shape (n,).
+    out : tuple of ndarray of bool
+        The clipped ones among them, which no bridge can replace.
+    jitter : float
+        Rms of the sampling instants [s]; 0 when none is seen.
+    quantum : float
+        Step of the readings [m]; 0 when there is none.
+    """
+
+    faults: tuple[Fault, ...]
+    bad: tuple[NDArray[np.bool_], ...]
+    out: tuple[NDArray[np.bool_], ...]
+    jitter: float = 0.0
+    quantum: float = 0.0
+
+
+def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
+    """
+    Look for the five faults.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+
+    Returns
+    -------
+    FaultSearch
+        One fault a record and kind.
+    """
+    faults: list[Fault] = []
+    bad: list[NDArray[np.bool_]] = []
+    out: list[NDArray[np.bool_]] = []
+    largest_jitter = largest_quantum = 0.0
+    strokes = strokes_of(parts)
+    for part in parts:
+        stroke = strokes[part.record]
+        missed = clipped = outliers = np.zeros(part.piece.n, dtype=bool)
+        if part.piece.n >= 100 and stroke > 0.0:
+            scatter = scatter_of(part)
+            largest_quantum = max(largest_quantum, scatter.quantum)
+            clipped = _clipped(part, scatter)
+            missed = _missed(part, scatter)
+            wide = binary_dilation(missed, iterations=3)
+            outliers = _outliers(part, scatter, wide | clipped)
+            if missed.any():
+                # a reading that repeats the one before is no spike
+                outliers[1:] &= np.diff(part.piece.y) != 0.0
+            jitter, growth = _jitter(part, scatter, wide | clipped | outliers)
+            if jitter > 0.0 and outliers.any():
+                # most of them may be readings at the wrong moment
+                outliers = _outliers(part, scatter, wide | clipped, jitter)
+            largest_jitter = max(largest_jitter, jitter)
+            faults += _said(part, stroke, scatter, missed, outliers, clipped)
+            if jitter > 0.0:
+                faults.append(
+                    Fault(
+                        'timing_jitter',
+                        f'in {part.record}',
+                        part.piece.n,
+                        f'sampling instants scatter by {1e6 * jitter:.3g} us rms: the variance '
+                        f'of the residual grows {growth:.3g} times with (dy/dt)^2',
+                    )
+                )
+        bad.append(missed | outliers | clipped)
+        out.append(clipped)
+    return FaultSearch(tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum)
+
+
+def _said(
+    part: ResidualPart,
+    stroke: float,
+    scatter: Scatter,
+    missed: NDArray[np.bool_],
+    outliers: NDArray[np.bool_],
+    clipped: NDArray[np.bool_],
+) -> list[Fault]:
+    faults = []
+    t = part.piece.t
+
+    def where(mask: NDArray[np.bool_]) -> str:
+        places = np.flatnonzero(mask)
+        return f'in {part.record}, first at {t[places[0]]:.6g} s'
+
+    if missed.any():
+        faults.append(
+            Fault(
+                'missed_samples',
+                where(missed),
+                int(missed.sum()),
+                'readings that repeat the one before while the position moves; to be left out',
+            )
+        )
+    coarse = scatter.quantum > COARSE * scatter.rest and scatter.quantum > COARSE_SHARE * stroke
+    if coarse:
+        faults.append(
+            Fault(
+                'quantisation',
+                f'in {part.record}',
+                part.piece.n,
+                f'readings are multiples of {1e9 * scatter.quantum:.4g} nm, '
+                f'{100 * scatter.quantum / stroke:.2g} % of the stroke and more than twice the '
+                'rest of the noise',
+            )
+        )
+    if outliers.any():
+        faults.append(
+            Fault(
+                'outliers',
+                where(outliers),
+                int(outliers.sum()),
+                'isolated jumps; to be left out',
+            )
+        )
+    if clipped.any():
+        faults.append(
+            Fault(
+                'clipping',
+                where(clipped),
+                int(clipped.sum()),
+                'readings rest at the end of their range while the model moves; to be left out',
+            )
+        )
+    return faults
+
+
+def _missed(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
+    """
+    Return readings equal to the one before where those around say that the position moved.
+
+    The slope is that between the readings before and after the equal ones, so no model is asked.
+    """
+    y, n = part.piece.y, part.piece.n
+    stroke = float(np.ptp(y))
+    found = np.zeros(n, dtype=bool)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(y) != 0.0) + 1, [n]])
+    start, stop = edges[:-1], edges[1:]
+    inner = (start >= 1) & (stop < n)
+    start, stop = start[inner], stop[inner]
+    slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
+    sigma, q = max(scatter.rms, 1e-12 * stroke), scatter.quantum
+    density = q / (np.sqrt(4.0 * np.pi) * sigma)
+    # the slope is itself known to about half a deviation
+    least = 2.0 * np.sqrt(np.log(max(density / CHANCE, 1.0))) + 1.0
+    length = stop - start
+    # a missed reading is entered at speed, and behind it the signal makes up for it
+    sign = np.sign(y[stop] - y[start - 1])
+    before, after = sign * (y[start] - y[start - 1]), sign * (y[stop] - y[stop - 1])
+    entered = before > 0.3 * slope
+    makes_up = (after - before) / np.maximum(length - 1, 1)
+    for factor in (1.0, 1.5, 2.5, 4.0):
+        moving = slope > factor * max(least * scatter.rms + 1.5 * q, MOVED * stroke)
+        equal = moving & entered & (length > 1)
+        samples, count = int(length[moving].sum()), int((length - 1)[equal].sum())
+        distance = np.maximum(slope[moving] - 0.5 * sigma - q, 0.0) / (2.0 * sigma)
+        expected = float(np.sum(length[moving] * density * np.exp(-(distance**2))))
+        by_chance = 2.0 * expected + 6.0 * np.sqrt(expected)
+        if count < max(REPEATS, REPEATED * samples) or count <= by_chance:
+            continue
+        behind = float(np.mean(makes_up[equal] > 0.3 * slope[equal]))
+        if behind >= MADE_UP or count > HELD * samples:
+            for a, b in zip(start[equal], stop[equal], strict=True):
+                found[a + 1 : b] = True
+            return found & part.mask
+    return found
+
+
+def _outliers(
+    part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_], jitter: float = 0.0
+) -> NDArray[np.bool_]:
+    """Return single readings far from both neighbours, which agree with each other."""
+    e = part.e
+    height = np.zeros(e.size)
+    height[1:-1] = e[1:-1] - 0.5 * (e[:-2] + e[2:])
+    size = np.abs(height)
+    window = 101
+    # the usual scatter around a sample: of jittered or driven data it changes along the record
+    local = _running_median(size, window) * 1.4826
+    level = np.maximum(local, np.sqrt(1.5) * scatter.rms)
+    level = np.maximum(level, 1e-6 * float(np.ptp(part.piece.y)))
+    if jitter > 0.0:
+        slope = np.gradient(part.y_hat) * part.piece.sample_rate
+        level = np.hypot(level, np.sqrt(1.5) * jitter * slope)
+    candidates = np.flatnonzero(
+        (size > FAR * level) & (size > 3.5 * scatter.quantum) & part.mask & ~known
+    )
+    found = np.zeros(e.size, dtype=bool)
+    for k in candidates:
+        if k < 8 or k >= e.size - 8:
+            continue
+        around = np.concatenate([e[k - 7 : k], e[k + 1 : k + 8]])
+        # a spike leaves its surroundings as they are; ringing, a step or a kink does not
+        places = np.concatenate([np.arange(-7, 0), np.arange(1, 8)])
+        rest = around - np.polynomial.Polynomial.fit(places, around, 1)(places)
+        found[k] = float(np.abs(rest).max()) < QUIET * size[k]
+    return found
+
+
+def _running_median(x: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Return the larger of the medians of a block and its neighbours, for every sample."""
+    blocks = max(1, x.size // window)
+    means = np.median(x[: blocks * window].reshape(blocks, -1), axis=1)
+    means = maximum_filter1d(means, 3, mode='nearest')
+    return np.asarray(means[np.minimum(np.arange(x.size) // window, blocks - 1)])
+
+
+def _clipped(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
+    """Return readings that stay at the largest or smallest value while the model moves on."""
+    y, y_hat, v = part.piece.y, part.y_hat, part.piece.v
+    found = np.zeros(y.size, dtype=bool)
+    span = float(np.ptp(v))
+    stroke = float(np.ptp(y))
+    for end in (float(y.max()), float(y.min())):
+        at = np.abs(y - end) <= max(1e-9 * stroke, 0.25 * scatter.quantum)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(np.int8), [0]])))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            if b - a < FLAT:
+                continue
+            # a delay lets the end of a rest look as if v moved on
+            late = b - min((b - a) // 4, round(0.002 * part.piece.sample_rate))
+            moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
+            gone = moved > LEFT * (scatter.rms + scatter.quantum) and moved > 1e-4 * stroke
+            if drive > 1e-4 * span and (gone or (drive > 0.02 * span and b - a >= 4 * FLAT)):
+                found[a:b] = True
+    return found & part.mask
+
+
+def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> tuple[float, float]:
+    """
+    Return the rms scatter of the sampling instants [s], and by how much the variance grows.
+
+    A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
+    sigma^2 + jitter^2 (dy/dt)^2.  Third differences keep what a model misses out of it, where
+    the motion is smooth; elsewhere nothing is read.
+    """
+    e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
+    third = np.zeros(e.size)
+    third[2:-1] = np.diff(e, 3) / np.sqrt(20.0)
+    motion = np.zeros(e.size)
+    motion[2:-1] = np.abs(np.diff(y_hat, 3)) / np.sqrt(20.0)
+    slope = np.gradient(y_hat) * rate
+    unusable = known | ~part.mask
+    unusable[:4] = unusable[-4:] = True
+    unusable = binary_dilation(unusable, iterations=3)
+    n = e.size // CHUNK * CHUNK
+    if n < 40 * CHUNK or scatter.rms == 0.0:
+        return 0.0, 1.0
+    smooth = motion[:n].reshape(-1, CHUNK).max(axis=1) < 0.2 * scatter.rms
+    rows = smooth & ~unusable[:n].reshape(-1, CHUNK).any(axis=1)
+    s2 = np.mean(slope[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
+    h2 = np.mean(third[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
+    # readings that rest on one code have no scatter of their own to compare with
+    moving = np.sqrt(s2) > scatter.quantum * rate
+    s2, h2 = s2[moving], h2[moving]
+    if s2.size < 40 or float(np.ptp(s2)) == 0.0:
+        return 0.0, 1.0
+    slope2, error = _slope(s2, h2)
+    if slope2 <= SURE * error:
+        return 0.0, 1.0
+    base = max(float(np.mean(h2)) - slope2 * float(np.mean(s2)), 1e-3 * float(np.mean(h2)))
+    base = max(base, (1e-6 * float(np.ptp(part.piece.y))) ** 2)
+    growth = 1.0 + slope2 * float(np.quantile(s2, 0.98)) / base
+    # what saturates with speed, as a converter's own noise does, is no jitter
+    fast = s2 > np.median(s2)
+    again, error = _slope(s2[fast], h2[fast])
+    if growth < GROWTH or again <= 3.0 * error or not 0.3 < again / slope2 < 3.0:
+        return 0.0, 1.0
+    return float(np.sqrt(slope2)), growth
+
+
+def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the slope of a line by weighted least squares and its robust standard deviation."""
+    weight = np.ones(x.size)
+    slope = error = 0.0
+    for _ in range(3):
+        mean = np.average(x, weights=weight)
+        dx = x - mean
+        power = float(np.sum(weight * dx * dx))
+        if power == 0.0:
+            return 0.0, float('inf')
+        level = float(np.average(y, weights=weight))
+        slope = float(np.sum(weight * dx * y)) / power
+        rest = y - level - slope * dx
+        error = float(np.sqrt(np.sum((weight * dx * rest) ** 2))) / power
+        fitted = np.maximum(level + slope * dx, 0.05 * level)
+        # a mean of squares scatters in proportion to itself
+        weight = 1.0 / fitted**2
+    return slope, error

@@ -1,0 +1,297 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The noise floor of a residual: what comes out differently each time the drive is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.residual.stretches import ResidualPart, Stretch
+from scipy import signal
+
+__all__ = ['FloorSource', 'NoiseFloor', 'noise_floor']
+
+#: a frame of differences is freed of a slow change of this order
+ORDER = 3
+#: shortest frame [s]: slower changes count as drift
+FRAME = 0.25
+#: share at the start of a rest that is left out, and at least this time [s]
+SETTLING, SETTLING_TIME = 0.2, 0.02
+#: most blocks a table of block lengths goes up to
+LONGEST_BLOCK = 4096
+
+
+@dataclass(frozen=True)
+class FloorSource:
+    """
+    One stretch in which the noise was read.
+
+    Attributes
+    ----------
+    record, segment : str
+    kind : {'repeat', 'rest'}
+    start_time : float
+        [s]
+    n : int
+        Samples read.
+    rms : float
+        [m]
+    """
+
+    record: str
+    segment: str
+    kind: str
+    start_time: float
+    n: int
+    rms: float
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFloor:
+    """
+    Noise that no model of the voltage can explain.
+
+    Attributes
+    ----------
+    rms : float or None
+        Of single samples [m]; None when it is unknown.
+    source : str
+        Where it was read, in words.
+    sources : tuple of FloorSource
+    blocks : ndarray of int, shape (k,)
+        Block lengths [samples], from 1.
+    block_rms : ndarray, shape (k,)
+        Rms of the noise after averaging over blocks [m].
+    frequency, density : ndarray, shape (p,)
+        Power spectral density of the noise [Hz], [m^2/Hz]; empty when unknown.
+    """
+
+    rms: float | None
+    source: str
+    sources: tuple[FloorSource, ...] = ()
+    blocks: NDArray[np.int64] = None  # type: ignore[assignment]
+    block_rms: NDArray[np.float64] = None  # type: ignore[assignment]
+    frequency: NDArray[np.float64] = None  # type: ignore[assignment]
+    density: NDArray[np.float64] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        for name in ('blocks', 'block_rms', 'frequency', 'density'):
+            if getattr(self, name) is None:
+                kind = np.int64 if name == 'blocks' else np.float64
+                object.__setattr__(self, name, np.zeros(0, kind))
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a floor."""
+        return self.rms is not None
+
+    def at(self, m: float) -> float | None:
+        """
+        Return the rms of the noise in means over blocks of m samples [m], None when unknown.
+
+        Between the block lengths measured it is interpolated as a power law; beyond the longest,
+        where no data tell, the mean slope of the last two octaves goes on.
+        """
+        if self.rms is None:
+            return None
+        if self.rms == 0.0 or self.blocks.size < 2:
+            return float(self.rms) / float(np.sqrt(m) if self.blocks.size < 2 else 1.0)
+        x = np.log(self.blocks.astype(np.float64))
+        y = np.log(np.maximum(self.block_rms, np.finfo(float).tiny))
+        at = float(np.log(m))
+        if at <= x[-1]:
+            return float(np.exp(np.interp(at, x, y)))
+        k = max(-3, -x.size)
+        slope = float(np.clip((y[-1] - y[k]) / (x[-1] - x[k]), -0.5, 0.0))
+        return float(np.exp(y[-1] + slope * (at - x[-1])))
+
+    def share(self, mean_square: float, m: float = 1.0) -> float | None:
+        """
+        Return the share of a residual that a model could explain: 1 - floor^2 / mean square.
+
+        Parameters
+        ----------
+        mean_square : float
+            Of the residual, or of its means over m samples [m^2].
+        m : float, optional
+        """
+        floor = self.at(m)
+        if floor is None:
+            return None
+        if mean_square <= 0.0:
+            return 0.0
+        return float(np.clip(1.0 - floor * floor / mean_square, 0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    source: FloorSource
+    blocks: NDArray[np.int64]
+    variances: NDArray[np.float64]
+    series: NDArray[np.float64]
+    sample_rate: float
+
+
+def noise_floor(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> NoiseFloor:
+    """
+    Return the noise floor of some residuals.
+
+    Where v repeats, the residual's differences between consecutive periods, from the second
+    period on, have twice the variance of the noise; whatever a model may lack repeats and drops
+    out, and slow drift is taken from the differences.  Only without repeats are the rests taken:
+    freed of parabolas in time and in its logarithm, which is how creep goes.  Of several stretches
+    the weighted median counts, so that one that is still settling does no harm.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+    stretches : sequence of Stretch
+        From `piezo_ident.residual.stretches.stretches_of`.
+
+    Returns
+    -------
+    NoiseFloor
+
+    Notes
+    -----
+    Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012),
+    section 2.5, doi:10.1002/9781118287422.  Noise slower than a period, or than a rest, looks
+    like drift and is not counted.
+    """
+    for kind in ('repeat', 'rest'):
+        readings = []
+        for s in stretches:
+            if s.kind == kind:
+                reading = _repeat(parts[s.part], s) if s.period else _rest(parts[s.part], s)
+                if reading is not None:
+                    readings.append(reading)
+        if readings:
+            return _pooled(readings, kind)
+    return NoiseFloor(None, 'floor unknown: the voltage neither repeats three times nor rests')
+
+
+def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
+    p, rate = s.period, part.piece.sample_rate
+    difference = part.e[s.start + 2 * p : s.stop] - part.e[s.start + p : s.stop - p]
+    frame = min(max(p, round(FRAME * rate)), difference.size)
+    series = _detrended(difference, frame, _polynomial(frame)) / np.sqrt(2.0)
+    # means over more than half a period would see the end of one against the start of the next
+    return _reading(part, s, series, frame, min(p // 2, frame // 16), ORDER + 1)
+
+
+def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
+    rate = part.piece.sample_rate
+    skip = max(round(SETTLING * s.n), round(SETTLING_TIME * rate))
+    n = s.n - skip
+    if n < 100:
+        return None
+    t = (np.arange(n) + skip + 1.0) / s.n
+    lg = np.log(t)
+    # a few relaxations are no exact logarithm; the squares bend towards them
+    basis = np.column_stack([np.ones(n), t, t * t, lg, lg * lg])
+    series = _detrended(part.e[s.start + skip : s.stop], n, basis)
+    return _reading(part, s, series, n, n // 16, basis.shape[1])
+
+
+def _polynomial(n: int) -> NDArray[np.float64]:
+    order = ORDER if n > 16 * ORDER else 0
+    return np.asarray(
+        np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), order), dtype=np.float64
+    )
+
+
+def _detrended(
+    x: NDArray[np.float64], frame: int, basis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return x without what the basis explains of each frame, cut to whole frames."""
+    rows = x[: x.size // frame * frame].reshape(-1, frame)
+    q, _ = np.linalg.qr(basis)
+    return np.asarray((rows - (rows @ q) @ q.T).ravel())
+
+
+def _reading(
+    part: ResidualPart,
+    s: Stretch,
+    series: NDArray[np.float64],
+    frame: int,
+    longest: int,
+    removed: int,
+) -> _Reading | None:
+    if series.size < 16:
+        return None
+    top = int(np.log2(max(1, min(longest, LONGEST_BLOCK))))
+    blocks = 2 ** np.arange(top + 1)
+    rows = series.reshape(-1, frame)
+    variances = []
+    for m in blocks:
+        count = frame // m
+        means = rows[:, : count * m].reshape(rows.shape[0], count, m).mean(axis=2)
+        # of several frames the median: drift may have bent one of them
+        power = np.sum(means**2, axis=1) / max(count - removed, 1)
+        variances.append(float(np.median(power) if power.size > 2 else power.mean()))
+    source = FloorSource(
+        part.record,
+        s.label,
+        s.kind,
+        float(part.piece.start_time + s.start / part.piece.sample_rate),
+        series.size,
+        float(np.sqrt(variances[0])),
+    )
+    return _Reading(source, blocks, np.array(variances), series, part.piece.sample_rate)
+
+
+def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:
+    sources = tuple(r.source for r in readings)
+    longest = max(r.blocks.size for r in readings)
+    variances = np.array(
+        [
+            _median([(r.variances[i], r.source.n) for r in readings if r.blocks.size > i])
+            for i in range(longest)
+        ]
+    )
+    # averaging never adds noise, and never takes more than that of independent samples away
+    single = variances[0]
+    for i in range(1, longest):
+        variances[i] = np.clip(variances[i], 0.0, variances[i - 1])
+    widest = max(readings, key=lambda r: r.series.size)
+    frequency, density = signal.welch(
+        widest.series, widest.sample_rate, nperseg=min(4096, max(16, widest.series.size // 8))
+    )
+    seconds = sum(r.source.n / r.sample_rate for r in readings)
+    how = (
+        f'differences of repeated periods, {len(readings)} stretches, {seconds:.3g} s'
+        if kind == 'repeat'
+        else f'rests of the voltage without creep, {len(readings)} stretches, {seconds:.3g} s'
+    )
+    return NoiseFloor(
+        rms=float(np.sqrt(single)),
+        source=how,
+        sources=sources,
+        blocks=2 ** np.arange(longest),
+        block_rms=np.sqrt(variances),
+        frequency=frequency,
+        density=density,
+    )
+
+
+def _median(weighted: Sequence[tuple[float, int]]) -> float:
+    values = np.array([x for x, _ in weighted])
+    weights = np.array([float(n) for _, n in weighted])
+    order = np.argsort(values)
+    behind = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(behind, 0.5 * behind[-1])])

@@ -1,0 +1,322 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A residual with its record, cut into rests, repeating stretches and the rest of the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.errors import DataError
+from piezo_ident.record import Piece, Segment
+from scipy import fft
+from scipy.ndimage import (
+    binary_dilation,
+    maximum_filter1d,
+    minimum_filter1d,
+    uniform_filter1d,
+)
+
+__all__ = ['ResidualPart', 'Stretch', 'block_means', 'find_repeats', 'stretches_of', 'strokes_of']
+
+#: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
+REST_TIME, REST_SAMPLES = 0.05, 200
+#: share of the differences of a measured voltage that reverse the one before while it rests
+TREMBLE = 0.3
+#: v repeats where it comes back within this share of its range
+COMES_BACK = 2e-3
+#: so close is as good as exactly: of two such periods the shorter is taken
+EXACT = 1e-4
+#: periods that must lie behind the first, which may still be settling
+PERIODS = 2
+#: share of a period that may be missing: a rest may have taken a sample of it
+SLACK = 0.02
+#: candidates for the period that are looked at in every octave
+CANDIDATES = 3
+#: longest stretch whose autocorrelation is computed [samples]
+LONGEST = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualPart:
+    """
+    What a model leaves of one piece of a record.
+
+    Parameters
+    ----------
+    record : str
+        Name of the record.
+    piece : Piece
+    e : ndarray, shape (n,)
+        Measured minus simulated displacement, free run [m].
+    sound : ndarray of bool, shape (n,), optional
+        False where samples were bridged, or the memory of the start still matters; all when
+        absent.
+
+    Raises
+    ------
+    DataError
+        When the lengths differ, or a sound residual is not finite.
+    """
+
+    record: str
+    piece: Piece
+    e: NDArray[np.float64]
+    sound: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        e = np.asarray(self.e, dtype=np.float64)
+        sound = np.ones(e.size, bool) if self.sound is None else np.asarray(self.sound, bool)
+        if e.shape != (self.piece.n,) or sound.shape != e.shape:
+            raise DataError(
+                f'{self.record}: residual {e.shape} and mask {sound.shape} must have one value '
+                f'for each of the {self.piece.n} samples'
+            )
+        if not np.isfinite(e[sound]).all():
+            raise DataError(
+                f'{self.record}: the residual is not finite everywhere; did the model diverge?'
+            )
+        object.__setattr__(self, 'e', e)
+        object.__setattr__(self, 'sound', sound)
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """The samples that count, shape (n,)."""
+        return np.ones(self.piece.n, bool) if self.sound is None else self.sound
+
+    @property
+    def y_hat(self) -> NDArray[np.float64]:
+        """Simulated displacement [m], shape (n,)."""
+        return np.asarray(self.piece.y - self.e)
+
+    def with_residual(self, e: NDArray[np.float64]) -> ResidualPart:
+        """Return the same part with another residual."""
+        return ResidualPart(self.record, self.piece, e, self.sound)
+
+    def runs(self) -> list[tuple[int, int]]:
+        """Return the unbroken stretches of sound samples, as first and behind the last."""
+        return _runs(self.mask)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """
+    A sound stretch of one part in which the voltage does one thing.
+
+    Attributes
+    ----------
+    part : int
+        Number of the part.
+    label : str
+        Of the segment; empty without labels.
+    start, stop : int
+        First sample, and the one behind the last.
+    kind : {'rest', 'repeat', 'motion'}
+    period : int
+        Samples after which v repeats; 0 where it does not.
+    step : float
+        Change of v that led into a rest [V].
+    """
+
+    part: int
+    label: str
+    start: int
+    stop: int
+    kind: str
+    period: int = 0
+    step: float = 0.0
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.stop - self.start
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
+    """Return ``max y - min y`` of each record over all its parts [m]."""
+    ends: dict[str, tuple[float, float]] = {}
+    for part in parts:
+        low, high = ends.get(part.record, (np.inf, -np.inf))
+        ends[part.record] = (
+            min(low, float(part.piece.y.min())),
+            max(high, float(part.piece.y.max())),
+        )
+    return {name: high - low for name, (low, high) in ends.items()}
+
+
+def block_means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
+    """Return the means of whole blocks of m samples, shape (n // m,)."""
+    if m == 1:
+        return x
+    n = x.size // m * m
+    return np.asarray(x[:n].reshape(-1, m).mean(axis=1))
+
+
+def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
+    """
+    Cut a part where its voltage comes to rest, starts to repeat, or changes its segment.
+
+    Parameters
+    ----------
+    part : ResidualPart
+    number : int, optional
+        Of the part, for `Stretch.part`.
+
+    Returns
+    -------
+    list of Stretch
+        In order of time.
+    """
+    piece = part.piece
+    v = piece.v
+    span = float(np.ptp(v))
+    shortest = max(REST_SAMPLES, round(REST_TIME * piece.sample_rate))
+    still = _still(v, span, shortest)
+    segments = piece.segments or (Segment('', 0, piece.n),)
+    found: list[Stretch] = []
+    for first, last in part.runs():
+        for s in segments:
+            start, stop = max(s.start, first), min(s.stop, last)
+            if stop <= start:
+                continue
+            edge = start
+            for a, b in _runs(still[start:stop]):
+                # the first sample at the new level is no longer at the old one
+                a, b = start + a - (a > 0), start + b
+                if b - a < shortest:
+                    continue
+                found += _motion(v, number, s.label, edge, a, shortest)
+                step = _step_into(v, a, shortest)
+                found.append(Stretch(number, s.label, a, b, 'rest', step=step))
+                edge = b
+            found += _motion(v, number, s.label, edge, stop, shortest)
+    return found
+
+
+def _still(v: NDArray[np.float64], span: float, window: int) -> NDArray[np.bool_]:
+    """Return where the voltage rests: exactly, or but for the trembling of a measured one."""
+    d = np.concatenate([[0.0], np.diff(v)])
+    still = np.abs(d) <= 1e-9 * span
+    still[0] = False
+    if span == 0.0 or v.size < 2 * window or still.mean() > 0.01:
+        return np.asarray(still)
+    turns = np.concatenate([[False], d[1:] * d[:-1] < 0.0])
+    trembling = uniform_filter1d(turns.astype(np.float64), window) > TREMBLE
+    narrow = maximum_filter1d(v, window) - minimum_filter1d(v, window) < COMES_BACK * span
+    # a window that lies within the rest says so of every sample of it
+    inside = binary_dilation(trembling & narrow, iterations=window // 2)
+    return np.asarray(inside & (np.abs(d) < COMES_BACK * span))
+
+
+def _step_into(v: NDArray[np.float64], at: int, window: int) -> float:
+    return float(v[at] - v[max(at - window, 0)])
+
+
+def _motion(
+    v: NDArray[np.float64], number: int, label: str, start: int, stop: int, shortest: int
+) -> list[Stretch]:
+    """Return the repeating stretches of a motion, and what lies between them."""
+    if stop - start < shortest:
+        return []
+    found, edge = [], start
+    for a, b, period in find_repeats(v[start:stop]):
+        if start + a - edge >= shortest:
+            found.append(Stretch(number, label, edge, start + a, 'motion'))
+        found.append(Stretch(number, label, start + a, start + b, 'repeat', period))
+        edge = start + b
+    if stop - edge >= shortest:
+        found.append(Stretch(number, label, edge, stop, 'motion'))
+    return found
+
+
+def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
+    """
+    Return where a signal repeats itself: (first sample, behind the last, period), in order.
+
+    Candidates are minima of the mean square difference between the signal and itself shifted,
+    behind its first maximum; each is then held against the signal sample by sample, so that what
+    comes before and after does no harm.  At least three periods are asked for.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+
+    Notes
+    -----
+    The difference function of de Cheveigne and Kawahara (2002), J. Acoust. Soc. Am. 111,
+    1917-1930, doi:10.1121/1.1458024.
+    """
+    span = float(np.ptp(v))
+    if v.size < 3 * 8 or span == 0.0:
+        return []
+    tolerance = COMES_BACK * span
+    tried: list[tuple[float, int, list[tuple[int, int]]]] = []
+    for period in _candidates(v[:LONGEST]):
+        difference = v[period:] - v[:-period]
+        matching = [
+            (a, b)
+            for a, b in _runs(np.abs(difference) <= tolerance)
+            if b - a >= (PERIODS - SLACK) * period and np.ptp(v[a : a + period]) >= 20.0 * tolerance
+        ]
+        if matching:
+            miss = max(float(np.sqrt(np.mean(difference[a:b] ** 2))) for a, b in matching)
+            tried.append((miss / span, period, matching))
+    # the best first; among those that repeat about as well, the shortest
+    least = max(EXACT, 1.5 * min((miss for miss, _, _ in tried), default=0.0))
+    tried.sort(key=lambda one: (max(one[0], least), one[1]))
+    taken = np.zeros(v.size, dtype=bool)
+    found = []
+    for _, period, matching in tried:
+        for a, b in matching:
+            free = _runs(~taken[a : b + period])
+            for i, j in free:
+                if j - i >= (PERIODS + 1 - SLACK) * period:
+                    found.append((a + i, a + j, period))
+                    taken[a + i : a + j] = True
+    return sorted(found)
+
+
+def _candidates(v: NDArray[np.float64]) -> list[int]:
+    n, x = v.size, v - v.mean()
+    # two more, so that a period which just fits is a minimum inside
+    longest = n // (PERIODS + 1) + 2
+    size = fft.next_fast_len(n + longest + 1, real=True)
+    spectrum = fft.rfft(x, size)
+    products = fft.irfft(np.abs(spectrum) ** 2, size)[: longest + 1]
+    squares = np.concatenate([[0.0], np.cumsum(x * x)])
+    lags = np.arange(longest + 1)
+    d = squares[n - lags] + squares[n] - squares[lags] - 2.0 * products
+    d /= n - lags
+    top = float(d.max(initial=0.0))
+    if top <= 0.0:
+        return []
+    behind = int(np.argmax(d > 0.2 * top))
+    minima = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] < d[2:])) + 1
+    minima = minima[(minima > behind) & (d[minima] < 0.8 * top)]
+    # a long period is found exactly at the multiples of a short one that is no whole number, and
+    # one may follow the other: so the best of every octave
+    octave = np.floor(np.log2(np.maximum(minima, 1)))
+    chosen: set[int] = set()
+    for k in np.unique(octave):
+        own = minima[octave == k]
+        chosen.update(int(lag) for lag in own[np.argsort(d[own])][:CANDIDATES])
+    return sorted(chosen)

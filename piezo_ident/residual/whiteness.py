@@ -1,0 +1,364 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether a residual is white, whether it follows the input: correlations, honest bands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.residual.stretches import block_means, ResidualPart
+from scipy import fft, linalg, signal, special, stats
+
+__all__ = [
+    'Coherence',
+    'CrossCorrelation',
+    'Whiteness',
+    'coherence',
+    'cross_correlation',
+    'whiteness',
+]
+
+#: samples after averaging, at most; lags looked at; highest order of the noise model
+SAMPLES, LAGS, ORDER = 2**17, 200, 40
+#: confidence of bands and bounds
+CONFIDENCE = 0.99
+#: averages asked of a coherence, longest segment [samples]
+AVERAGES, SEGMENT = 32, 8192
+#: share of the input's largest density below which there is no input to cohere with
+EXCITED = 1e-7
+#: independent averages in one that overlaps by half, with a Hann window
+OVERLAP = 1.0 / 1.056
+
+
+@dataclass(frozen=True, eq=False)
+class Whiteness:
+    """
+    Autocorrelation of a residual.
+
+    Attributes
+    ----------
+    lag : ndarray, shape (m,)
+        [s], from one sample on.
+    correlation : ndarray, shape (m,)
+    band : float
+        Within it 99 % of the values of white noise.
+    statistic : float
+        Of Ljung and Box: chi square of m degrees of freedom for white noise.
+    p_value : float
+    """
+
+    lag: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+    band: float
+    statistic: float
+    p_value: float
+
+    @property
+    def white(self) -> bool:
+        """Whether nothing speaks against white noise."""
+        return self.p_value > 1.0 - CONFIDENCE
+
+
+@dataclass(frozen=True, eq=False)
+class CrossCorrelation:
+    """
+    Cross-correlation of an input with a residual.
+
+    Attributes
+    ----------
+    input : {'v', 'dv/dt'}
+    lag : ndarray, shape (m,)
+        By which the residual follows the input [s].
+    correlation : ndarray, shape (m,)
+    band : ndarray, shape (m,)
+        Within it 99 % of the values at one lag when the two have nothing to do with each other.
+    wide_band : ndarray, shape (m,)
+        Within it all lags together in 99 % of such cases.
+    p_value : float
+        Chance of the largest value at any lag.
+    """
+
+    input: str
+    lag: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+    band: NDArray[np.float64]
+    wide_band: NDArray[np.float64]
+    p_value: float
+
+    @property
+    def related(self) -> bool:
+        """Whether the residual follows the input."""
+        return self.p_value < 1.0 - CONFIDENCE
+
+
+@dataclass(frozen=True, eq=False)
+class Coherence:
+    """
+    Coherence of voltage and residual.
+
+    Attributes
+    ----------
+    frequency, coherence : ndarray, shape (p,)
+        [Hz], and ``|S_ve|^2 / (S_vv S_ee)``.
+    tested : ndarray of bool, shape (p,)
+        Frequencies at which the voltage has power.
+    bound : float
+        ``1 - (1 - c)^(1/(L - 1))``: unrelated signals stay below it in a share c of cases.
+    averages : float
+        Independent averages L.
+    share : float
+        Share of the residual's power that is coherent with the voltage, bias taken away.
+    density : ndarray, shape (p,)
+        Power spectral density of the residual [m^2/Hz].
+    """
+
+    frequency: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    tested: NDArray[np.bool_]
+    bound: float
+    averages: float
+    share: float
+    density: NDArray[np.float64]
+
+
+def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
+    """Return the parts of the rate at which most was sampled."""
+    rates: dict[float, int] = {}
+    for part in parts:
+        rates[part.piece.sample_rate] = rates.get(part.piece.sample_rate, 0) + part.piece.n
+    if not rates:
+        return [], 1.0
+    rate = max(rates, key=lambda r: rates[r])
+    return [p for p in parts if abs(p.piece.sample_rate / rate - 1.0) < 1e-6], rate
+
+
+def _blocks(parts: Sequence[ResidualPart]) -> int:
+    return max(1, -(-sum(part.piece.n for part in parts) // SAMPLES))
+
+
+def whiteness(
+    parts: Sequence[ResidualPart], lags: int = 50, seconds: float | None = None
+) -> Whiteness | None:
+    """
+    Return the autocorrelation of single samples and the Ljung-Box statistic.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+    lags : int, optional
+    seconds : float, optional
+        Look at means over blocks of this length instead.
+
+    Returns
+    -------
+    Whiteness or None
+        None when no run of sound samples is long enough.
+
+    Notes
+    -----
+    Ljung and Box (1978), Biometrika 65, 297-303, doi:10.1093/biomet/65.2.297.  It says that
+    something is left, never what.
+    """
+    chosen, rate = _chosen(parts)
+    m = 1 if seconds is None else max(1, round(seconds * rate))
+    sums, n = np.zeros(lags + 1), 0
+    for part in chosen:
+        for start, stop in part.runs():
+            x = block_means(part.e[start:stop], m)
+            if x.size <= 4 * lags:
+                continue
+            sums += _products(x - x.mean(), x - x.mean(), lags)[lags:]
+            n += x.size
+    if n == 0:
+        return None
+    if sums[0] <= 0.0:
+        return Whiteness(np.arange(1, lags + 1) * m / rate, np.zeros(lags), 0.0, 0.0, 1.0)
+    r = sums[1:] / sums[0]
+    k = np.arange(1, lags + 1)
+    statistic = float(n * (n + 2.0) * np.sum(r * r / (n - k)))
+    return Whiteness(
+        lag=k * m / rate,
+        correlation=r,
+        band=float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE) / np.sqrt(n)),
+        statistic=statistic,
+        p_value=float(special.gammaincc(0.5 * lags, 0.5 * statistic)),
+    )
+
+
+def _products(x: NDArray[np.float64], y: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
+    """Return ``sum_t x(t) y(t + k)`` for k = -lags .. lags, shape (2 lags + 1,)."""
+    size = fft.next_fast_len(x.size + lags + 1, real=True)
+    c = fft.irfft(np.conj(fft.rfft(x, size)) * fft.rfft(y, size), size)
+    return np.concatenate([c[-lags:], c[: lags + 1]])
+
+
+def cross_correlation(
+    parts: Sequence[ResidualPart], which: str = 'v', lags: int = LAGS
+) -> CrossCorrelation | None:
+    """
+    Return the cross-correlation of an input with the residual, and its band.
+
+    The variance of ``sum_t u(t) e(t + k)`` for a given u and an unrelated e of autocovariance g
+    is ``sum_j g(j) sum_t u(t) u(t + j)``, Bartlett's formula with the input as it was.  A band
+    for white residuals, 2.58 / sqrt(N), would be too narrow by far.  g comes from an
+    autoregression, so that slow residuals do not need lags without end.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+    which : {'v', 'dv/dt'}
+    lags : int, optional
+        To either side, in samples after averaging to about 1e5.
+
+    Returns
+    -------
+    CrossCorrelation or None
+        None when there is too little to correlate.
+
+    Notes
+    -----
+    Bartlett (1946), J. R. Stat. Soc. Suppl. 8, 27-41, doi:10.2307/2983611; Box, Jenkins and
+    Reinsel, Time Series Analysis, 5th ed. (2015), section 12.1.
+    """
+    chosen, rate = _chosen(parts)
+    m = _blocks(chosen)
+    products = np.zeros(2 * lags + 1)
+    variance = uu = ee = 0.0
+    for part in chosen:
+        for start, stop in part.runs():
+            v = block_means(part.piece.v[start:stop], m)
+            u = np.gradient(v) if which == 'dv/dt' and v.size > 2 else v
+            e = block_means(part.e[start:stop], m)
+            if u.size <= 4 * lags:
+                continue
+            u, e = u - u.mean(), e - e.mean()
+            products += _products(u, e, lags)
+            variance += _unrelated(u, e)
+            uu, ee = uu + float(u @ u), ee + float(e @ e)
+    if uu <= 0.0 or ee <= 0.0:
+        return None
+    scale = np.sqrt(uu * ee)
+    std = np.sqrt(variance) / scale
+    r = products / scale
+    # lags are not independent, so counting each errs on the safe side
+    p_value = min(1.0, r.size * float(2.0 * stats.norm.sf(float(np.abs(r).max()) / std)))
+    narrow = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)) * std
+    wide = float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / r.size)) * std
+    return CrossCorrelation(
+        input=which,
+        lag=np.arange(-lags, lags + 1) * m / rate,
+        correlation=r,
+        band=np.full(r.size, narrow),
+        wide_band=np.full(r.size, wide),
+        p_value=p_value,
+    )
+
+
+def _unrelated(u: NDArray[np.float64], e: NDArray[np.float64]) -> float:
+    """Return the variance of ``sum u e`` if e had nothing to do with u."""
+    a, innovation = _autoregression(e)
+    size = fft.next_fast_len(2 * u.size, real=True)
+    # the density of e on the grid of u's transform; Parseval turns the sum over lags into one
+    response = np.abs(fft.rfft(np.concatenate([[1.0], a]), size)) ** 2
+    power = np.abs(fft.rfft(u, size)) ** 2 / response
+    whole = 2.0 * power.sum() - power[0] - (power[-1] if size % 2 == 0 else 0.0)
+    return float(innovation * whole / size)
+
+
+def _autoregression(e: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the coefficients and innovation variance of e by Levinson's recursion and BIC."""
+    order = min(ORDER, e.size // 20)
+    c = _products(e, e, order)[order:] / e.size
+    if c[0] <= 0.0:
+        return np.zeros(0), 0.0
+    best, chosen = np.inf, (np.zeros(0), float(c[0]))
+    for p in sorted({0, 1, 2, 4, 8, 16, order}):
+        if p > order:
+            continue
+        a = -linalg.solve_toeplitz(c[:p] * _ridge(p), c[1 : p + 1]) if p else np.zeros(0)
+        left = float(c[0] + a @ c[1 : p + 1])
+        if left <= 0.0:
+            break
+        score = e.size * np.log(left) + p * np.log(e.size)
+        if score < best:
+            best, chosen = score, (a, left)
+    return chosen
+
+
+def _ridge(p: int) -> NDArray[np.float64]:
+    ridge = np.ones(p)
+    ridge[0] += 1e-9
+    return ridge
+
+
+def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
+    """
+    Return the coherence of the voltage with the residual, by Welch's method.
+
+    Parameters
+    ----------
+    parts : sequence of ResidualPart
+
+    Returns
+    -------
+    Coherence or None
+        None when there are fewer than four segments to average.
+
+    Notes
+    -----
+    Bendat and Piersol, Random Data, 4th ed. (2010), section 9.2, doi:10.1002/9781118032428.
+    """
+    chosen, rate = _chosen(parts)
+    runs = [(p, a, b) for p in chosen for a, b in p.runs()]
+    total = sum(b - a for _, a, b in runs)
+    if total < 256:
+        return None
+    n = int(2 ** np.floor(np.log2(max(64, 2 * total // AVERAGES))))
+    n = min(n, SEGMENT)
+    window = signal.windows.hann(n, sym=False)
+    vv, ee, ve, count = np.zeros(n // 2 + 1), np.zeros(n // 2 + 1), 0j, 0
+    for part, start, stop in runs:
+        for k in range(start, stop - n + 1, n // 2):
+            v = window * signal.detrend(part.piece.v[k : k + n])
+            e = window * signal.detrend(part.e[k : k + n])
+            V, E = fft.rfft(v), fft.rfft(e)
+            vv += np.abs(V) ** 2
+            ee += np.abs(E) ** 2
+            ve = ve + np.conj(V) * E
+            count += 1
+    if count < 4:
+        return None
+    averages = max(2.0, count * OVERLAP)
+    tiny = np.finfo(float).tiny
+    c = np.clip(np.abs(ve) ** 2 / np.maximum(vv * ee, tiny), 0.0, 1.0)
+    tested = vv > EXCITED * float(vv.max())
+    # the first bins are what detrending left
+    tested[:2] = False
+    bound = 1.0 - (1.0 - CONFIDENCE) ** (1.0 / (averages - 1.0))
+    unbiased = np.clip((c - 1.0 / averages) / (1.0 - 1.0 / averages), 0.0, 1.0)
+    power = float(ee[2:].sum())
+    coherent = float(np.sum((unbiased * ee)[tested & (c > bound)]))
+    return Coherence(
+        frequency=np.arange(n // 2 + 1) * rate / n,
+        coherence=c,
+        tested=tested,
+        bound=float(bound),
+        averages=float(averages),
+        share=coherent / power if power > 0.0 else 0.0,
+        density=2.0 * ee / (count * rate * float(window @ window)),
+    )
