@@ -93,8 +93,16 @@ def assemble(
     before = errors_of(rows, e_given, lost)
     refit = errors_of(rows, held_out_residual(rows, base), lost)
     after = errors_of(rows, held_out_residual(rows, fitted), lost)
+    lasting = [name for name in findings.effects if not find_effect(name).time_driven]
     if not findings.effects and refit.overall > (1.0 - WORTH_REFIT) * before.overall:
         state, refined, after = given, model, before
+    elif findings.effects and not lasting:
+        # H was refitted beside a drift that another record will not repeat
+        effects = tuple(_lasting(added) for added in fitted.state.effects)
+        state, refined = (
+            fitted.state,
+            _refined(simulator, replace(given, effects=effects), findings),
+        )
     else:
         state, refined = fitted.state, _refined(simulator, fitted.state, findings)
     full = [simulator.full(s) for s in (given, base.state, state)]
@@ -164,10 +172,18 @@ def _refined(simulator: Simulator, state: State, findings: Findings) -> StageMod
 
 
 def _lasting(added: Added) -> Added:
-    """Return an effect as the model keeps it: what belongs to one record is set to nothing."""
+    """Return an effect as the model keeps it: what belongs to one record is left out."""
     if not added.effect.time_driven:
         return added
-    return Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
+    return Added(added.name, tuple(added.effect.elsewhere(values) for values in added.values))
+
+
+def _silenced(effects: Sequence[Added]) -> tuple[Added, ...]:
+    """Return effects with all amplitudes at nothing."""
+    return tuple(
+        Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
+        for added in effects
+    )
 
 
 def _effects(

@@ -43,7 +43,7 @@ from piezo_ident.model import StageModel
 from piezo_ident.record import Record
 from piezo_ident.residual.faults import FaultSearch, find_faults
 from piezo_ident.residual.floor import noise_floor, NoiseFloor
-from piezo_ident.residual.lines import find_lines
+from piezo_ident.residual.lines import find_lines, without_lines
 from piezo_ident.residual.stretches import ResidualPart, stretches_of
 from piezo_ident.results import Progress, silent
 
@@ -51,6 +51,8 @@ __all__ = ['diagnose']
 
 #: share of the explainable part from which a linear change is a finding, not a side effect
 LINEAR = 0.5
+#: share of what a linear change leaves that a bent G and another effect must not exceed
+BENT = 0.25
 #: samples with a fault are left out up to this share; beyond it they are all there is
 FAULTY = 0.02
 
@@ -99,15 +101,14 @@ def diagnose(
     base, columns = _base(simulator, given)
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
-    floor = noise_floor(parts, stretches)
-    noise = row_noise(floor, faults, rows.m, abs(model.scaling.Y))
     lines = find_lines(parts, stretches).lines
+    # hum is no noise: it can be explained
+    floor = noise_floor([without_lines(part, lines) for part in parts], stretches)
+    noise = row_noise(floor, faults, rows.m, abs(model.scaling.Y))
     progress('residual', 1.0)
     frequencies = [line.frequency for line in lines]
-    start = _start(simulator, base, columns, noise)
-    rounds, taken, fitted = _search(
-        simulator, start, columns, frequencies, noise, settings, progress
-    )
+    search = _Search(simulator, columns, frequencies, noise, settings, progress)
+    rounds, taken, fitted = search.run(base)
     if not taken:
         fitted = base
     findings = judge(rows, base, fitted, taken, noise)
@@ -143,53 +144,82 @@ def row_noise(floor: NoiseFloor, faults: FaultSearch, m: int, span: float) -> fl
     return float(max(rms, rounding) / span) ** 2
 
 
-def _start(
-    simulator: Simulator, base: Fitted, columns: NDArray[np.float64], noise: float
-) -> Fitted:
-    """Return what the candidates are added to: the base, with G retuned where that is minor."""
-    state = replace(base.state, retuning=(0.0,) * len(RETUNING))
-    retuned = fit_jointly(simulator, state, columns)
-    explainable = max(base.mean_square - noise, 1e-300)
-    if base.mean_square - retuned.mean_square > LINEAR * explainable:
-        return base
-    return retuned
+class _Search:
+    """Effects are added one after another as long as held-out data gain."""
 
+    def __init__(
+        self,
+        simulator: Simulator,
+        columns: NDArray[np.float64],
+        lines: Sequence[float],
+        noise: float,
+        settings: DiagnosisSettings,
+        progress: Progress,
+    ) -> None:
+        self._simulator = simulator
+        self._columns = columns
+        self._lines = lines
+        self._noise = noise
+        self._most = settings.most_effects
+        self._progress = progress
+        self._rng = np.random.default_rng(settings.seed)
+        names = settings.effects or tuple(catalogue())
+        self._candidates = [find_effect(name) for name in names if name not in settings.without]
+        self._count = 0
 
-def _search(
-    simulator: Simulator,
-    start: Fitted,
-    columns: NDArray[np.float64],
-    lines: Sequence[float],
-    noise: float,
-    settings: DiagnosisSettings,
-    progress: Progress,
-) -> tuple[list[Round], list[Round], Fitted]:
-    """Add effects one after another as long as held-out data gain."""
-    rng = np.random.default_rng(settings.seed)
-    names = settings.effects or tuple(catalogue())
-    candidates = [find_effect(name) for name in names if name not in settings.without]
-    rounds: list[Round] = []
-    taken: list[Round] = []
-    fitted = start
-    explainable = max(start.mean_square - noise, 0.0)
-    have = {setting.name for setting in simulator.model.effects}
-    total = settings.most_effects
-    while len(taken) < total:
-        left = [effect for effect in candidates if effect.name not in have]
-        done = len(rounds)
+    def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:
+        """Return all rounds, those whose best contender was added, and the fit at the end."""
+        state = replace(base.state, retuning=(0.0,) * len(RETUNING))
+        retuned = fit_jointly(self._simulator, state, self._columns)
+        explainable = max(base.mean_square - self._noise, 1e-300)
+        if base.mean_square - retuned.mean_square < LINEAR * explainable:
+            return self._from(retuned, self._round(retuned))
+        # a linear change is the larger part: is it the whole of it?
+        linear, bent = self._round(base), None
+        if self._left(linear) > self._least:
+            bent = self._round(retuned)
+        if bent is not None and self._left(bent) < BENT * self._left(linear):
+            return self._from(retuned, bent)
+        return self._from(base, linear)
 
-        def tick(share: float, done: int = done) -> None:
-            progress('candidates', (done + share) / (total + 1))
+    @property
+    def _least(self) -> float:
+        """Mean square of the smallest effect."""
+        return (SMALLEST * self._simulator.rows.stroke / 100.0) ** 2
 
-        this = search_round(simulator, fitted, columns, left, lines, noise, rng, tick)
-        rounds.append(this)
-        if not takes(simulator.rows, this, noise, explainable, first=not taken):
-            break
-        taken.append(this)
-        least = (SMALLEST * simulator.rows.stroke / 100.0) ** 2
-        fitted, dropped = drop_needless(simulator, this.contenders[0].fitted, columns, least)
-        for i in dropped:
-            del taken[i]
-        have.add(this.contenders[0].name)
-    progress('candidates', 1.0)
-    return rounds, taken, fitted
+    def _left(self, this: Round) -> float:
+        best = this.contenders[0].fitted if this.contenders else this.before
+        return max(best.mean_square - self._noise, 0.0)
+
+    def _round(self, fitted: Fitted) -> Round:
+        have = {setting.name for setting in self._simulator.model.effects}
+        have |= {added.name for added in fitted.state.effects}
+        left = [effect for effect in self._candidates if effect.name not in have]
+        done = self._count
+        self._count += 1
+
+        def tick(share: float) -> None:
+            # most searches end after two or three rounds: the bar nears its end ever slower
+            self._progress('candidates', 1.0 - 0.4 ** (done + share))
+
+        return search_round(
+            self._simulator, fitted, self._columns, left, self._lines, self._noise, self._rng, tick
+        )
+
+    def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
+        rows, fitted, this = self._simulator.rows, start, first
+        rounds, taken = [first], list[Round]()
+        explainable = max(start.mean_square - self._noise, 0.0)
+        while takes(rows, this, self._noise, explainable, first=not taken):
+            taken.append(this)
+            fitted, dropped = drop_needless(
+                self._simulator, this.contenders[0].fitted, self._columns, self._least
+            )
+            for i in dropped:
+                del taken[i]
+            if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
+                break
+            this = self._round(fitted)
+            rounds.append(this)
+        self._progress('candidates', 1.0)
+        return rounds, taken, fitted

@@ -110,7 +110,10 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
     gain, left = before - after, max(before - noise, 1e-300)
     if percent(rows, gain) < SMALLEST or gain < LEAST_GAIN * explainable:
         return False
-    if gain < BEYOND_CHANCE * this.chance.get(best.name, 0.0):
+    # what follows time alone fits a residual that was turned in time as well; its lines and
+    # trends have tests of their own
+    chance = 0.0 if best.effect.time_driven else this.chance.get(best.name, 0.0)
+    if gain < BEYOND_CHANCE * chance:
         return False
     if gain < (ADDED if first else FURTHER) * left:
         return False

@@ -233,6 +233,15 @@ class Effect:
         return checked
 
     @classmethod
+    def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
+        """
+        Return what to expect of an effect that is driven by time in a record that nobody knows.
+
+        Here: its neutral values, for what is known of one record says nothing of another.
+        """
+        return cls.neutral(values)
+
+    @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
         """Return by how many samples an effect `in_delay_line` lengthens it."""
         return 0.0

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from piezo_ident.block import Block, Slot
@@ -86,6 +86,15 @@ class GainDrift(Effect):
             full = cls.trial({'time': knots})
             found.append(Trial(full.values, full.moves[1:], full.steps[1:]))
         return tuple(found)
+
+    @classmethod
+    def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
+        """Return the mean gain of the record: H was fitted to the gain before the first knot."""
+        checked = cls.check(values)
+        time, gain = (np.asarray(checked[name], dtype=np.float64) for name in ('time', 'gain'))
+        at = np.linspace(time[0], time[-1], 1000)
+        mean = float(np.interp(at, time, gain).mean())
+        return cls.check({'time': time[:1], 'gain': [mean]})
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the gain as it is before the first knot."""

@@ -91,7 +91,8 @@ class RateDependentHysteresis(Effect):
     zero, where ``s`` is the input's speed behind a first-order low-pass: beta makes all plays
     wider by the same, sigma each in proportion to itself.  The band of a play of H reaches from
     v - r to v; its upper edge may move out as well, to ``v + (lambda_0 + lambda_1 r_i)
-    |s(k)|^eps``, so that a band that widens evenly to both sides is a case of it.
+    |s(k)|^eps``, so that a band that widens evenly to both sides is a case of it.  With a
+    `levelling` c, ``|s|`` is replaced by ``|s| / (1 + c |s|)``: growth that levels off.
     The speed is filtered before its magnitude is taken, so that converter steps and noise cancel
     instead of adding up.  Weights,
     p1 and p2 stay those of H; what is added to the signal is the difference between the widened
@@ -123,6 +124,15 @@ class RateDependentHysteresis(Effect):
             step=1e-5,
         ),
         Parameter('exponent', '1', 'power eps of the speed', NAN, 0.05, 2.0, scale='log'),
+        Parameter(
+            'levelling',
+            's',
+            'c: growth levels off above a speed of 1/c',
+            NAN,
+            0.0,
+            1e3,
+            default=0.0,
+        ),
         Parameter('cutoff', 'Hz', 'low-pass of the speed', NAN, 1e-3, 1e5, scale='log'),
         Parameter(
             'stretch',
@@ -165,15 +175,24 @@ class RateDependentHysteresis(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return powers of the speed from 0.3 to 1.5, growth below alone and on both sides."""
+        """Return several laws of the speed, growth below alone and on both sides."""
         if not np.any(view.thresholds > 0):
             return ()
         cutoff, found = min(view.sample_rate / 10, 2000.0), []
-        for exponent in (0.3, 0.5, 0.75, 1.0, 1.5):
-            unit = 1.0 / max(view.speed, *view.speeds) ** exponent
+        fast = max(view.speed, *view.speeds)
+        laws = [
+            (0.3, 0.0),
+            (0.6, 0.0),
+            (1.0, 0.0),
+            (1.5, 0.0),
+            (1.0, 5.0 / fast),
+            (1.0, 50.0 / fast),
+        ]
+        for exponent, levelling in laws:
+            unit = ((1.0 + levelling * fast) / fast) ** exponent
             small, large = min(0.1, 2e-3 * unit), min(0.5, 1e-2 * unit)
             steps = {'gain': small, 'stretch': large, 'lead': small, 'lead_stretch': large}
-            shape = {'exponent': exponent, 'cutoff': cutoff}
+            shape = {'exponent': exponent, 'levelling': levelling, 'cutoff': cutoff}
             found += [cls.trial(shape, ['gain', 'stretch'], steps), cls.trial(shape, steps=steps)]
         return tuple(found)
 
@@ -194,6 +213,8 @@ class RateDependentHysteresis(Effect):
         h, v = self.hysteresis, np.ascontiguousarray(block.x)
         speed = _low_pass(v, self._pole, self.sample_rate, self._speed)
         power = np.abs(speed)
+        if self.number('levelling') > 0.0:
+            power /= 1.0 + self.number('levelling') * power
         if self.number('exponent') != 1.0:
             power **= self.number('exponent')
         more = np.empty(v.size)

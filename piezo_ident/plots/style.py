@@ -40,9 +40,11 @@ __all__ = [
     'figure',
     'legend',
     'legend_above',
+    'length_unit',
     'lightness',
     'line',
     'note',
+    'percent_axis',
     'plain_log',
     'safe',
     'tidy',
@@ -131,6 +133,13 @@ def legend(axes: Axes, **options: Any) -> None:
     axes.legend(**{**given, 'edgecolor': 'none', 'borderpad': 0.3, **options})
 
 
+def length_unit(largest: float) -> tuple[str, float]:
+    """Return the unit in which lengths up to `largest` [m] read best, and its factor."""
+    if largest >= 1e-6:
+        return 'µm', 1e6
+    return ('nm', 1e9) if largest >= 1e-9 else ('pm', 1e12)
+
+
 def envelope(y: NDArray[np.float64], points: int = POINTS) -> NDArray[np.int64]:
     """
     Return the samples that have to be drawn for a trace to show every extreme.
@@ -182,6 +191,22 @@ def plain_log(axis: Axis, low: float, high: float) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axis.set_minor_locator(LogLocator(subs=tuple(float(k) for k in range(1, 10)), numticks=20))
     axis.set_minor_formatter(NullFormatter())
+
+
+def percent_axis(axes: Axes, stroke: float) -> None:
+    """Add a right-hand axis in % of stroke; `stroke` in the unit of the left one."""
+    if stroke <= 0.0:
+        return
+
+    def percent(e: Any) -> Any:
+        return 100.0 * e / stroke
+
+    def error(p: Any) -> Any:
+        return p * stroke / 100.0
+
+    right = axes.secondary_yaxis('right', functions=(percent, error))
+    right.set_ylabel('% of stroke', fontsize=NORMAL)
+    right.tick_params(labelsize=SMALL)
 
 
 def note(axes: Axes, text: str) -> None:

@@ -42,6 +42,8 @@ FAR, QUIET = 8.0, 0.35
 FLAT, LEFT = 5, 6.0
 #: jitter: deviations of the slope, least growth of the variance, blocks of samples
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
+#: jitter is read where the fast part of the motion has at most this share of the scatter's power
+SMOOTH = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +278,9 @@ def _clipped(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
             moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
             gone = moved > LEFT * (scatter.rms + scatter.quantum) and moved > 1e-4 * stroke
             if drive > 1e-4 * span and (gone or (drive > 0.02 * span and b - a >= 4 * FLAT)):
-                found[a:b] = True
+                # what reads the same elsewhere has been cut off there too
+                found |= at
+                break
     return found & part.mask
 
 
@@ -286,7 +290,8 @@ def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> t
 
     A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
     sigma^2 + jitter^2 (dy/dt)^2.  Third differences keep what a model misses out of it, where
-    the motion is smooth; elsewhere nothing is read.
+    the motion is smooth; what is left of it grows with the motion's own third differences, which
+    are a cause beside, and where they are large nothing is read.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)
@@ -300,16 +305,18 @@ def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> t
     n = e.size // CHUNK * CHUNK
     if n < 40 * CHUNK or scatter.rms == 0.0:
         return 0.0, 1.0
-    smooth = motion[:n].reshape(-1, CHUNK).max(axis=1) < 0.2 * scatter.rms
+    motion2 = np.mean(motion[:n].reshape(-1, CHUNK) ** 2, axis=1)
+    smooth = motion2 < SMOOTH * scatter.rms**2
     rows = smooth & ~unusable[:n].reshape(-1, CHUNK).any(axis=1)
     s2 = np.mean(slope[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
     h2 = np.mean(third[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
+    motion2 = motion2[rows]
     # readings that rest on one code have no scatter of their own to compare with
     moving = np.sqrt(s2) > scatter.quantum * rate
-    s2, h2 = s2[moving], h2[moving]
+    s2, h2, motion2 = s2[moving], h2[moving], motion2[moving]
     if s2.size < 40 or float(np.ptp(s2)) == 0.0:
         return 0.0, 1.0
-    slope2, error = _slope(s2, h2)
+    slope2, error = _slope(s2, motion2, h2)
     if slope2 <= SURE * error:
         return 0.0, 1.0
     base = max(float(np.mean(h2)) - slope2 * float(np.mean(s2)), 1e-3 * float(np.mean(h2)))
@@ -317,27 +324,31 @@ def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> t
     growth = 1.0 + slope2 * float(np.quantile(s2, 0.98)) / base
     # what saturates with speed, as a converter's own noise does, is no jitter
     fast = s2 > np.median(s2)
-    again, error = _slope(s2[fast], h2[fast])
+    again, error = _slope(s2[fast], motion2[fast], h2[fast])
     if growth < GROWTH or again <= 3.0 * error or not 0.3 < again / slope2 < 3.0:
         return 0.0, 1.0
     return float(np.sqrt(slope2)), growth
 
 
-def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the slope of a line by weighted least squares and its robust standard deviation."""
-    weight = np.ones(x.size)
-    slope = error = 0.0
-    for _ in range(3):
-        mean = np.average(x, weights=weight)
-        dx = x - mean
-        power = float(np.sum(weight * dx * dx))
-        if power == 0.0:
-            return 0.0, float('inf')
-        level = float(np.average(y, weights=weight))
-        slope = float(np.sum(weight * dx * y)) / power
-        rest = y - level - slope * dx
-        error = float(np.sqrt(np.sum((weight * dx * rest) ** 2))) / power
-        fitted = np.maximum(level + slope * dx, 0.05 * level)
+def _slope(
+    x: NDArray[np.float64], other: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return the slope of y over x beside another cause, and its robust standard deviation."""
+    scale = max(float(other.max(initial=0.0)), 1e-300)
+    A = np.column_stack([x / float(x.max()), np.ones(x.size), other / scale])
+    if other.max(initial=0.0) <= 0.0:
+        A = A[:, :2]
+    y_scale = max(float(np.mean(y)), 1e-300)
+    target, weight = y / y_scale, np.ones(x.size)
+    coefficients, errors = np.zeros(A.shape[1]), np.full(A.shape[1], np.inf)
+    for _ in range(4):
+        normal = A.T @ (weight[:, None] * A)
+        inverse = np.linalg.pinv(normal)
+        coefficients = inverse @ (A.T @ (weight * target))
+        rest = target - A @ coefficients
+        spread = A.T @ ((weight * rest)[:, None] ** 2 * A)
+        errors = np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0))
         # a mean of squares scatters in proportion to itself
-        weight = 1.0 / fitted**2
-    return slope, error
+        weight = 1.0 / np.maximum(A @ coefficients, 0.05) ** 2
+    unit = y_scale / float(x.max())
+    return float(coefficients[0]) * unit, float(errors[0]) * unit

@@ -275,7 +275,8 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
         matching = [
             (a, b)
             for a, b in _runs(np.abs(difference) <= tolerance)
-            if b - a >= (PERIODS - SLACK) * period and np.ptp(v[a : a + period]) >= 20.0 * tolerance
+            if b - a >= (PERIODS - SLACK) * period
+            and np.ptp(v[a : a + period]) >= 20.0 * tolerance
         ]
         if matching:
             miss = max(float(np.sqrt(np.mean(difference[a:b] ** 2))) for a, b in matching)
