@@ -136,6 +136,38 @@ class Dynamics:
             raise ModelError(f'dynamics: static gain {gain} cannot be scaled to one')
         return Dynamics(a=self.a, b=self.b / gain)
 
+    def without_slow_poles(self, slowest: float, sample_rate: float) -> Dynamics:
+        """
+        Return the dynamics freed of real poles below a frequency, each with the zero next to it.
+
+        Parameters
+        ----------
+        slowest, sample_rate : float
+            [Hz]
+
+        Returns
+        -------
+        Dynamics
+            With the same gain at ten times that frequency; itself when no pole is that slow.
+        """
+        radius = np.exp(-2.0 * np.pi * slowest / sample_rate)
+        poles, zeros = self.poles, np.roots(self.b)
+        slow = (poles.imag == 0.0) & (poles.real > radius)
+        if not slow.any() or zeros.size < slow.sum():
+            return self
+        for pole in poles[slow]:
+            # complex zeros come in pairs; only a real one may go alone
+            real = np.flatnonzero(np.abs(zeros.imag) == 0.0)
+            if not real.size:
+                return self
+            zeros = np.delete(zeros, real[np.argmin(np.abs(zeros[real] - pole))])
+        a = np.atleast_1d(np.real(np.poly(poles[~slow])))[1:]
+        faster = Dynamics(a=a, b=np.atleast_1d(np.real(np.poly(zeros))))
+        at = [10.0 * slowest]
+        gain = np.abs(self.response(at, sample_rate)) / np.abs(faster.response(at, sample_rate))
+        sign = np.sign(np.real(self.response(at, sample_rate) / faster.response(at, sample_rate)))
+        return Dynamics(a=faster.a, b=faster.b * float(gain[0] * sign[0]))
+
     def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
         """
         Return the frequency response.

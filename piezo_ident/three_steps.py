@@ -284,7 +284,8 @@ def second_step(
     raw = _noise(run, run.u, start, stop)
     # only good enough to undo the hysteresis
     [(_, first)] = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
-    G = first.normalised()
+    rate = run.piece.sample_rate
+    G = first.without_slow_poles(SLOWEST, rate).normalised()
 
     excerpts = triangle_excerpts(runs)
     n = int(sum(e.use.sum() for e in excerpts))
@@ -307,11 +308,13 @@ def second_step(
     best, result = float('inf'), found[0][0]
     for i, (candidate, start_G) in enumerate(found):
         tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
-        fit = output_error(stretches, start_G.normalised(), maxiter=6, tick=tick)
+        fast = start_G.without_slow_poles(SLOWEST, rate).normalised()
+        fit = output_error(stretches, fast, maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
         # a larger model comes later, and must earn its size
         if score < best / (1.0 + GAIN):
-            best, result, G = score, candidate, fit.dynamics.normalised()
+            best, result = score, candidate
+            G = fit.dynamics.without_slow_poles(SLOWEST, rate).normalised()
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)

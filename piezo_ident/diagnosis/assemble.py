@@ -44,10 +44,14 @@ from piezo_ident.model import StageModel
 from piezo_ident.residual.faults import FaultSearch
 from piezo_ident.residual.floor import NoiseFloor
 
-__all__ = ['assemble']
+__all__ = ['PASSES', 'assemble']
 
 #: held-out gain of the refitted base below which the model stays as it was given
 WORTH_REFIT = 0.05
+#: retuning of G that is worth a word, samples of delay
+TUNED = 0.05
+#: passes over the range, there or back, that a test on data not fitted needs
+PASSES = 3.0
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
 
@@ -98,11 +102,8 @@ def assemble(
         state, refined, after = given, model, before
     elif findings.effects and not lasting:
         # H was refitted beside a drift that another record will not repeat
-        effects = tuple(_lasting(added) for added in fitted.state.effects)
-        state, refined = (
-            fitted.state,
-            _refined(simulator, replace(given, effects=effects), findings),
-        )
+        state = fitted.state
+        refined = _refined(simulator, replace(given, effects=_silenced(state.effects)), findings)
     else:
         state, refined = fitted.state, _refined(simulator, fitted.state, findings)
     full = [simulator.full(s) for s in (given, base.state, state)]
@@ -119,8 +120,8 @@ def assemble(
     )
     effects = _effects(rows, base, fitted, taken, findings, noise)
     smallest = _smallest(rows, base, rounds)
-    rest = replace(findings.unexplained, description=_rest(findings, smallest))
-    warnings = _warnings(rows, fitted.state, findings, floor)
+    rest = replace(findings.unexplained, description=_rest(findings, smallest, rows.passes))
+    warnings = _warnings(fitted.state, findings, lasting, floor)
     result = Diagnosis(
         verdict=findings.verdict,
         sentence='',
@@ -271,24 +272,33 @@ def _deviations(
 
 def _smallest(rows: Rows, base: Fitted, rounds: Sequence[Round]) -> float:
     """Return the rms of the smallest effect that would have been taken, % of stroke."""
-    chance = max(rounds[0].chance.values(), default=0.0)
-    return max(SMALLEST, percent(rows, chance) if rounds[0].before.mean_square else 0.0)
+    # what follows time alone fits any slow residual
+    last = rounds[-1].chance
+    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
+    return max(SMALLEST, percent(rows, chance))
 
 
-def _rest(findings: Findings, smallest: float) -> str:
+def _rest(findings: Findings, smallest: float, passes: float) -> str:
     left = findings.unexplained.rms_percent
     if left < smallest:
         return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
+    if passes < PASSES:
+        return (
+            f'the voltage passes its range {passes:.1f} times, so nothing that is fitted could be '
+            'tested; drive the range back and forth twice or more'
+        )
     if not findings.effects:
         return 'structure that no candidate of the catalogue accounts for'
     return 'structure that the effects added do not account for'
 
 
-def _warnings(rows: Rows, state: State, findings: Findings, floor: NoiseFloor) -> tuple[str, ...]:
+def _warnings(
+    state: State, findings: Findings, lasting: Sequence[str], floor: NoiseFloor
+) -> tuple[str, ...]:
     said = []
     if not floor.known:
         said.append(f'{floor.source}: every share counts the noise as unexplained')
-    if findings.effects and any(state.retuning):
+    if lasting and np.any(np.abs(state.retuning) > TUNED):
         said.append(
             'the dynamics were retuned along with the effect, which had bent them at the '
             f'identification: about {-state.retuning[0]:.2g} samples of delay'
@@ -310,18 +320,21 @@ def _sentence(result: Diagnosis, findings: Findings) -> str:
     )
     names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
     rest = result.unexplained.rms_percent
+    share = f'{100.0 * findings.share:.0f} %'
     if result.verdict == 'named':
         verb = 'explains' if len(result.effects) == 1 else 'explain'
-        return _capital(f'{names} {verb} {findings.share:.0%} of what the model missed; {errors}.')
+        return _capital(
+            f'{names} {verb} {100.0 * findings.share:.0f} % of what the model missed; {errors}.'
+        )
     if result.verdict == 'class' and result.group is not None:
         group = ' or '.join(n.replace('_', ' ') for n in result.group.names)
         return _capital(
             f'{group}: these data do not tell which; {names} was added and explains '
-            f'{findings.share:.0%} of what the model missed; {errors}.'
+            f'{share} of what the model missed; {errors}.'
         )
     if result.verdict == 'partly_explained':
         return _capital(
-            f'{names} explains {findings.share:.0%} of what the model missed, {rest:.2g} % of '
+            f'{names} explains {share} of what the model missed, {rest:.2g} % of '
             f'stroke stays unexplained; {errors}.'
         )
     if result.verdict == 'unexplained':

@@ -33,13 +33,21 @@ from piezo_ident.errors import ModelError
 from piezo_ident.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
-__all__ = ['Fitted', 'Handle', 'base_thresholds', 'fit_base', 'fit_jointly', 'handles_of']
+__all__ = [
+    'BaseColumns',
+    'Fitted',
+    'Handle',
+    'base_thresholds',
+    'fit_base',
+    'fit_jointly',
+    'handles_of',
+]
 
 #: how far a weight of H may be expected to move, normalised: what keeps collinear plays quiet
 WEIGHT_SPREAD = 0.1
-ITERATIONS, ATTEMPTS, TOLERANCE = 8, 5, 1e-3
-#: how far G may be retuned: about samples of delay, and their squares
-RETUNING = (5.0, 200.0)
+ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
+#: how far G may be retuned: about samples of delay, their squares, and two relaxations
+RETUNING = (5.0, 200.0, 1.0, 1.0)
 #: relative size of a finite difference in the logarithm of a parameter
 LOG_STEP = 1e-2
 
@@ -136,9 +144,26 @@ def base_thresholds(swing: float) -> NDArray[np.float64]:
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
+@dataclass(frozen=True, eq=False)
+class BaseColumns:
+    """
+    What a refit of the base model can do.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (n, m + 2 + records)
+        Filtered plays, v^3, v and the offset of each record.
+    total : ndarray, shape (m + 2 + records, m + 2 + records)
+        Their products.
+    """
+
+    columns: NDArray[np.float64]
+    total: NDArray[np.float64]
+
+
 def fit_base(
     simulator: Simulator, state: State, thresholds: NDArray[np.float64]
-) -> tuple[State, NDArray[np.float64]]:
+) -> tuple[State, BaseColumns]:
     """
     Return H refitted on other thresholds by bounded least squares, and the columns used.
 
@@ -149,26 +174,27 @@ def fit_base(
         Its effects are kept as they are.
     thresholds : ndarray, shape (m,)
     """
-    rows = simulator.rows
-    columns = simulator.base_columns(thresholds)
+    rows, m = simulator.rows, thresholds.size
+    columns = np.hstack([simulator.base_columns(thresholds), _offset_columns(rows)])
+    base = BaseColumns(columns, columns.T @ columns)
     own = simulator.base_columns(state.hysteresis.thresholds)
     h = state.hysteresis
     linear = own @ np.concatenate([h.weights, [h.p1, h.p2]])
     target = rows.x - (simulator.run(state) - state.offsets[rows.of_record] - linear)
-    offsets = _offset_columns(rows)
-    M = np.hstack([columns, offsets])
-    lower = np.full(M.shape[1], -np.inf)
-    lower[: thresholds.size] = 0.0
-    theta = _Normal(M, target, np.zeros(M.shape[1])).solve(lower, np.full(M.shape[1], np.inf))
-    m = thresholds.size
+    lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
+    lower[:m] = 0.0
+    normal = _Normal(base, np.empty((rows.n, 0)), target, np.zeros(columns.shape[1]))
+    theta = normal.solve(lower, upper)
     new = Hysteresis(thresholds, theta[:m], float(theta[m]), float(theta[m + 1]))
-    return replace(state, hysteresis=new, offsets=theta[m + 2 :]), columns
+    return replace(state, hysteresis=new, offsets=theta[m + 2 :]), base
 
 
 def handles_of(state: State, records: int) -> tuple[Handle, ...]:
     """Return every number of G's retuning and of the effects that the fit may move."""
     handles = [
-        Handle(None, None, 'retuning', i, False, 10.0**i * 0.01, -RETUNING[i], RETUNING[i], True)
+        Handle(
+            None, None, 'retuning', i, False, 1e-3 * RETUNING[i], -RETUNING[i], RETUNING[i], True
+        )
         for i in range(len(state.retuning))
     ]
     for i, added in enumerate(state.effects):
@@ -203,21 +229,21 @@ def handles_of(state: State, records: int) -> tuple[Handle, ...]:
 def fit_jointly(
     simulator: Simulator,
     state: State,
-    columns: NDArray[np.float64],
+    base: BaseColumns,
     *,
     iterations: int = ITERATIONS,
     tick: Callable[[], None] = lambda: None,
 ) -> Fitted:
     """
-    Fit everything that a state holds by the free-run error.
+    Fit everything that a state holds by the free-run error (Levenberg-Marquardt).
 
     Parameters
     ----------
     simulator : Simulator
     state : State
         Where to start; its thresholds stay.
-    columns : ndarray, shape (n, m + 2)
-        `Simulator.base_columns` of its thresholds.
+    base : BaseColumns
+        Of its thresholds.
     iterations : int, optional
     tick : callable, optional
         Called between the steps; may raise `piezo_ident.errors.Cancelled`.
@@ -225,18 +251,18 @@ def fit_jointly(
     rows = simulator.rows
     handles = handles_of(state, len(rows.names))
     m = state.hysteresis.thresholds.size
-    fixed = np.hstack([columns, _offset_columns(rows)])
+    p = base.columns.shape[1] + len(handles)
     damping = 1e-4
     prediction = simulator.remember(state)
     e = rows.x - prediction
-    J = np.hstack([fixed, _derivatives(simulator, state, handles, prediction)])
+    moving = _derivatives(simulator, state, handles, prediction, tick)
     for _ in range(iterations):
-        tick()
         before = float(e @ e)
-        lower, upper = _room(state, handles, J.shape[1])
-        normal = _Normal(J, e, _prior(rows, e, J.shape[1], m))
+        lower, upper = _room(state, handles, p)
+        normal = _Normal(base, moving, e, _prior(rows, e, p, m))
         found = None
         for _ in range(ATTEMPTS):
+            tick()
             step = normal.solve(lower, upper, damping)
             try:
                 trial = _moved(state, handles, step)
@@ -255,12 +281,14 @@ def fit_jointly(
         state = found
         prediction = simulator.remember(state)
         e = rows.x - prediction
-        J = np.hstack([fixed, _derivatives(simulator, state, handles, prediction)])
+        moving = _derivatives(simulator, state, handles, prediction, tick)
         if after > (1.0 - TOLERANCE) * before:
             break
-    lower, upper = _room(state, handles, J.shape[1])
-    free = (lower < -1e-12) & (upper > 1e-12) & (np.abs(J).max(axis=0) > 0.0)
-    prior = _prior(rows, e, J.shape[1], m)
+    lower, upper = _room(state, handles, p)
+    J = np.hstack([base.columns, moving])
+    alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
+    free = (lower < -1e-12) & (upper > 1e-12) & alive
+    prior = _prior(rows, e, p, m)
     gram = gram_of(rows, J[:, free], e)
     return Fitted(
         state=state,
@@ -292,9 +320,11 @@ def _derivatives(
     state: State,
     handles: tuple[Handle, ...],
     prediction: NDArray[np.float64],
+    tick: Callable[[], None],
 ) -> NDArray[np.float64]:
     columns = np.zeros((prediction.size, len(handles)))
     for j, handle in enumerate(handles):
+        tick()
         value = handle.get(state)
         step = handle.step
         top = handle.upper / value if handle.logarithmic else handle.upper - value
@@ -348,13 +378,21 @@ class _Normal:
     """Normal equations of a step, scaled to columns of length one."""
 
     def __init__(
-        self, J: NDArray[np.float64], e: NDArray[np.float64], prior: NDArray[np.float64]
+        self,
+        base: BaseColumns,
+        moving: NDArray[np.float64],
+        e: NDArray[np.float64],
+        prior: NDArray[np.float64],
     ) -> None:
-        size = np.linalg.norm(J, axis=0)
+        mixed = base.columns.T @ moving
+        A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
+        size = np.sqrt(np.diag(A))
         self._size = np.where(size > 0.0, size, 1.0)
-        self._A = J.T @ J / np.outer(self._size, self._size)
+        self._A = A / np.outer(self._size, self._size)
         self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
-        self._b = J.T @ e / self._size
+        # a column of zeros stays where it is
+        self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
+        self._b = np.concatenate([base.columns.T @ e, moving.T @ e]) / self._size
 
     def solve(
         self, lower: NDArray[np.float64], upper: NDArray[np.float64], damping: float = 0.0

@@ -30,9 +30,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.diagnosis.assemble import assemble
-from piezo_ident.diagnosis.fit import base_thresholds, fit_base, fit_jointly, Fitted, RETUNING
+from piezo_ident.diagnosis.assemble import assemble, PASSES
+from piezo_ident.diagnosis.fit import (
+    base_thresholds,
+    BaseColumns,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    RETUNING,
+)
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.search import drop_needless, Round, search_round
@@ -53,6 +59,8 @@ __all__ = ['diagnose']
 LINEAR = 0.5
 #: share of what a linear change leaves that a bent G and another effect must not exceed
 BENT = 0.25
+
+
 #: samples with a fault are left out up to this share; beyond it they are all there is
 FAULTY = 0.02
 
@@ -103,7 +111,9 @@ def diagnose(
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
     lines = find_lines(parts, stretches).lines
     # hum is no noise: it can be explained
-    floor = noise_floor([without_lines(part, lines) for part in parts], stretches)
+    resting = _parts(simulator, base.state, whole=True)
+    rests = [s for i, part in enumerate(resting) for s in stretches_of(part, i)]
+    floor = noise_floor([without_lines(part, lines) for part in resting], rests)
     noise = row_noise(floor, faults, rows.m, abs(model.scaling.Y))
     progress('residual', 1.0)
     frequencies = [line.frequency for line in lines]
@@ -120,16 +130,16 @@ def diagnose(
     return result
 
 
-def _parts(simulator: Simulator, state: State) -> list[ResidualPart]:
-    """Return the residual of each run at the full rate [m]."""
+def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
+    """Return the residual of each run [m]; `whole` with what the unknown start still touches."""
     Y = simulator.model.scaling.Y
     return [
-        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.known)
+        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.sound if whole else run.known)
         for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
     ]
 
 
-def _base(simulator: Simulator, given: State) -> tuple[Fitted, NDArray[np.float64]]:
+def _base(simulator: Simulator, given: State) -> tuple[Fitted, BaseColumns]:
     """Return the base model refitted on a fine grid of thresholds, and the columns of it."""
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     state, columns = fit_base(simulator, given, base_thresholds(swing))
@@ -150,7 +160,7 @@ class _Search:
     def __init__(
         self,
         simulator: Simulator,
-        columns: NDArray[np.float64],
+        columns: BaseColumns,
         lines: Sequence[float],
         noise: float,
         settings: DiagnosisSettings,
@@ -210,7 +220,9 @@ class _Search:
         rows, fitted, this = self._simulator.rows, start, first
         rounds, taken = [first], list[Round]()
         explainable = max(start.mean_square - self._noise, 0.0)
-        while takes(rows, this, self._noise, explainable, first=not taken):
+        # a branch that was passed once only cannot be held out
+        testable = rows.passes >= PASSES
+        while testable and takes(rows, this, self._noise, explainable, first=not taken):
             taken.append(this)
             fitted, dropped = drop_needless(
                 self._simulator, this.contenders[0].fitted, self._columns, self._least

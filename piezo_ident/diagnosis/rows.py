@@ -99,6 +99,15 @@ class Rows:
         return int(self.x.size)
 
     @property
+    def passes(self) -> float:
+        """How often the command passed over its range, there or back."""
+        low = min(float(run.u.min()) for run in self.runs)
+        high = max(float(run.u.max()) for run in self.runs)
+        # over rows, so that converter steps and noise are no travel
+        travel = sum(float(np.abs(np.diff(means(run.u, self.m))).sum()) for run in self.runs)
+        return travel / (high - low) if high > low else 0.0
+
+    @property
     def edges(self) -> NDArray[np.int64]:
         """First row of each block, and the end; shape (blocks + 1,)."""
         starts = np.flatnonzero(np.diff(self.block, prepend=-1))
@@ -124,7 +133,8 @@ class Rows:
 def means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
     """Return the means over each m neighbours; what is left at the end is dropped."""
     n = x.size // m
-    return np.asarray(x[: n * m].reshape(n, m).mean(axis=1))
+    # a product with a vector is several times faster than a mean along a short axis
+    return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
 def make_rows(

@@ -26,9 +26,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
-from piezo_ident.diagnosis.fit import fit_jointly, Fitted
+from piezo_ident.diagnosis.fit import BaseColumns, fit_jointly, Fitted
 from piezo_ident.diagnosis.gain import gram_of
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
@@ -101,7 +100,7 @@ class Round:
 def search_round(
     simulator: Simulator,
     before: Fitted,
-    columns: NDArray[np.float64],
+    columns: BaseColumns,
     effects: Sequence[type[Effect]],
     lines: Sequence[float],
     noise: float,
@@ -115,8 +114,8 @@ def search_round(
     ----------
     simulator : Simulator
     before : Fitted
-    columns : ndarray
-        `Simulator.base_columns` of the thresholds in use.
+    columns : BaseColumns
+        Of the thresholds in use.
     effects : sequence of type of Effect
         Candidates.
     lines : sequence of float
@@ -158,17 +157,22 @@ def search_round(
         :JOINT
     ]
     contenders = []
+
+    def alive() -> None:
+        tick(at)
+
     for i, scored in enumerate(promising):
-        tick(0.5 + 0.5 * i / len(promising))
+        at = 0.5 + 0.5 * i / len(promising)
+        tick(at)
         state = before.state.with_effect(started(rows, scored))
         try:
-            fitted = fit_jointly(simulator, state, columns, iterations=FIRST)
+            fitted = fit_jointly(simulator, state, columns, iterations=FIRST, tick=alive)
         except ModelError:
             continue
         contenders.append(Contender(scored.effect, scored, fitted))
     contenders.sort(key=lambda c: c.fitted.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
-        better = fit_jointly(simulator, contender.fitted.state, columns)
+        better = fit_jointly(simulator, contender.fitted.state, columns, tick=alive)
         contenders[i] = replace(contender, fitted=better)
     contenders.sort(key=lambda c: c.fitted.mean_square)
     contenders = _simplest_first(contenders, noise)
@@ -193,7 +197,7 @@ def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender
 
 
 def drop_needless(
-    simulator: Simulator, fitted: Fitted, columns: NDArray[np.float64], least: float
+    simulator: Simulator, fitted: Fitted, columns: BaseColumns, least: float
 ) -> tuple[Fitted, tuple[int, ...]]:
     """
     Take out effects that later ones have made needless.
@@ -203,7 +207,7 @@ def drop_needless(
     simulator : Simulator
     fitted : Fitted
         Whose last effect stays.
-    columns : ndarray
+    columns : BaseColumns
         As in `search_round`.
     least : float
         Mean square that an effect must be worth.

@@ -39,6 +39,9 @@ from piezo_ident.play import play_columns
 
 __all__ = ['Added', 'Simulator', 'State', 'retuned']
 
+#: corner frequencies of the relaxations that a retuned G may show [Hz]
+RELAXATIONS = (15.0, 100.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Added:
@@ -92,8 +95,7 @@ class State:
         Added to the displacement, normalised.
     effects : tuple of Added
     retuning : tuple of float
-        Coefficients c_1, c_2, ... of ``1 + sum c_i (1 - z^-1)^i``, by which G is multiplied; empty
-        where G stays as it is.  G(1) stays 1.
+        Coefficients of `retuned`, empty where G stays as it is.
     """
 
     hysteresis: Hysteresis
@@ -129,7 +131,7 @@ class Simulator:
         return replace(
             self.model,
             hysteresis=state.hysteresis,
-            dynamics=retuned(self.model.dynamics, state.retuning),
+            dynamics=retuned(self.model.dynamics, state.retuning, self.model.sample_rate),
             effects=(*self.model.effects, *settings),
         )
 
@@ -231,21 +233,42 @@ class Simulator:
         return signals
 
 
-def retuned(dynamics: Dynamics, retuning: Sequence[float]) -> Dynamics:
+def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -> Dynamics:
     """
-    Return G multiplied by ``1 + sum c_i (1 - z^-1)^i``.
+    Return G multiplied by a factor near one.
+
+    ``1 + c_1 D + c_2 D^2 + sum_j c_j D / (1 - p_j z^-1)`` with ``D = 1 - z^-1`` and p_j the poles
+    of `RELAXATIONS`: a delay, a roll-off, and relaxations.  G(1) stays 1.
 
     Parameters
     ----------
     dynamics : Dynamics
     retuning : sequence of float
-        c_1, c_2, ...; c_1 acts like minus a delay in samples at low frequencies.
+        The coefficients; c_1 acts like minus a delay in samples at low frequencies.
+    sample_rate : float
+        [Hz]
     """
-    factor, difference = np.array([1.0]), np.array([1.0])
-    for c in retuning:
-        difference = np.convolve(difference, [1.0, -1.0])
-        factor = np.pad(factor, (0, difference.size - factor.size)) + c * difference
-    return replace(dynamics, b=np.convolve(dynamics.b, factor)) if retuning else dynamics
+    if not any(retuning):
+        return dynamics
+    difference = np.array([1.0, -1.0])
+    poles = [np.exp(-2.0 * np.pi * f / sample_rate) for f in RELAXATIONS]
+    denominators = [np.array([1.0, -p]) for p in poles[: len(retuning) - 2]]
+    common = np.array([1.0])
+    for denominator in denominators:
+        common = np.convolve(common, denominator)
+    square = np.convolve(difference, difference)
+    c1, c2, *others = (*retuning, 0.0, 0.0)[: max(len(retuning), 2)]
+    terms = [common, c1 * np.convolve(common, difference), c2 * np.convolve(common, square)]
+    for j, c in enumerate(others):
+        rest = np.array([1.0])
+        for k, denominator in enumerate(denominators):
+            if k != j:
+                rest = np.convolve(rest, denominator)
+        terms.append(c * np.convolve(rest, difference))
+    size = max(term.size for term in terms)
+    factor = np.sum([np.pad(term, (0, size - term.size)) for term in terms], axis=0)
+    a = np.convolve(np.concatenate([[1.0], dynamics.a]), common)[1:]
+    return Dynamics(a=a, b=np.convolve(dynamics.b, factor))
 
 
 def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:

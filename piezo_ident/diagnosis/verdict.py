@@ -53,7 +53,7 @@ HARM = 1.25
 #: a rival that leaves less than this times what the best one leaves is not told from it
 AHEAD = 1.6
 #: a rival with more parameters must leave less than this times what the best one leaves
-BOUGHT = 0.9
+BOUGHT = 0.95
 #: what two effects may leave without a difference, % of stroke: H is never right to more than that
 INDISTINCT = 0.01
 #: a candidate is not testable when a refit of the base swallows all but this share of it
@@ -221,7 +221,9 @@ def _why_not(name: str, share: float, findings: Findings, last: Round) -> str:
     if not findings.effects:
         if share < LEAST_GAIN:
             return 'explains nothing beyond chance'
-        return f'explains {share:.0%} of what could be explained, too little for a cause'
+        if findings.verdict == 'none':
+            return f'there is only {findings.unexplained.rms_percent:.2g} % of stroke to explain'
+        return f'explains {100.0 * share:.0f} % of what could be explained, too little for a cause'
     if share < LEAST_GAIN:
         return 'explains nothing beyond chance'
     gain = last.before.mean_square

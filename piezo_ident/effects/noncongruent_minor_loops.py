@@ -36,6 +36,7 @@ def _tilted(
     v: NDArray[np.float64],
     r: NDArray[np.float64],
     slope: NDArray[np.float64],
+    bend: NDArray[np.float64],
     bias: float,
     memory: NDArray[np.float64],
 ) -> NDArray[np.float64]:
@@ -43,6 +44,7 @@ def _tilted(
     for k in range(v.size):
         x = v[k]
         w = 0.0
+        bent = 0.0
         for i in range(r.size):
             f = memory[i]
             f = x if f > x else f
@@ -50,7 +52,8 @@ def _tilted(
             f = low if f < low else f
             memory[i] = f
             w += slope[i] * f
-        out[k] = (x - bias) * w
+            bent += bend[i] * f * f
+        out[k] = (x - bias) * w + bent
     return out
 
 
@@ -58,7 +61,8 @@ class NoncongruentMinorLoops(Effect):
     """
     Plays whose weight depends on the voltage.
 
-    ``w = H[v] + sum_j kappa_j (v - c) F_rho_j[v]``.  In a Prandtl-Ishlinskii operator all minor
+    ``w = H[v] + sum_j (kappa_j (v - c) F_rho_j[v] + lambda_j F_rho_j[v]^2)``: the weight may go
+    with the voltage, or with where the play stands.  In a Prandtl-Ishlinskii operator all minor
     loops between the same two voltages are congruent, and so are, but for the cubic, those of one
     width at different biases; a weight that grows with the voltage takes that away.  The plays
     have thresholds and a memory of their own.
@@ -81,9 +85,14 @@ class NoncongruentMinorLoops(Effect):
     )
     needs: ClassVar[str] = 'equal minor loops at three biases'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='log'),
+        Parameter(
+            'threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='fixed'
+        ),
         Parameter(
             'slope', '1', 'growth kappa_j', 0.0, -10.0, 10.0, vector=True, default=0.0, step=2e-3
+        ),
+        Parameter(
+            'bend', '1', 'growth lambda_j', 0.0, -10.0, 10.0, vector=True, default=0.0, step=2e-3
         ),
         Parameter(
             'bias', '1', 'voltage c without a change', NAN, -10.0, 10.0, default=0.5, scale='fixed'
@@ -92,7 +101,8 @@ class NoncongruentMinorLoops(Effect):
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._r, self._slope = self.array('threshold'), self.array('slope')
+        self._r = self.array('threshold')
+        self._slope, self._bend = self.array('slope'), self.array('bend')
         self._memory = initial_memory(0.0, self._r)
 
     @classmethod
@@ -104,11 +114,15 @@ class NoncongruentMinorLoops(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return narrow, middling and wide plays, together and the middling alone."""
+        """Return narrow, middling and wide plays that go with v or with themselves, and one."""
         bias = (view.low + view.high) / 2
-        return tuple(
-            cls.trial({'threshold': np.array(widths) * view.span, 'bias': bias})
-            for widths in ([0.05, 0.15, 0.4], [0.15])
+        widths = np.array([0.05, 0.15, 0.4]) * view.span
+        shape = {'threshold': widths, 'bias': bias}
+        return (
+            cls.trial({'threshold': widths[1:2], 'bias': bias}, ['slope']),
+            cls.trial(shape, ['slope']),
+            cls.trial(shape, ['bend']),
+            cls.trial(shape, ['slope', 'bend']),
         )
 
     def reset(self, v0: float, x0: float) -> float:
@@ -131,6 +145,6 @@ class NoncongruentMinorLoops(Effect):
 
     def _more(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         out: NDArray[np.float64] = _tilted(
-            x, self._r, self._slope, self.number('bias'), self._memory
+            x, self._r, self._slope, self._bend, self.number('bias'), self._memory
         )
         return out

@@ -1,0 +1,46 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Stages for judging a diagnosis: every effect in another form than the one that is fitted.
+
+Nothing here knows the package that is judged.  A stage answers a voltage from rest:
+
+    stage = make_stage('creep', 0.3, seed=1)
+    t, v, labels = programme('diagnosis', seed=1)
+    y = stage.respond(t, v)
+"""
+
+from .faults import spoil
+from .leftover import left_over
+from .programmes import other_axis, programme, table_one_sines
+from .stage import make_stage, SPAN, Stage
+from .table import describe, EFFECTS, FAULTS, LATER, OUTSIDE, VARIANTS
+
+__all__ = [
+    'EFFECTS',
+    'FAULTS',
+    'LATER',
+    'OUTSIDE',
+    'SPAN',
+    'VARIANTS',
+    'Stage',
+    'describe',
+    'left_over',
+    'make_stage',
+    'other_axis',
+    'programme',
+    'spoil',
+    'table_one_sines',
+]

@@ -1,0 +1,97 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How much of an effect the best refit of a base model leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .cores import plays, Row
+from .stage import Base, Stage, VOLTS
+
+__all__ = ['base_of', 'difference', 'left_over']
+
+Array = NDArray[np.float64]
+
+#: thresholds of the refitted base
+THRESHOLDS = 40
+#: one sample in so many is compared
+STRIDE = 8
+
+
+def _play(u: Array, r: float) -> Array:
+    return plays(u, Row(np.array([r]), np.ones(1)))
+
+
+def base_of(base: Base, v: ArrayLike) -> Array:
+    """
+    Return an orthonormal basis, shape (m, 43), of what a refit of the base can do.
+
+    Offset, v, v^3 and 40 plays behind the stage's own dynamics and delay, one sample in `STRIDE`.
+
+    Parameters
+    ----------
+    base : Base
+    v : array_like, shape (n,)
+        [V], at 20 kHz.
+    """
+    u = np.ascontiguousarray(v, dtype=np.float64) / VOLTS
+    parts = [u, u**3]
+    parts += [_play(u, r) for r in (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS]
+    columns = [np.ones(u.size), *(base.carry(part) for part in parts)]
+    Q, _ = np.linalg.qr(np.stack([c[::STRIDE] for c in columns], axis=1))
+    return np.asarray(Q)
+
+
+def difference(
+    stage: Stage,
+    t: ArrayLike,
+    v: ArrayLike,
+    channels: Mapping[str, ArrayLike] | None = None,
+) -> tuple[Array, float]:
+    """Return what the effects change [m], shape (n,), and the stroke without them [m]."""
+    with_them = stage.respond(t, v, channels=channels, clean=True)
+    without = stage.without().respond(t, v, clean=True)
+    return with_them - without, float(np.ptp(without))
+
+
+def left_over(
+    stage: Stage,
+    t: ArrayLike,
+    v: ArrayLike,
+    channels: Mapping[str, ArrayLike] | None = None,
+    basis: Array | None = None,
+) -> tuple[float, float]:
+    """
+    Return the rms of what the effects change, before and after a refit [% of stroke].
+
+    Parameters
+    ----------
+    stage : Stage
+    t, v : array_like, shape (n,)
+        [s] and [V], at 20 kHz.
+    channels : mapping, optional
+    basis : ndarray, optional
+        From `base_of`, when it is there already.
+    """
+    change, stroke = difference(stage, t, v, channels)
+    Q = base_of(stage.base, v) if basis is None else basis
+    some = change[::STRIDE]
+    rest = some - Q @ (Q.T @ some)
+    raw, left = (100.0 * float(np.sqrt(np.mean(x**2))) / stroke for x in (change, rest))
+    return raw, left

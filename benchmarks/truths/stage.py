@@ -1,0 +1,374 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Stages whose laws are known here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+import math
+from types import MappingProxyType
+import zlib
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import laws
+from .cores import bouc_wen, Density, everett, plays
+from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
+from .sizes import gain_of
+from .table import EFFECTS, LATER, OUTSIDE, VARIANTS
+
+__all__ = ['SPAN', 'VOLTS', 'Base', 'Stage', 'make_base', 'make_stage']
+
+Array = NDArray[np.float64]
+
+#: displacement [m] and voltage [V] of the whole range
+SPAN = 75e-6
+VOLTS = 10.0
+
+#: these need thresholds one by one; the others leave the core as it is
+_PLAYS = ('rate_dependent_hysteresis', 'memory_fade')
+
+
+@dataclass(frozen=True)
+class Base:
+    """
+    The stage without any effect.
+
+    Attributes
+    ----------
+    core : {'plays', 'everett', 'bouc_wen'}
+        How the hysteresis is computed.
+    density : Density
+        Of the thresholds.
+    polynomial : tuple of float
+        Factors of u, u^3 and u^5.
+    dynamics : Cascade or ARX
+    delay : float
+        [s]
+    """
+
+    core: str
+    density: Density
+    polynomial: tuple[float, float, float]
+    dynamics: Cascade | ARX
+    delay: float
+
+    def single_valued(self, u: Array) -> Array:
+        """Return the part of the hysteresis block that has no memory."""
+        c1, c3, c5 = self.polynomial
+        square = u * u
+        return np.asarray(u * (c1 + square * (c3 + square * c5)))
+
+    def carry(self, h: Array) -> Array:
+        """Return what dynamics and delay make of the output of the hysteresis block."""
+        return delayed(self.dynamics(h), self.delay)
+
+
+def make_base(seed: int, core: str | None = None) -> Base:
+    """Draw a stage; the same seed gives the same stage, whatever effect is added."""
+    rng = np.random.default_rng([7321, seed])
+    drawn = ('plays', 'everett')[int(rng.integers(2))]
+    n = int(rng.integers(2, 4))
+    density = Density(
+        rng.uniform(0.3, 1.0, n),
+        rng.integers(1, 4, n).astype(np.float64),
+        rng.uniform(0.03, 0.16, n) * np.array([1.0, 1.6, 2.2])[:n],
+    )
+    density = density.scaled(rng.uniform(0.10, 0.15) / density.width())
+    rest = rng.uniform(0.93, 0.96) - density.everett(1.0)
+    # what a fall from the top begins with: the slope of the part without memory, never negative
+    end, c5 = rest * rng.uniform(0.4, 0.8), rng.uniform(-0.01, 0.01)
+    c3 = 0.5 * (end - rest) - 2.0 * c5
+    c1 = rest - c3 - c5
+    first = rng.uniform(300.0, 1500.0)
+    modes = [(first, math.exp(rng.uniform(math.log(0.02), math.log(0.1))), 1.0)]
+    if rng.random() < 0.5:
+        share = rng.uniform(0.05, 0.2)
+        modes[0] = (first, modes[0][1], 1.0 - share)
+        modes.append((first * rng.uniform(1.8, 3.0), rng.uniform(0.02, 0.1), share))
+    poles = (rng.uniform(2000.0, 5000.0), rng.uniform(3000.0, 8000.0))
+    paper = rng.random() < 0.25
+    return Base(
+        core or drawn,
+        density,
+        (c1, c3, c5),
+        ARX() if paper else Cascade(tuple(modes), poles),
+        int(rng.integers(2, 6)) / RATE,
+    )
+
+
+@dataclass(frozen=True)
+class Stage:
+    """
+    A stage, perhaps with effects, behind a sampled sensor.
+
+    Attributes
+    ----------
+    base : Base
+    gains : mapping of str to float
+        Parameter of every effect's law; 0 (infinity for slew_limit) is none.
+    variants : mapping of str to int
+        Which form of its law every effect takes.
+    later : tuple of str
+        Effects that set in after the identification.
+    seed : int
+    noise : {'white', '1/f', '10-bit', 'none'}
+    noise_rms : float
+        Share of the span.
+    """
+
+    base: Base
+    gains: Mapping[str, float] = field(default_factory=dict)
+    variants: Mapping[str, int] = field(default_factory=dict)
+    later: tuple[str, ...] = LATER
+    seed: int = 0
+    noise: str = 'none'
+    noise_rms: float = 2e-5
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of what the stage has beyond its base."""
+        return tuple(self.gains)
+
+    def without(self, *names: str) -> Stage:
+        """Return the same stage without some effects (all when none is named)."""
+        kept = {n: g for n, g in self.gains.items() if names and n not in names}
+        # the core stays in the form that the effect needed
+        return replace(self, gains=MappingProxyType(kept))
+
+    def respond(
+        self,
+        t: ArrayLike,
+        v: ArrayLike,
+        changed: bool = True,
+        channels: Mapping[str, ArrayLike] | None = None,
+        *,
+        take: int = 0,
+        clean: bool = False,
+    ) -> Array:
+        """
+        Return the measured displacement [m], shape (n,), of a stage that was at rest at 0 V.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Time [s], uniform, 2 kHz and faster.
+        v : array_like, shape (n,)
+            Command held between samples [V], 0 .. 10.
+        changed : bool
+            False: as it was before the effects of `later` set in.
+        channels : mapping of str to array_like, optional
+            ``other``: voltage of another axis [V]; at rest when absent.
+        take : int
+            Another draw of noise, phases and drifts for the same voltage.
+        clean : bool
+            Without sensor noise.
+        """
+        time = np.asarray(t, dtype=np.float64)
+        volts = np.ascontiguousarray(v, dtype=np.float64)
+        rate = (time.size - 1) / (time[-1] - time[0])
+        others = {
+            k: np.ascontiguousarray(x, dtype=np.float64) for k, x in (channels or {}).items()
+        }
+        # a record's own draws: its phases are not those of the next
+        key = zlib.crc32(volts.tobytes())
+        gains = {n: g for n, g in self.gains.items() if changed or n not in self.later}
+        if abs(rate / RATE - 1) < 1e-6:
+            y = self._displacement(time, volts / VOLTS, gains, others, (key, take))
+        else:
+            ticks = np.arange(math.floor((time[-1] - time[0]) * RATE + 1e-6) + 1) / RATE + time[0]
+            index = np.searchsorted(time, ticks + 1e-9, side='right') - 1
+            held = {k: x[index] for k, x in others.items()}
+            fine = self._displacement(ticks, volts[index] / VOLTS, gains, held, (key, take))
+            y = np.interp(time, ticks, fine)
+        if not clean:
+            y = y + self._sensor_noise(y, np.random.default_rng([3, self.seed, key, take]))
+        return np.asarray(y * SPAN)
+
+    def _displacement(
+        self,
+        t: Array,
+        u: Array,
+        gains: Mapping[str, float],
+        channels: Mapping[str, Array],
+        key: tuple[int, int],
+    ) -> Array:
+        def draw(name: str) -> np.random.Generator:
+            return np.random.default_rng([zlib.crc32(name.encode()), self.seed, *key])
+
+        kind = self.variants
+        drive = self._amplifier(u, gains)
+        h = self._hysteresis(drive, gains)
+        if 'creep' in gains:
+            h = relaxation(h, ('log', 'power')[kind['creep']], gains['creep'])
+        if 'asymmetric_relaxation' in gains:
+            h = relaxation(h, 'log', gains['asymmetric_relaxation'], up=0.0)
+        if 'preload_loss' in gains:
+            h = h + laws.hinge(drive, gains['preload_loss'], kind['preload_loss'])
+        y = self._motion(h, gains)
+        if 'backlash' in gains:
+            y = y + laws.friction(y, gains['backlash'], kind['backlash'])
+        if 'gain_drift' in gains:
+            walk = laws.wander(t, gains['gain_drift'], kind['gain_drift'], draw('gain_drift'))
+            y = y * (1.0 + walk)
+        if 'cross_coupling' in gains and 'other' in channels:
+            y = y + gains['cross_coupling'] * self._other(channels['other'] / VOLTS)
+        for name, law in (('thermal_drift', laws.drift), ('periodic_disturbance', laws.hum)):
+            if name in gains:
+                y = y + law(t, gains[name], kind[name], draw(name))
+        if 'stick_jumps' in gains:
+            y = y + laws.jumps(u, gains['stick_jumps'], draw('stick_jumps'))
+        if 'floor_vibration' in gains:
+            y = y + laws.vibration(u.size, gains['floor_vibration'], draw('floor_vibration'))
+        if 'input_ripple' in gains:
+            y = y + laws.ripple(t, u, gains['input_ripple'], draw('input_ripple'))
+        if 'sensor_nonlinearity' in gains:
+            y = laws.bridge(y, gains['sensor_nonlinearity'], kind['sensor_nonlinearity'])
+        if 'input_feedthrough' in gains:
+            y = y + laws.fed_through(u, gains['input_feedthrough'], kind['input_feedthrough'])
+        return y
+
+    def _amplifier(self, u: Array, gains: Mapping[str, float]) -> Array:
+        if 'slew_limit' in self.variants:
+            slew = gains.get('slew_limit', math.inf)
+            u = laws.current_limited(u, slew, self.variants['slew_limit'])
+        if 'saturation' in gains:
+            u = laws.limited(u, gains['saturation'], self.variants['saturation'])
+        if 'amplifier_lag' in gains:
+            u = laws.charged(u, gains['amplifier_lag'], self.variants['amplifier_lag'])
+        return u
+
+    def _hysteresis(self, u: Array, gains: Mapping[str, float]) -> Array:
+        base, kind = self.base, self.variants
+        h = base.single_valued(u)
+        if 'even_nonlinearity' in gains:
+            h = h + laws.bent(u, gains['even_nonlinearity'], kind['even_nonlinearity'])
+        if base.core == 'bouc_wen':
+            return np.asarray(h + base.density.width() * 0.7 * bouc_wen(u, 0.15))
+        kappa = gains.get('noncongruent_minor_loops', 0.0)
+        if base.core == 'everett':
+            return h + everett(u, base.density, kappa)
+        low = high = None
+        follow, rate = 1.0, gains.get('rate_dependent_hysteresis', 0.0)
+        if rate:
+            variant, speed = kind['rate_dependent_hysteresis'], laws.speed_of(u)
+            if variant == 2:
+                follow = -math.expm1(-1.0 / (RATE * rate))
+            else:
+                low = rate * speed / (speed + 60.0)
+                if variant == 0:
+                    low = high = 0.5 * low
+        forget = -math.expm1(-gains.get('memory_fade', 0.0) / RATE)
+        return h + plays(u, base.density, low, high, follow=follow, forget=forget, curve=kappa)
+
+    def _motion(self, h: Array, gains: Mapping[str, float]) -> Array:
+        dynamics, delay = self.base.dynamics, self.base.delay
+        amount = gains.get('changed_dynamics', 0.0)
+        if amount and self.variants['changed_dynamics'] == 0 and isinstance(dynamics, Cascade):
+            dynamics = dynamics.loaded(amount)
+        y = dynamics(h)
+        if amount and self.variants['changed_dynamics'] == 1:
+            y = y + ridden(h, amount, 260.0 + 14.0 * (self.seed % 7))
+        return delayed(y, delay + gains.get('delay_change', 0.0))
+
+    def _other(self, u: Array) -> Array:
+        density = make_base(self.seed + 1000).density
+        moved = 0.8 * u + everett(np.maximum(u, 0.0), density)
+        frequency = 180.0 + 60.0 * (self.seed % 5)
+        return Cascade(((frequency, 0.04, 1.0),), (2500.0,))(moved)
+
+    def _sensor_noise(self, y: Array, rng: np.random.Generator) -> Array:
+        if self.noise == 'none' or self.noise_rms == 0:
+            return np.zeros(y.size)
+        white = rng.standard_normal(y.size)
+        if self.noise == '1/f':
+            spectrum = np.fft.rfft(white)
+            spectrum[0] = 0.0
+            spectrum[1:] /= np.sqrt(np.arange(1, spectrum.size))
+            coloured = np.fft.irfft(spectrum, y.size)
+            return np.asarray(self.noise_rms * coloured / coloured.std())
+        noise = self.noise_rms * white
+        if self.noise == '10-bit':
+            noise = np.rint((y + noise) * 1024) / 1024 - y
+        return np.asarray(noise)
+
+
+def make_stage(
+    effect: str | tuple[str, ...] | None,
+    strength: float = 0.3,
+    seed: int = 0,
+    noise: str = 'white',
+    noise_rms: float = 2e-5,
+    *,
+    core: str | None = None,
+    variant: int | None = None,
+    later: tuple[str, ...] = LATER,
+) -> Stage:
+    """
+    Return a stage with undeclared effects.
+
+    Parameters
+    ----------
+    effect : str, tuple of str or None
+        Names out of `EFFECTS` and `OUTSIDE`.
+    strength : float
+        What about is left of each effect on the diagnosis programme after the best refit of
+        weights, polynomial and offset of the base [% of stroke, rms].
+    seed : int
+        Of the stage, and of the form of each law.
+    noise : {'white', '1/f', '10-bit', 'none'}
+        White, or with a density of 1/f, of the same rms over a record; or white, and then rounded
+        to 1/1024 of the span.
+    noise_rms : float
+        Share of the span.
+    core : {'plays', 'everett', 'bouc_wen'}, optional
+        Instead of the one that the seed draws.
+    variant : int, optional
+        Form of the law, instead of the one that the seed draws.
+    later : tuple of str
+        Effects that set in after the identification.
+
+    Raises
+    ------
+    ValueError
+        When an effect or a noise is unknown.
+    """
+    names = () if effect is None else (effect,) if isinstance(effect, str) else tuple(effect)
+    for name in names:
+        if name not in EFFECTS + OUTSIDE:
+            raise ValueError(f'no law for {name!r}; there are {", ".join(EFFECTS + OUTSIDE)}')
+    if noise not in ('white', '1/f', '10-bit', 'none'):
+        raise ValueError(f'noise must be white, 1/f, 10-bit or none, got {noise!r}')
+    kind = {n: seed % VARIANTS[n] if variant is None else variant for n in names}
+    base = make_base(seed, core)
+    if kind.get('changed_dynamics') == 0 and isinstance(base.dynamics, ARX):
+        kind['changed_dynamics'] = 1
+    if 'noncongruent_minor_loops' in kind and core is None:
+        form = ('everett', 'plays')[kind['noncongruent_minor_loops']]
+        base = replace(base, core=form)
+    if any(n in _PLAYS for n in names):
+        base = replace(base, core='plays')
+    gains = {n: gain_of(n, kind[n], strength) for n in names}
+    return Stage(
+        base,
+        MappingProxyType(gains),
+        MappingProxyType(kind),
+        later,
+        seed,
+        noise,
+        noise_rms,
+    )
