@@ -210,7 +210,8 @@ def test_a_file_may_leave_out_what_has_a_default(name):
 )
 def test_numbers_out_of_bounds_are_refused(name, p):
     def given(x):
-        value = np.full(np.shape(VISIBLE[name][p.name]), x) if p.vector else x
+        complete = find_effect(name).check(VISIBLE[name])
+        value = np.full(np.shape(complete[p.name]), x) if p.vector else x
         return {**VISIBLE[name], p.name: value}
 
     beyond = [float('nan')]

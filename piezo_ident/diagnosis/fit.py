@@ -34,9 +34,11 @@ from piezo_ident.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
 __all__ = [
+    'RETUNING',
     'BaseColumns',
     'Fitted',
     'Handle',
+    'base_at',
     'base_thresholds',
     'fit_base',
     'fit_jointly',
@@ -50,6 +52,8 @@ ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
 RETUNING = (5.0, 200.0, 1.0, 1.0)
 #: relative size of a finite difference in the logarithm of a parameter
 LOG_STEP = 1e-2
+#: finite difference of a weight of H, normalised
+WEIGHT_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,23 @@ class Handle:
 
 
 @dataclass(frozen=True, eq=False)
+class BaseColumns:
+    """
+    What a refit of the base model can do.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (n, m + 2 + records)
+        Filtered plays, v^3, v and the offset of each record.
+    total : ndarray, shape (m + 2 + records, m + 2 + records)
+        Their products.
+    """
+
+    columns: NDArray[np.float64]
+    total: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """
     Result of a joint fit.
@@ -106,6 +127,8 @@ class Fitted:
     Attributes
     ----------
     state : State
+    base : BaseColumns
+        That were used for H.
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
     J : ndarray, shape (n, p)
@@ -119,6 +142,7 @@ class Fitted:
     """
 
     state: State
+    base: BaseColumns
     e: NDArray[np.float64]
     J: NDArray[np.float64]
     free: NDArray[np.bool_]
@@ -142,23 +166,6 @@ def base_thresholds(swing: float) -> NDArray[np.float64]:
     """Return twenty even thresholds over the swing, and four fine ones near zero."""
     fine = np.array([0.005, 0.012, 0.025, 0.037])
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
-
-
-@dataclass(frozen=True, eq=False)
-class BaseColumns:
-    """
-    What a refit of the base model can do.
-
-    Attributes
-    ----------
-    columns : ndarray, shape (n, m + 2 + records)
-        Filtered plays, v^3, v and the offset of each record.
-    total : ndarray, shape (m + 2 + records, m + 2 + records)
-        Their products.
-    """
-
-    columns: NDArray[np.float64]
-    total: NDArray[np.float64]
 
 
 def fit_base(
@@ -187,6 +194,30 @@ def fit_base(
     theta = normal.solve(lower, upper)
     new = Hysteresis(thresholds, theta[:m], float(theta[m]), float(theta[m + 1]))
     return replace(state, hysteresis=new, offsets=theta[m + 2 :]), base
+
+
+def base_at(simulator: Simulator, state: State) -> BaseColumns:
+    """
+    Return what a refit of H can do in a state, its effects and a retuned G included.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    state : State
+    """
+    h = state.hysteresis
+    prediction = simulator.run(state)
+    columns = []
+    for j in range(h.thresholds.size + 2):
+        weights, p1, p2 = h.weights.copy(), h.p1, h.p2
+        if j < h.thresholds.size:
+            weights[j] += WEIGHT_STEP
+        p1 += WEIGHT_STEP * (j == h.thresholds.size)
+        p2 += WEIGHT_STEP * (j == h.thresholds.size + 1)
+        moved = replace(state, hysteresis=Hysteresis(h.thresholds, weights, p1, p2))
+        columns.append((simulator.run(moved) - prediction) / WEIGHT_STEP)
+    whole = np.hstack([np.stack(columns, axis=1), _offset_columns(simulator.rows)])
+    return BaseColumns(whole, whole.T @ whole)
 
 
 def handles_of(state: State, records: int) -> tuple[Handle, ...]:
@@ -292,6 +323,7 @@ def fit_jointly(
     gram = gram_of(rows, J[:, free], e)
     return Fitted(
         state=state,
+        base=base,
         e=e,
         J=J,
         free=free,

@@ -33,7 +33,6 @@ import numpy as np
 from piezo_ident.diagnosis.assemble import assemble, PASSES
 from piezo_ident.diagnosis.fit import (
     base_thresholds,
-    BaseColumns,
     fit_base,
     fit_jointly,
     Fitted,
@@ -106,7 +105,7 @@ def diagnose(
         )
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    base, columns = _base(simulator, given)
+    base = _base(simulator, given)
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
     lines = find_lines(parts, stretches).lines
@@ -117,7 +116,7 @@ def diagnose(
     noise = row_noise(floor, faults, rows.m, abs(model.scaling.Y))
     progress('residual', 1.0)
     frequencies = [line.frequency for line in lines]
-    search = _Search(simulator, columns, frequencies, noise, settings, progress)
+    search = _Search(simulator, frequencies, noise, settings, progress)
     rounds, taken, fitted = search.run(base)
     if not taken:
         fitted = base
@@ -139,11 +138,11 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
     ]
 
 
-def _base(simulator: Simulator, given: State) -> tuple[Fitted, BaseColumns]:
-    """Return the base model refitted on a fine grid of thresholds, and the columns of it."""
+def _base(simulator: Simulator, given: State) -> Fitted:
+    """Return the base model refitted on a fine grid of thresholds."""
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     state, columns = fit_base(simulator, given, base_thresholds(swing))
-    return fit_jointly(simulator, state, columns), columns
+    return fit_jointly(simulator, state, columns)
 
 
 def row_noise(floor: NoiseFloor, faults: FaultSearch, m: int, span: float) -> float:
@@ -160,14 +159,12 @@ class _Search:
     def __init__(
         self,
         simulator: Simulator,
-        columns: BaseColumns,
         lines: Sequence[float],
         noise: float,
         settings: DiagnosisSettings,
         progress: Progress,
     ) -> None:
         self._simulator = simulator
-        self._columns = columns
         self._lines = lines
         self._noise = noise
         self._most = settings.most_effects
@@ -180,7 +177,7 @@ class _Search:
     def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:
         """Return all rounds, those whose best contender was added, and the fit at the end."""
         state = replace(base.state, retuning=(0.0,) * len(RETUNING))
-        retuned = fit_jointly(self._simulator, state, self._columns)
+        retuned = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
         if base.mean_square - retuned.mean_square < LINEAR * explainable:
             return self._from(retuned, self._round(retuned))
@@ -213,7 +210,7 @@ class _Search:
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
         return search_round(
-            self._simulator, fitted, self._columns, left, self._lines, self._noise, self._rng, tick
+            self._simulator, fitted, left, self._lines, self._noise, self._rng, tick
         )
 
     def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
@@ -225,7 +222,7 @@ class _Search:
         while testable and takes(rows, this, self._noise, explainable, first=not taken):
             taken.append(this)
             fitted, dropped = drop_needless(
-                self._simulator, this.contenders[0].fitted, self._columns, self._least
+                self._simulator, this.contenders[0].fitted, self._least
             )
             for i in dropped:
                 del taken[i]

@@ -23,11 +23,12 @@ of the same colour would gain sets the bar.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
-from piezo_ident.diagnosis.fit import BaseColumns, fit_jointly, Fitted
+from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.gain import gram_of
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
@@ -42,6 +43,8 @@ Tick = Callable[[float], None]
 JOINT, WORTH = 5, 0.05
 #: iterations of their first fit, and how many are fitted to the end
 FIRST, FINAL = 4, 2
+#: trials of a candidate that a fit starts from
+STARTS = 3
 #: a simpler effect goes first when it leaves no more than this times what the best one leaves
 SIMPLER = 1.3
 #: turned residuals that say what chance gains
@@ -100,7 +103,6 @@ class Round:
 def search_round(
     simulator: Simulator,
     before: Fitted,
-    columns: BaseColumns,
     effects: Sequence[type[Effect]],
     lines: Sequence[float],
     noise: float,
@@ -114,8 +116,6 @@ def search_round(
     ----------
     simulator : Simulator
     before : Fitted
-    columns : BaseColumns
-        Of the thresholds in use.
     effects : sequence of type of Effect
         Candidates.
     lines : sequence of float
@@ -133,7 +133,7 @@ def search_round(
     turns = rng.integers(rows.n // 20, rows.n - rows.n // 20, TURNS)
     turned = np.stack([np.roll(before.e, int(k)) for k in turns], axis=1)
     base = (M, gram_of(rows, M, before.e), prior)
-    best: dict[str, Scored] = {}
+    trials: dict[str, list[Scored]] = {}
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
     for scored in score_trials(
@@ -149,8 +149,10 @@ def search_round(
         name = scored.effect.name
         chance[name] = max(chance.get(name, 0.0), float(scored.chance.max()) / rows.n)
         visible[name] = max(visible.get(name, 0.0), scored.visible)
-        if name not in best or scored.errors.sum() < best[name].errors.sum():
-            best[name] = scored
+        trials.setdefault(name, []).append(scored)
+    for scores in trials.values():
+        scores.sort(key=lambda s: float(s.errors.sum()))
+    best = {name: scores[0] for name, scores in trials.items()}
     explainable = max(float(before.errors.sum()) - noise * rows.n, 1e-300)
     ranked = sorted(best.values(), key=lambda s: float(s.errors.sum()))
     promising = [s for s in ranked if before.errors.sum() - s.errors.sum() > WORTH * explainable][
@@ -164,15 +166,21 @@ def search_round(
     for i, scored in enumerate(promising):
         at = 0.5 + 0.5 * i / len(promising)
         tick(at)
-        state = before.state.with_effect(started(rows, scored))
-        try:
-            fitted = fit_jointly(simulator, state, columns, iterations=FIRST, tick=alive)
-        except ModelError:
-            continue
-        contenders.append(Contender(scored.effect, scored, fitted))
+        fits = []
+        # a law that looks best while it is small need not be the one that fits best
+        for start in trials[scored.effect.name][:STARTS]:
+            state = before.state.with_effect(started(rows, start))
+            with contextlib.suppress(ModelError):
+                fits.append(
+                    fit_jointly(simulator, state, before.base, iterations=FIRST, tick=alive)
+                )
+        if fits:
+            fitted = min(fits, key=lambda f: f.mean_square)
+            contenders.append(Contender(scored.effect, scored, fitted))
     contenders.sort(key=lambda c: c.fitted.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
-        better = fit_jointly(simulator, contender.fitted.state, columns, tick=alive)
+        state = contender.fitted.state
+        better = fit_jointly(simulator, state, base_at(simulator, state), tick=alive)
         contenders[i] = replace(contender, fitted=better)
     contenders.sort(key=lambda c: c.fitted.mean_square)
     contenders = _simplest_first(contenders, noise)
@@ -197,7 +205,7 @@ def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender
 
 
 def drop_needless(
-    simulator: Simulator, fitted: Fitted, columns: BaseColumns, least: float
+    simulator: Simulator, fitted: Fitted, least: float
 ) -> tuple[Fitted, tuple[int, ...]]:
     """
     Take out effects that later ones have made needless.
@@ -207,8 +215,6 @@ def drop_needless(
     simulator : Simulator
     fitted : Fitted
         Whose last effect stays.
-    columns : BaseColumns
-        As in `search_round`.
     least : float
         Mean square that an effect must be worth.
 
@@ -221,7 +227,7 @@ def drop_needless(
     dropped: list[int] = []
     for i in range(len(fitted.state.effects) - 2, -1, -1):
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        without = fit_jointly(simulator, replace(fitted.state, effects=rest), columns)
+        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
         if without.mean_square - fitted.mean_square < least:
             fitted = without
             dropped.append(i)

@@ -85,7 +85,7 @@ class Creep(Effect):
             step=1e-3,
         ),
         Parameter(
-            'time_constant', 's', 'time constant tau_i', NAN, 1e-4, 1e6, vector=True, scale='log'
+            'time_constant', 's', 'time constant tau_i', NAN, 1e-4, 1e6, vector=True, scale='fixed'
         ),
     )
 
@@ -98,11 +98,12 @@ class Creep(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return elements spread over all times that the data hold, a few, and single ones."""
+        """Return elements spread over all times that the data hold, many and few."""
         shortest = max(5.0 / view.sample_rate, 0.01)
-        longest = max(3.0 * view.duration, 10.0 * shortest)
-        sets = [ladder(shortest, longest, 6), ladder(3 * shortest, longest / 3, 3)]
-        sets += [[tau] for tau in ladder(3 * shortest, longest, 5)]
+        # a time far beyond the record would pass for a drift
+        longest = max(view.duration, 10.0 * shortest)
+        # single times would fit a decade better and the next one worse
+        sets = [ladder(shortest, longest, 7), ladder(3 * shortest, longest / 3, 4)]
         return tuple(cls.trial({'time_constant': taus}) for taus in sets)
 
     def reset(self, v0: float, x0: float) -> float:
