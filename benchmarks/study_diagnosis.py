@@ -120,20 +120,19 @@ class Row:
 
 def cases(short: bool = False) -> Iterator[Case]:
     """Yield every case, the telling ones first."""
-    seeds, sizes = (SEEDS[:1], (0.3,)) if short else (SEEDS, (0.3, 0.1, 1.0))
-    for size in sizes:
-        for seed in seeds:
-            for effect in EFFECTS:
-                yield Case('one', (effect,), size, seed)
-    for seed in range(1, 2 if short else 21):
-        for noise in COLOURS:
-            yield Case('none', (), 0.0, seed, noise)
-    for seed in seeds:
+    for seed in SEEDS[:1] if short else SEEDS:
+        for effect in EFFECTS:
+            yield Case('one', (effect,), 0.3, seed)
+        for number in range(seed, 2 if short else 21, len(SEEDS)):
+            for noise in COLOURS:
+                yield Case('none', (), 0.0, number, noise)
         for effect in EFFECTS:
             yield Case('removed', (effect,), 0.3, seed, without=(effect,))
-    for seed in seeds:
         for effect in OUTSIDE:
             yield Case('outside', (effect,), 0.3, seed)
+        for size in () if short else (0.1, 1.0):
+            for effect in EFFECTS:
+                yield Case('one', (effect,), size, seed)
     for pair in PAIRS[:2] if short else PAIRS:
         yield Case('pair', pair, 0.3, 1)
 

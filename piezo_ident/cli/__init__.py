@@ -15,7 +15,8 @@
 """
 The command line: ``piezo_ident VERB ...``.
 
-Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted.
+Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted;
+1 when the graph of the demonstration did not get through.
 Nothing heavy is imported before the arguments are understood.
 """
 
@@ -213,11 +214,48 @@ def _build_parser() -> _Parser:
     )
     p.add_argument('--plot', type=_path, metavar='PNG', help='picture of measured and predicted')
 
+    p = verb('diagnose', 'Find the effect that a model lacks, and add it', _reading(), _json())
+    p.add_argument('model_file', type=_path, metavar='MODEL', help='model file')
+    p.add_argument(
+        'records',
+        nargs='+',
+        type=_path,
+        metavar='RECORD',
+        help='file, bag, or folder of records that the model was not identified from',
+    )
+    p.add_argument('--model', type=_path, metavar='YAML', help='write the refined model there')
+    p.add_argument('--report', type=_path, metavar='DIR', help='write page and pictures there')
+    p.add_argument(
+        '--validation',
+        nargs='+',
+        type=_path,
+        default=[],
+        metavar='RECORD',
+        help='further records: predicted before and after, with no part in the diagnosis',
+    )
+    for option, text in (
+        ('--only', 'try this effect and no other'),
+        ('--without', 'do not try this effect'),
+    ):
+        p.add_argument(
+            option,
+            type=_name,
+            action='append',
+            default=[],
+            metavar='NAME',
+            help=f'{text}; may be given several times',
+        )
+    p.add_argument(
+        '--most-effects', type=_whole, default=4, metavar='N', help='to be added (default: 4)'
+    )
+    p.add_argument('--seed', type=_whole, default=0, help='of what is drawn (default: 0)')
+
     p = verb('convert', 'Turn a record into another format', _reading(), _json())
     p.add_argument('record', type=_path, metavar='IN', help='file or bag')
     _add_output(p)
 
-    verb('effects', 'List the effects that a model can have', _json())
+    p = verb('effects', 'List the effects that a model can have', _json())
+    p.add_argument('name', nargs='?', type=_name, metavar='NAME', help='say more about this one')
 
     p = verb('demo', 'Identify simulated stages, and a measured one if it is there')
     p.add_argument('--out', type=_path, default=Path('demo_report'), metavar='DIR', help='reports')
@@ -269,7 +307,7 @@ def _main(argv: Sequence[str] | None) -> int:
         with interrupts.quitting():
             from piezo_ident.cli import commands
 
-        commands.run(args)
+        code = commands.run(args)
         sys.stdout.flush()
         interrupts.finish()
     except KeyboardInterrupt:
@@ -290,7 +328,7 @@ def _main(argv: Sequence[str] | None) -> int:
         if interrupts.met:
             return _interrupted()
         raise
-    return DONE
+    return code
 
 
 def _interrupted() -> int:

@@ -18,16 +18,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-import inspect
 from pathlib import Path
 
 import numpy as np
 from piezo_ident.cli.common import check_record_output, read, say_faults, story
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
 from piezo_ident.cli.outputs import check_folder, check_link
-from piezo_ident.effects import catalogue
 from piezo_ident.errors import ConfigError
 from piezo_ident.program import load_program
 from piezo_ident.record_io import write_record
@@ -37,16 +36,16 @@ from piezo_ident.simulation import load_stage, simulate
 __all__ = ['run']
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> int:
     """
-    Do what the arguments ask.
+    Do what the arguments ask, and return the exit code.
 
     Raises
     ------
     PiezoIdentError
         With a message that names the file and the cure.
     """
-    COMMANDS[args.verb](args, Console(getattr(args, 'json', False)))
+    return COMMANDS[args.verb](args, Console(getattr(args, 'json', False))) or 0
 
 
 def simulate_command(args: argparse.Namespace, console: Console) -> None:
@@ -105,46 +104,25 @@ def convert_command(args: argparse.Namespace, console: Console) -> None:
     console.result({'in': str(args.record), 'out': str(args.out), **story(record, losses)})
 
 
-def effects_command(args: argparse.Namespace, console: Console) -> None:
-    """``piezo_ident effects``."""
-    data = []
-    for name, effect in sorted(catalogue().items()):
-        about = (inspect.getdoc(effect) or '').partition('\n')[0]
-        console.say(f'{name}  (slot: {effect.slot})\n    {about}')
-        for p in effect.parameters:
-            shape = 'list of ' if p.vector else ''
-            neutral = 'no neutral value' if np.isnan(p.neutral) else f'neutral {p.neutral:g}'
-            console.say(
-                f'    {p.name:15s} {shape}[{p.unit}]  {p.lower:g} .. {p.upper:g}, {neutral}: '
-                f'{p.description}'
-            )
-        parameters = [
-            {
-                'name': p.name,
-                'unit': p.unit,
-                'description': p.description,
-                'neutral': p.neutral,
-                'lower': p.lower,
-                'upper': p.upper,
-                'list': p.vector,
-            }
-            for p in effect.parameters
-        ]
-        data.append({'name': name, 'slot': effect.slot, 'about': about, 'parameters': parameters})
-    console.result(data)
+def diagnose_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident diagnose``."""
+    from piezo_ident.cli.diagnose_command import diagnose_command as command
+
+    command(args, console)
 
 
-def demo_command(args: argparse.Namespace, console: Console) -> None:
+def demo_command(args: argparse.Namespace, console: Console) -> int:
     """``piezo_ident demo``."""
     from piezo_ident.cli.demo import demo
 
     check_folder(args.out)
-    demo(args.out, args.measured, console)
+    return demo(args.out, args.measured, console)
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], None]] = {
+COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], int | None]] = {
     'convert': convert_command,
     'demo': demo_command,
+    'diagnose': diagnose_command,
     'effects': effects_command,
     'identify': identify_command,
     'predict': predict_command,

@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ from piezo_ident.record import Record
 from piezo_ident.results import Settings
 from piezo_ident.table_io import Table, WRITERS
 
-__all__ = ['identify_command', 'predict_command']
+__all__ = ['MODEL_FILES', 'check_order', 'identify_command', 'predict_command']
 
 MODEL_FILES = ('.yaml', '.yml')
 TABLE_FILES = ('.csv', '.npz')
@@ -154,7 +155,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             check_suffix(path, suffixes, what)
             check_file(path, overwrite=True)
             check_distinct(path, [args.model, args.record])
-    _check_order(args)
+    check_order(args.model, args.record, 'predict')
     model = load_model(args.model)
     record = read(args.record, args)
     with naming(str(args.model)):
@@ -194,9 +195,15 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
     )
 
 
-def _check_order(args: argparse.Namespace) -> None:
-    order = 'MODEL comes first: piezo_ident predict model.yaml record.csv'
-    model, record = args.model, args.record
+def check_order(model: Path, record: Path, verb: str) -> None:
+    """
+    Refuse a model and a record in the wrong order.
+
+    Raises
+    ------
+    ConfigError
+    """
+    order = f'MODEL comes first: piezo_ident {verb} model.yaml record.csv'
     if model.suffix.lower() in RECORD_FILES or model.is_dir():
         raise ConfigError(f'{model}: is a record, no model file; {order}')
     if record.suffix.lower() in MODEL_FILES:

@@ -40,7 +40,7 @@ from piezo_ident.diagnosis.fit import (
 )
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.rows import make_rows
-from piezo_ident.diagnosis.search import drop_needless, Round, search_round
+from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
 from piezo_ident.effects import catalogue, find_effect
@@ -214,7 +214,8 @@ class _Search:
         )
 
     def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
-        rows, fitted, this = self._simulator.rows, start, first
+        simulator, fitted, this = self._simulator, start, first
+        rows = simulator.rows
         rounds, taken = [first], list[Round]()
         explainable = max(start.mean_square - self._noise, 0.0)
         # a branch that was passed once only cannot be held out
@@ -230,5 +231,9 @@ class _Search:
                 break
             this = self._round(fitted)
             rounds.append(this)
+        if len(fitted.state.effects) > 1:
+            fitted = polished(
+                simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
+            )
         self._progress('candidates', 1.0)
         return rounds, taken, fitted

@@ -34,7 +34,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
 from piezo_ident.errors import ModelError
 
-__all__ = ['Contender', 'Round', 'Tick', 'drop_needless', 'search_round']
+__all__ = ['Contender', 'Round', 'Tick', 'drop_needless', 'polished', 'search_round']
 
 #: called with the share of the round that is done; may raise `Cancelled`
 Tick = Callable[[float], None]
@@ -45,6 +45,8 @@ JOINT, WORTH = 5, 0.05
 FIRST, FINAL = 4, 2
 #: trials of a candidate that a fit starts from
 STARTS = 3
+#: passes with fresh columns at the end, at most, and the gain that makes another worth it
+PASSES, POLISH = 6, 0.02
 #: a simpler effect goes first when it leaves no more than this times what the best one leaves
 SIMPLER = 1.3
 #: turned residuals that say what chance gains
@@ -232,3 +234,48 @@ def drop_needless(
             fitted = without
             dropped.append(i)
     return fitted, tuple(dropped)
+
+
+def polished(
+    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
+) -> Fitted:
+    """
+    Fit several effects again, each from fresh starts now that the others are known.
+
+    An effect that was found beside others not yet in the model took a law that made up for them.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    fitted : Fitted
+    lines : sequence of float
+        Lines in the residual [Hz].
+    tick : callable
+    """
+    rows = simulator.rows
+    nothing = np.zeros((rows.n, 0))
+    for i, own in enumerate(fitted.state.effects):
+        others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+        state = replace(fitted.state, effects=others)
+        rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
+        now = simulator.remember(rest.state)
+        M, prior = rest.J[:, rest.free], rest.prior[rest.free]
+        base = (M, gram_of(rows, M, rest.e), prior)
+        view = view_of(simulator, lines)
+        trials = list(score_trials(simulator, [own.effect], view, base, rest.e, now, nothing))
+        trials.sort(key=lambda s: float(s.errors.sum()))
+        for start in trials[:STARTS]:
+            effects = list(others)
+            effects.insert(i, started(rows, start))
+            state = replace(rest.state, effects=tuple(effects))
+            with contextlib.suppress(ModelError):
+                fresh = fit_jointly(simulator, state, fitted.base, tick=tick)
+                if fresh.mean_square < fitted.mean_square:
+                    fitted = fresh
+    for _ in range(PASSES):
+        state = fitted.state
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
+        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted

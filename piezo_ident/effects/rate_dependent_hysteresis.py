@@ -178,22 +178,22 @@ class RateDependentHysteresis(Effect):
         """Return several laws of the speed, growth below alone and on both sides."""
         if not np.any(view.thresholds > 0):
             return ()
-        cutoff, found = min(view.sample_rate / 10, 2000.0), []
+        found = []
         fast = max(view.speed, *view.speeds)
-        laws = [
-            (0.3, 0.0),
-            (0.6, 0.0),
-            (1.0, 0.0),
-            (1.5, 0.0),
-            (1.0, 5.0 / fast),
-            (1.0, 50.0 / fast),
-        ]
+        laws = [(0.3, 0.0), (0.6, 0.0), (1.0, 0.0), (1.5, 0.0)]
+        laws += [(1.0, 5.0 / fast), (1.0, 50.0 / fast)]
         for exponent, levelling in laws:
             unit = ((1.0 + levelling * fast) / fast) ** exponent
             small, large = min(0.1, 2e-3 * unit), min(0.5, 1e-2 * unit)
             steps = {'gain': small, 'stretch': large, 'lead': small, 'lead_stretch': large}
-            shape = {'exponent': exponent, 'levelling': levelling, 'cutoff': cutoff}
-            found += [cls.trial(shape, ['gain', 'stretch'], steps), cls.trial(shape, steps=steps)]
+            for cutoff in (2000.0, 400.0):
+                shape = {
+                    'exponent': exponent,
+                    'levelling': levelling,
+                    'cutoff': min(view.sample_rate / 10, cutoff),
+                }
+                found.append(cls.trial(shape, ['gain', 'stretch'], steps))
+            found.append(cls.trial(shape, steps=steps))
         return tuple(found)
 
     def reset(self, v0: float, x0: float) -> float:

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -31,9 +30,9 @@ from piezo_ident.plots.style import (
     legend,
     legend_above,
     line,
-    NORMAL,
     note,
     NothingToDraw,
+    percent_axis,
     plain_log,
     safe,
     SMALL,
@@ -105,7 +104,7 @@ def loops_figure(runs: Sequence[FreeRun], edges: Sequence[int | None] = ()) -> F
     name = ', '.join(filter(None, (safe(run.record), safe(s.label))))
     tidy(loops, '', 'displacement / µm', name)
     tidy(errors, 'voltage / V', f'error / {unit}')
-    _percent_axis(errors, scale * 1e6 * float(np.ptp(run.piece.y)))
+    percent_axis(errors, scale * 1e6 * float(np.ptp(run.piece.y)))
     legend(loops, loc='best')
     fig.align_ylabels([loops, errors])
     return fig
@@ -202,22 +201,6 @@ def _draw_error(
     return unit, scale
 
 
-def _percent_axis(axes: Axes, stroke: float) -> None:
-    """Add a right-hand axis in % of stroke; `stroke` in the unit of the left one."""
-    if stroke <= 0.0:
-        return
-
-    def percent(e: Any) -> Any:
-        return 100.0 * e / stroke
-
-    def error(p: Any) -> Any:
-        return p * stroke / 100.0
-
-    right = axes.secondary_yaxis('right', functions=(percent, error))
-    right.set_ylabel('% of stroke', fontsize=NORMAL)
-    right.tick_params(labelsize=SMALL)
-
-
 def overview_figure(run: FreeRun, held_out_from: int | None = None) -> Figure:
     """
     Draw a whole piece: voltage, displacement measured and modelled, and the error.
@@ -249,7 +232,7 @@ def overview_figure(run: FreeRun, held_out_from: int | None = None) -> Figure:
     tidy(axes[1], '', 'displacement / µm')
     tidy(axes[2], 'time / s', f'error / {unit}')
     _name_segments(axes[0], run)
-    _percent_axis(axes[2], scale * float(np.ptp(y)))
+    percent_axis(axes[2], scale * float(np.ptp(y)))
     axes[0].margins(x=0.01)
     legend_above(axes[1])
     if len(axes[2].lines) > 2:

@@ -16,23 +16,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import io
 import json
 import os
 from pathlib import Path
 import shutil
 import tempfile
+from typing import TYPE_CHECKING
 
 from piezo_ident.errors import DataError
+from piezo_ident.model import StageModel
 from piezo_ident.model_io import save_model
 from piezo_ident.record import Record
+from piezo_ident.report.html import Shown
 from piezo_ident.report.numbers import to_json
 from piezo_ident.report.page import page
 from piezo_ident.results import Identification, Progress, silent
 from piezo_ident.validation import free_runs, sines_of
 
-__all__ = ['write_report']
+if TYPE_CHECKING:
+    from piezo_ident.plots import Picture
+
+__all__ = ['PAGE', 'put_in_place', 'rendered', 'write_report']
+
+PAGE = 'report.html'
 
 
 def write_report(
@@ -70,35 +78,88 @@ def write_report(
         When the folder cannot be written.
     """
     # matplotlib takes half a second to import, and most commands draw nothing
-    from piezo_ident.plots import DPI, draw, NAMES
+    from piezo_ident.plots import draw, NAMES
 
     records = [records] if isinstance(records, Record) else list(records)
     runs = free_runs(identification.model, records, identification.memories)
     drawn = draw(identification, runs, lambda share: progress('drawing', 0.4 * share))
-    shown = []
-    for i, picture in enumerate(drawn.pictures):
-        progress('drawing', 0.4 + 0.5 * i / len(drawn.pictures))
-        buffer = io.BytesIO()
-        picture.figure.savefig(buffer, format='png', dpi=DPI)
-        shown.append((picture.name, picture.title, picture.caption, buffer.getvalue()))
+    shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.4 + 0.5 * share))
     progress('writing', 0.9)
     html = page(identification, records, sines_of(runs), shown, drawn.left_out)
     numbers = json.dumps(
         to_json(identification, records, runs), indent=2, ensure_ascii=False, allow_nan=False
     )
+    texts = {'identification.json': numbers + '\n', PAGE: html}
+    return put_in_place(folder, texts, identification.model, shown, NAMES)
+
+
+def rendered(pictures: Sequence[Picture], tick: Callable[[float], None]) -> list[Shown]:
+    """
+    Return pictures as PNG.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+    tick : callable
+        Called with the share done; may raise to stop it.
+    """
+    from piezo_ident.plots import DPI
+
+    shown = []
+    for i, picture in enumerate(pictures):
+        tick(i / len(pictures))
+        buffer = io.BytesIO()
+        picture.figure.savefig(buffer, format='png', dpi=DPI)
+        shown.append((picture.name, picture.title, picture.caption, buffer.getvalue()))
+    return shown
+
+
+def put_in_place(
+    folder: str | os.PathLike[str],
+    texts: Mapping[str, str],
+    model: StageModel,
+    pictures: Sequence[Shown],
+    names: Collection[str],
+) -> Path:
+    """
+    Write the files of a report, all of them or none.
+
+    Parameters
+    ----------
+    folder : path
+        Made when it does not exist.
+    texts : mapping of str to str
+        By file name; one of them is the page, which is put in place last.
+    model : StageModel
+        Becomes ``model.yaml``.
+    pictures : sequence of (name, title, caption, png)
+    names : collection of str
+        Names of pictures that a report of this kind may have; an earlier one's are taken away.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    DataError
+        When the folder cannot be written.
+    """
     target = Path(folder)
     try:
         target.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(dir=target, prefix='.report.', suffix='.tmp'))
         try:
-            for name, _, _, png in shown:
+            for name, _, _, png in pictures:
                 (work / f'{name}.png').write_bytes(png)
-            (work / 'identification.json').write_text(numbers + '\n', encoding='utf-8')
-            save_model(identification.model, work / 'model.yaml')
-            (work / 'report.html').write_text(html, encoding='utf-8')
-            for name in sorted(os.listdir(work), key=lambda name: name == 'report.html'):
+            for name, text in texts.items():
+                # file names need not be Unicode
+                (work / name).write_bytes(text.encode('utf-8', 'replace'))
+            save_model(model, work / 'model.yaml')
+            for name in sorted(os.listdir(work), key=lambda name: name == PAGE):
                 os.replace(work / name, target / name)
-            for name in set(NAMES) - {name for name, *_ in shown}:
+            for name in set(names) - {name for name, *_ in pictures}:
                 (target / f'{name}.png').unlink(missing_ok=True)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -107,4 +168,4 @@ def write_report(
             f'{folder}: the report cannot be written ({error.strerror or error}); choose a folder '
             'with room and the right to write'
         ) from None
-    return target / 'report.html'
+    return target / PAGE

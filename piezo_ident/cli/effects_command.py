@@ -1,0 +1,147 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``effects``: the catalogue, and one effect at length."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import difflib
+import inspect
+import textwrap
+from typing import Any
+
+import numpy as np
+from piezo_ident.cli.console import Console
+from piezo_ident.effects import catalogue, Effect, Parameter
+from piezo_ident.errors import ConfigError
+
+__all__ = ['effect_name', 'effect_names', 'effects_command']
+
+#: [characters]
+WIDTH = 99
+
+
+def effect_name(text: str) -> str:
+    """
+    Return the name of an effect.
+
+    Raises
+    ------
+    ConfigError
+        When there is none of that name; with one that is spelt alike.
+    """
+    if text in catalogue():
+        return text
+    close = difflib.get_close_matches(text.lower().replace('-', '_'), catalogue(), n=1)
+    cure = f'did you mean {close[0]}?' if close else 'see piezo_ident effects'
+    raise ConfigError(f'unknown effect {text!r}; {cure}')
+
+
+def effect_names(texts: Sequence[str]) -> tuple[str, ...]:
+    """
+    Return names of effects, given one by one or joined by commas, each once.
+
+    Raises
+    ------
+    ConfigError
+        As `effect_name`.
+    """
+    names = [name.strip() for text in texts for name in text.split(',')]
+    return tuple(dict.fromkeys(effect_name(name) for name in names if name))
+
+
+def effects_command(args: argparse.Namespace, console: Console) -> None:
+    """``piezo_ident effects``."""
+    if args.name is not None:
+        effect = catalogue()[effect_name(args.name)]
+        for line in _at_length(effect):
+            console.say(line)
+        console.result(_data(effect))
+        return
+    effects = [effect for _, effect in sorted(catalogue().items())]
+    for effect in effects:
+        console.say(_title(effect))
+        console.say(f'    {_about(effect)}')
+        console.say(f'    parameters: {", ".join(p.name for p in effect.parameters)}')
+    console.say('\npiezo_ident effects NAME says more about one of them')
+    console.result([_data(effect) for effect in effects])
+
+
+def _title(effect: type[Effect]) -> str:
+    package = effect.__module__.partition('.')[0]
+    own = '' if package == 'piezo_ident' else f'  from {package}'
+    return f'{effect.name}  (slot: {effect.slot}){own}'
+
+
+def _about(effect: type[Effect]) -> str:
+    return effect.description or _documentation(effect).partition('\n')[0]
+
+
+def _documentation(effect: type[Effect]) -> str:
+    # a plug-in without a text of its own must not borrow that of the base class
+    return inspect.cleandoc(effect.__doc__ or '')
+
+
+def _at_length(effect: type[Effect]) -> list[str]:
+    lines = [_title(effect), *textwrap.wrap(_about(effect), WIDTH)]
+    if effect.needs:
+        lines += textwrap.wrap(f'shows in: {effect.needs}', WIDTH, subsequent_indent='  ')
+    if effect.time_driven:
+        lines.append('driven by time: its amplitudes differ from record to record')
+    head = ('parameter', 'unit', 'from', 'to', 'neutral', 'default', '')
+    rows = [head, *(_row(p) for p in effect.parameters)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines.append('')
+    for row in rows:
+        cells = [cell.ljust(w) for cell, w in zip(row, widths, strict=True)]
+        lines.append('  '.join(cells).rstrip())
+    lines += ['', *_documentation(effect).splitlines()]
+    return lines
+
+
+def _row(p: Parameter) -> tuple[str, ...]:
+    default = '' if p.default is None else str(p.default)
+    if p.kind == 'text':
+        return (p.name, 'text', '', '', '', default, p.description)
+    neutral = '' if np.isnan(p.neutral) else f'{p.neutral:g}'
+    about = f'{p.description} (a list)' if p.vector else p.description
+    return (p.name, p.unit, f'{p.lower:g}', f'{p.upper:g}', neutral, default, about)
+
+
+def _data(effect: type[Effect]) -> dict[str, Any]:
+    return {
+        'name': effect.name,
+        'slot': effect.slot,
+        'about': _about(effect),
+        'needs': effect.needs,
+        'time_driven': effect.time_driven,
+        'module': effect.__module__,
+        'parameters': [
+            {
+                'name': p.name,
+                'unit': p.unit,
+                'description': p.description,
+                'neutral': p.neutral,
+                'lower': p.lower,
+                'upper': p.upper,
+                'default': p.default,
+                'kind': p.kind,
+                'list': p.vector,
+            }
+            for p in effect.parameters
+        ],
+        'documentation': _documentation(effect),
+    }

@@ -1,0 +1,80 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The report folder of a diagnosis: the page, the pictures, the numbers and the refined model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+from pathlib import Path
+
+from piezo_ident.diagnosis.diagnosis_json import json_text
+from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.report.diagnosis_page import diagnosis_page
+from piezo_ident.report.diagnosis_tables import Unseen
+from piezo_ident.report.folder import PAGE, put_in_place, rendered
+from piezo_ident.results import Progress, silent
+
+__all__ = ['DIAGNOSIS_FILES', 'write_diagnosis_report']
+
+#: what is in the folder, besides the pictures
+DIAGNOSIS_FILES = (PAGE, 'diagnosis.json', 'model.yaml')
+
+
+def write_diagnosis_report(
+    diagnosis: Diagnosis,
+    folder: str | os.PathLike[str],
+    *,
+    unseen: Sequence[Unseen] = (),
+    progress: Progress = silent,
+) -> Path:
+    """
+    Write the report of a diagnosis.
+
+    Every file is written under a temporary name first; the page is put in place last.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    folder : path
+        Made when it does not exist.  Files of an earlier report there are replaced.
+    unseen : sequence of Unseen, optional
+        Errors on records that took no part in the diagnosis.
+    progress : callable, optional
+        Called with what is done and the share of it; may raise `Cancelled` as long as nothing is
+        written.
+
+    Returns
+    -------
+    Path
+        The page, ``report.html``; beside it ``diagnosis.json``, ``model.yaml`` (the refined model)
+        and the pictures.
+
+    Raises
+    ------
+    DataError
+        When the folder cannot be written.
+    """
+    # matplotlib takes half a second to import, and most commands draw nothing
+    from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES, draw_diagnosis
+
+    drawn = draw_diagnosis(diagnosis, lambda share: progress('drawing', 0.5 * share))
+    shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.5 + 0.4 * share))
+    progress('writing', 0.9)
+    texts = {
+        'diagnosis.json': json_text(diagnosis) + '\n',
+        PAGE: diagnosis_page(diagnosis, shown, drawn.left_out, unseen),
+    }
+    return put_in_place(folder, texts, diagnosis.model, shown, DIAGNOSIS_NAMES)

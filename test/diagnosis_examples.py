@@ -1,0 +1,204 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Diagnoses made by hand, of a stage that creeps, for tests of what is made of a diagnosis."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from piezo_ident.diagnosis.results import (
+    Candidate,
+    Class,
+    Diagnosis,
+    DiagnosisSettings,
+    Errors,
+    FoundEffect,
+    FoundParameter,
+    Residual,
+    Unexplained,
+    Untestable,
+)
+from piezo_ident.dynamics import Delay, Dynamics
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.model import EffectSetting, Scaling, StageModel
+from piezo_ident.program import parse_program
+from piezo_ident.record import Fault, Piece, Record, Segment
+from piezo_ident.validation import sine_frequency
+
+#: what a name in somebody's file may hold
+HOSTILE = '<script>alert("$x^$")</script>\x1b[31m'
+
+RATE = 2000.0
+NOISE = 4e-9
+PROGRAM = """
+limits: [0, 10]
+slew: 200
+segments:
+  - {signal: idle, duration: 0.3}
+  - {signal: sine, bias: 5, amplitude: 5, frequency: 5, duration: 2}
+  - {signal: staircase, levels: [0, 4, 8, 4, 0], hold: 1.5}
+  - {signal: sine, bias: 5, amplitude: 4, frequency: 50, duration: 1}
+  - {signal: idle, duration: 0.3}
+"""
+CREEP = {'gain': [0.012, 0.01], 'time_constant': [0.1, 1.0]}
+
+
+@cache
+def base_model() -> StageModel:
+    """Return a stage with one slow mode, without any effect."""
+    return StageModel(
+        sample_rate=RATE,
+        scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
+        hysteresis=Hysteresis(
+            np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.2, 0.1]), p1=-0.2, p2=0.9
+        ),
+        dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
+        delay=Delay(2),
+    )
+
+
+@cache
+def refined_model() -> StageModel:
+    """Return the same stage with creep."""
+    return replace(base_model(), effects=(EffectSetting('creep', CREEP),))
+
+
+@cache
+def measured(name: str = 'val.npz') -> Record:
+    """Return a record of the stage that creeps."""
+    sequence = parse_program(PROGRAM, 'program').build(RATE)
+    segments = tuple(Segment(s.label, s.start, s.stop) for s in sequence.segments)
+    piece = Piece(sequence.v, np.zeros(sequence.n), RATE, segments=segments)
+    y = refined_model().predict_piece(piece)
+    noise = NOISE * np.random.default_rng(3).standard_normal(y.size)
+    return Record((replace(piece, y=y + noise),), name)
+
+
+def errors(record: Record, residual: np.ndarray) -> Errors:
+    """Return the errors of the one piece of a record."""
+    (piece,) = record.pieces
+
+    def percent(e: np.ndarray) -> float:
+        return 100.0 * float(np.sqrt(np.mean(e**2))) / record.stroke
+
+    by_label: dict[str, list[np.ndarray]] = {}
+    for s in piece.segments:
+        by_label.setdefault(s.label, []).append(residual[s.start : s.stop])
+    by_segment = {label: percent(np.concatenate(parts)) for label, parts in by_label.items()}
+    by_frequency = {
+        f'{sine_frequency(label):g}': value
+        for label, value in by_segment.items()
+        if sine_frequency(label)
+    }
+    return Errors(percent(residual), by_segment, by_frequency)
+
+
+@cache
+def example(verdict: str = 'named') -> Diagnosis:
+    """
+    Return a diagnosis with a verdict of one's choice.
+
+    'named' has creep in it; 'class' adds what it cannot be told from, 'partly_explained' leaves
+    something; 'unexplained' and 'none' have no effect.
+    """
+    record = measured()
+    (piece,) = record.pieces
+    given = piece.y - base_model().predict_piece(piece)
+    before = given - given.mean()
+    added = verdict in ('named', 'class', 'partly_explained')
+    after = piece.y - refined_model().predict_piece(piece) if added else before
+    if verdict == 'none':
+        given = before = after = NOISE * np.random.default_rng(4).standard_normal(piece.n)
+    effect = FoundEffect(
+        name='creep',
+        slot='hidden',
+        share=0.93,
+        rms_percent=errors(record, before - after).overall,
+        parameters={
+            'gain': FoundParameter((0.012, 0.01), '1', (0.0004, 0.0006)),
+            'time_constant': FoundParameter((0.1, 1.0), 's', None),
+        },
+    )
+    sentences = {
+        'named': 'Creep explains 93 % of what the model missed.',
+        'class': 'Creep or thermal drift explains 93 % of what the model missed.',
+        'partly_explained': 'Creep explains 60 % of what the model missed; 0.2 % is left.',
+        'unexplained': 'No candidate explains what the model misses.',
+        'none': 'Nothing is missing that these data could show.',
+    }
+    group = Class(('creep', 'thermal_drift', 'gain_drift'), 'a hold of 10 s after a step')
+    return Diagnosis(
+        verdict=verdict,
+        sentence=sentences[verdict],
+        given=base_model(),
+        model=refined_model() if added else base_model(),
+        effects=(effect,) if added else (),
+        group=group if verdict == 'class' else None,
+        unexplained=Unexplained(
+            0.07 if added else 1.0,
+            errors(record, after).overall,
+            'no line, no dependence on v or its rate beyond chance',
+        ),
+        candidates=(
+            Candidate('rate_dependent_hysteresis', 0.29, 'creep explains more; nothing is left'),
+            Candidate('thermal_drift', 0.12, 'helps the holds and harms the sines'),
+            Candidate('gain_drift', 0.11, 'no more than chance gives'),
+            Candidate('backlash', 0.02, 'no more than chance gives'),
+            Candidate('preload_loss', 0.01, 'no more than chance gives'),
+            Candidate('saturation', 0.0, 'gains nothing'),
+            Candidate('slew_limit', -0.01, 'gains nothing at all'),
+        ),
+        before=errors(record, given),
+        refit=errors(record, before),
+        after=errors(record, after),
+        noise_floor=100.0 * NOISE / record.stroke,
+        noise_source='2 idle stretches',
+        smallest_detectable=0.02,
+        untestable=(Untestable('cross_coupling', 'a recorded voltage of another axis'),),
+        faults=(Fault('outliers', 'in val.npz at 1.2 s', 3, 'left out'),),
+        residuals=(
+            Residual(record.name, piece, given, before, after, np.ones(piece.n, dtype=bool)),
+        ),
+        records=(record.name,),
+        blocks=40,
+        warnings=('no repeated periods',),
+        settings=DiagnosisSettings(seed=5),
+    )
+
+
+def hostile() -> Diagnosis:
+    """Return a diagnosis in which every text that comes from outside tries to do harm."""
+    found = example('class')
+    (residual,), (effect,) = found.residuals, found.effects
+    segments = tuple(replace(s, label=HOSTILE) for s in residual.piece.segments)
+    values = Errors(0.1, {HOSTILE: 0.1}, {})
+    return replace(
+        found,
+        sentence=f'Something of {HOSTILE}.',
+        effects=(replace(effect, parameters={'channel': FoundParameter(HOSTILE, HOSTILE, None)}),),
+        candidates=(Candidate('backlash', 0.5, HOSTILE), *found.candidates),
+        unexplained=Unexplained(0.1, 0.1, HOSTILE),
+        before=values,
+        refit=values,
+        after=values,
+        noise_source=HOSTILE,
+        untestable=(Untestable('creep', HOSTILE),),
+        faults=(Fault('repeats', HOSTILE, 3, HOSTILE),),
+        residuals=(
+            replace(residual, record=HOSTILE, piece=replace(residual.piece, segments=segments)),
+        ),
+        records=(HOSTILE,),
+        warnings=(HOSTILE,),
+    )
