@@ -106,26 +106,32 @@ def next_experiment(
         return None if 'sweeps' in asked else Experiment('sweeps', reason)
     span = _span(diagnosis, records)
     lacking = [m for m in _MOTIONS if m.kind not in asked and not m.is_there(records, span)]
-    for names, doubt in _doubts(diagnosis):
+    for names, doubt, must in _doubts(diagnosis):
         for motion in lacking:
             shown = [name for name in names if name in motion.shows]
-            if shown:
+            if shown and must in ('', shown[0]):
                 return Experiment(motion.kind, f'{doubt(shown)} without {motion.name}')
     return None
 
 
-def _doubts(diagnosis: Diagnosis) -> Iterator[tuple[tuple[str, ...], Callable[[list[str]], str]]]:
-    """Return groups of names that are in doubt, and how to say so; the gravest come first."""
+def _doubts(
+    diagnosis: Diagnosis,
+) -> Iterator[tuple[tuple[str, ...], Callable[[list[str]], str], str]]:
+    """
+    Return groups of names that are in doubt, the gravest first.
+
+    With each comes how to say so, and the name that a motion must show; empty for any.
+    """
     if diagnosis.group is not None:
-        yield diagnosis.group.names, _not_told_apart
+        yield diagnosis.group.names, _not_told_apart, ''
     for effect in diagnosis.effects:
         for group in _ALIKE:
             if effect.name in group:
                 alike = tuple(n for n in group if n != effect.name)
-                yield (effect.name, *alike), _not_told_apart
-    yield tuple(x.name for x in diagnosis.untestable), _not_tested
+                yield (effect.name, *alike), _not_told_apart, effect.name
+    yield tuple(x.name for x in diagnosis.untestable), _not_tested, ''
     if diagnosis.verdict in ('partly_explained', 'unexplained'):
-        yield tuple(c.name for c in diagnosis.candidates), _not_tested
+        yield tuple(c.name for c in diagnosis.candidates), _not_tested, ''
 
 
 def _not_told_apart(names: list[str]) -> str:

@@ -40,11 +40,11 @@ __all__ = ['Contender', 'Round', 'Tick', 'drop_needless', 'polished', 'search_ro
 Tick = Callable[[float], None]
 
 #: candidates of a round that are fitted jointly, at most, and the share that makes them worth it
-JOINT, WORTH = 5, 0.05
+JOINT, WORTH = 4, 0.05
 #: iterations of their first fit, and how many are fitted to the end
-FIRST, FINAL = 4, 2
+FIRST, FINAL = 3, 2
 #: trials of a candidate that a fit starts from
-STARTS = 3
+STARTS = 2
 #: passes with fresh columns at the end, at most, and the gain that makes another worth it
 PASSES, POLISH = 6, 0.02
 #: a simpler effect goes first when it leaves no more than this times what the best one leaves

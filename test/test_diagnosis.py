@@ -1,0 +1,271 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Data with an undeclared effect: inside the catalogue, outside it, and none.
+
+The stages come from benchmarks/truths: their laws are not those of the candidates.
+"""
+
+from functools import cache
+from pathlib import Path
+import sys
+
+import numpy as np
+from piezo_ident.diagnosis import diagnose, DiagnosisSettings
+from piezo_ident.diagnosis.fit import base_at, base_thresholds, fit_base, fit_jointly
+from piezo_ident.diagnosis.gain import gram_of, held_out_errors
+from piezo_ident.diagnosis.rows import make_rows
+from piezo_ident.diagnosis.simulator import Added, retuned, Simulator, State
+from piezo_ident.dynamics import Dynamics
+from piezo_ident.errors import Cancelled, ConfigError, IdentificationError
+from piezo_ident.identification import identify
+from piezo_ident.model_io import model_from_dict, model_to_dict
+from piezo_ident.prediction import predict_record
+from piezo_ident.program import parse_program
+from piezo_ident.record import Piece, Record, Segment
+from piezo_ident.results import Settings
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+RATE = 20_000.0
+IDENTIFICATION = """
+limits: [0, 10]
+sample_rate: 20000
+seed: 1
+slew: 40
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 16}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 2}
+  - {signal: triangle, slope: 12}
+  - {signal: idle, duration: 0.1}
+"""
+
+
+@pytest.fixture(scope='module')
+def truths():
+    sys.path.insert(0, str(ROOT / 'benchmarks'))
+    try:
+        import truths as found
+    finally:
+        sys.path.remove(str(ROOT / 'benchmarks'))
+    return found
+
+
+def record_of(v, y, labels, name) -> Record:
+    segments = tuple(Segment(*label) for label in labels)
+    return Record((Piece(v, y, RATE, segments=segments),), name)
+
+
+@cache
+def measured(effect, size, seed):
+    """Return model, a record to diagnose and one that nothing saw."""
+    import truths as found
+
+    stage = found.make_stage(effect, size, seed)
+    sequence = parse_program(IDENTIFICATION).build()
+    t = np.arange(sequence.n) / RATE
+    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
+    y = stage.respond(t, sequence.v, changed=False)
+    model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
+    records = []
+    for kind in ('diagnosis', 'unseen'):
+        t, v, labels = found.programme(kind, seed)
+        records.append(record_of(v, stage.respond(t, v), labels, kind))
+    return model.model, *records
+
+
+def unseen_errors(result, record) -> tuple[float, float]:
+    before, after = (predict_record(m, record).whole.percent for m in (result.given, result.model))
+    return before, after
+
+
+# -- the user's three cases --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('effect', ['creep', 'saturation'])
+def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
+    model, record, unseen = measured(effect, 0.3, 1)
+    result = diagnose(model, record)
+    assert result.verdict in ('named', 'class'), result.sentence
+    assert effect in {e.name for e in result.effects} | set(
+        result.group.names if result.group else ()
+    )
+    assert result.refit.overall > 0.2
+    assert result.after.overall < result.refit.overall / 3
+    before, after = unseen_errors(result, unseen)
+    assert after < before / 3
+
+
+def test_effect_outside_the_catalogue_stays_unexplained(truths):
+    model, record, unseen = measured('floor_vibration', 0.3, 1)
+    result = diagnose(model, record)
+    assert result.verdict == 'unexplained', result.sentence
+    assert not result.effects
+    assert result.unexplained.rms_percent > 0.1
+    # a refit of H may help; nothing else was added
+    assert result.after.overall <= result.before.overall
+    before, after = unseen_errors(result, unseen)
+    assert after < 1.05 * before
+
+
+def test_no_effect_is_none(truths):
+    model, record, unseen = measured(None, 0.0, 2)
+    result = diagnose(model, record)
+    assert result.verdict == 'none', result.sentence
+    assert not result.effects
+    assert result.smallest_detectable >= 0.05
+    assert result.after.overall <= result.before.overall < 0.3
+    before, after = unseen_errors(result, unseen)
+    assert after < 1.05 * before
+
+
+def test_hum_stays_in_its_record(truths):
+    model, record, unseen = measured('periodic_disturbance', 0.3, 1)
+    result = diagnose(model, record)
+    assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
+    assert result.after.overall < result.refit.overall / 3
+    frequency = result.effects[0].parameters['frequency'].value
+    assert frequency == pytest.approx(50.0, abs=15.0)
+    # another record has another phase: the refined model must not make it worse
+    before, after = unseen_errors(result, unseen)
+    assert after == pytest.approx(before)
+
+
+def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    refined = diagnose(model, record).model
+    again = model_from_dict(model_to_dict(refined))
+    assert [e.name for e in again.effects] == ['creep']
+    second = diagnose(again, record)
+    assert second.verdict == 'none', second.sentence
+    assert second.before.overall < 0.1
+
+
+def test_seed_repeats_and_inputs_stay(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    y = record.pieces[0].y.copy()
+    one, other = (diagnose(model, record, DiagnosisSettings(seed=3)) for _ in range(2))
+    assert one.sentence == other.sentence
+    assert one.candidates == other.candidates
+    np.testing.assert_array_equal(record.pieces[0].y, y)
+
+
+def test_a_candidate_that_is_left_out_is_not_named(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    result = diagnose(model, record, DiagnosisSettings(without=('creep',)))
+    assert 'creep' not in {e.name for e in result.effects}
+    assert 'creep' not in {c.name for c in result.candidates}
+
+
+def test_every_step_can_be_cancelled(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    for step in ('residual', 'candidates', 'verdict'):
+
+        def progress(name, share, step=step):
+            if name == step and share >= 0.0:
+                raise Cancelled(name)
+
+        with pytest.raises(Cancelled, match=step):
+            diagnose(model, record, progress=progress)
+
+
+# -- refusals ----------------------------------------------------------------------------------
+
+
+def test_unknown_candidates_are_refused():
+    with pytest.raises(ConfigError, match='unknown effect'):
+        DiagnosisSettings(without=('crep',))
+
+
+def test_another_rate_and_too_little_are_refused(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    piece = record.pieces[0]
+    slow = Record((Piece(piece.v[::2], piece.y[::2], RATE / 2),), 'slow')
+    with pytest.raises(IdentificationError, match='sampled'):
+        diagnose(model, slow)
+    with pytest.raises(IdentificationError, match='longer'):
+        diagnose(model, Record((piece.cut(0, 500),), 'short'))
+
+
+def test_one_pass_over_the_range_names_nothing(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    piece = record.pieces[0]
+    sine = next(s for s in piece.segments if s.label.startswith('sine:1Hz'))
+    once = Record((piece.cut(0, sine.start + int(RATE)),), 'once')
+    result = diagnose(model, once)
+    assert not result.effects
+    assert result.verdict in ('none', 'unexplained')
+
+
+# -- the parts that carry it -------------------------------------------------------------------
+
+
+def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    rows = make_rows(model, [record])
+    rng = np.random.default_rng(0)
+    M, e = rng.standard_normal((rows.n, 4)), rng.standard_normal(rows.n)
+    errors = held_out_errors(gram_of(rows, M, e), rows.fold, np.zeros(4))
+    out = (rows.fold == 2)[rows.block]
+    theta = np.linalg.lstsq(M[~out], e[~out], rcond=None)[0]
+    left = e[out] - M[out] @ theta
+    assert errors[rows.fold == 2].sum() == pytest.approx(left @ left, rel=1e-6)
+
+
+def test_columns_near_the_optimum_are_derivatives(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    rows = make_rows(model, [record])
+    simulator = Simulator(model, rows)
+    state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), base_thresholds(1.0))
+    # without effects the quick columns are the exact ones
+    np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-9)
+    fitted = fit_jointly(simulator, state, base)
+    assert fitted.mean_square < 1e-6
+
+
+def test_what_is_kept_from_the_run_before_changes_nothing(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    simulator = Simulator(model, make_rows(model, [record]))
+    state = State(model.hysteresis, np.zeros(1), retuning=(0.1, 0.2, 0.01, 0.02))
+    simulator.remember(state)
+    for name, values in (
+        ('creep', {'gain': [0.01], 'time_constant': [0.3]}),
+        ('even_nonlinearity', {'square': 0.01}),
+        ('delay_change', {'samples': 0.7}),
+        ('saturation', {'high': 0.9}),
+        ('input_feedthrough', {'gain': 0.01}),
+        ('sensor_nonlinearity', {'square': 0.01}),
+    ):
+        added = Added(name, (values,))
+        added = Added(name, (added.effect.check(values),))
+        np.testing.assert_allclose(
+            simulator.added(added), simulator.run(state.with_effect(added)), atol=1e-12
+        )
+
+
+def test_retuning_is_the_product_with_its_factor():
+    G = Dynamics(a=np.array([-0.9]), b=np.array([0.06, 0.04]))
+    c = (0.3, -0.5, 0.02, -0.04)
+    f = np.array([0.0, 3.0, 40.0, 900.0])
+    z = np.exp(-2j * np.pi * f / RATE)
+    factor = 1 + c[0] * (1 - z) + c[1] * (1 - z) ** 2
+    for size, corner in zip(c[2:], (15.0, 100.0), strict=True):
+        factor = factor + size * (1 - z) / (1 - np.exp(-2 * np.pi * corner / RATE) * z)
+    np.testing.assert_allclose(
+        retuned(G, c, RATE).response(f, RATE), G.response(f, RATE) * factor, rtol=1e-9
+    )
+    assert retuned(G, (0.0,) * 4, RATE) is G
