@@ -87,7 +87,8 @@ class TableOneStage:
         u = volts / VOLTS
         row = Row(np.array(core['thresholds']), np.array(core['weights']))
         speed = speed_of(u, rate['corner'])
-        wider = rate['gain'] * speed / (speed + rate['speed'])
+        # an arc tangent, which is none of the candidate's laws
+        wider = rate['gain'] * 2.0 / np.pi * np.arctan(speed / rate['speed'])
         h = u * (core['p2'] + core['p1'] * u * u) + plays(u, row, wider, additive=True)
         # the published dynamics have this static gain; here they have 1
         h = relaxation(self.parameters['static_gain'] * h, creep['law'], creep['gain'])
