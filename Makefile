@@ -9,7 +9,8 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
-.PHONY: demo test lint pytest test-graph test-jazzy bench study-identification colcon clean distclean
+.PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
+.PHONY: study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -36,22 +37,36 @@ test-jazzy: .venv-jazzy/.test
 bench: .venv/.demo
 	.venv/bin/python benchmarks/bench_prediction.py
 
+# the running graph in real time, 20 kHz for so many seconds, and faster
+BENCH_SECONDS ?= 300
+bench-live: .venv/.demo
+	.venv/bin/python benchmarks/bench_live.py --seconds $(BENCH_SECONDS) --out docs/live.md
+
 # twenty seeds, three noise levels, stages on and off the grid: about five minutes
 study-identification: .venv/.demo
 	.venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
-# what a ROS workspace would do, without ROS
+# how often a diagnosis is right: hours on two cores; goes on where it was stopped
+study: .venv/.demo
+	.venv/bin/python benchmarks/study_diagnosis.py docs/diagnosis_study.md
+
+# Table I of the paper with a third row: about a minute
+table-one: .venv/.demo
+	.venv/bin/python benchmarks/table_one.py docs/table_one.md
+
+# what a ROS workspace would do, without ROS; and every node starts from there
 colcon: .venv/.colcon
 	.venv/bin/colcon build --packages-select piezo_ident
 	test -x install/piezo_ident/lib/piezo_ident/piezo_ident
 	test -f install/piezo_ident/share/piezo_ident/package.xml
 	test -f install/piezo_ident/share/ament_index/resource_index/packages/piezo_ident
+	bash -c '. install/setup.bash && .venv/bin/python .ci/installed_nodes.py install/piezo_ident'
 
 # one environment, more of it as it is asked for
 .venv/.demo: EXTRAS := [ros]
 .venv/.test: EXTRAS := [test]
 .venv/.graph: EXTRAS := [ros,test]
-.venv/.colcon: EXTRAS := [colcon]
+.venv/.colcon: EXTRAS := [colcon,ros]
 .venv-jazzy/.test: EXTRAS := [test]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
 

@@ -32,17 +32,22 @@ def generate_launch_description():
     share = get_package_share_directory('piezo_ident')
     namespace = LaunchConfiguration('namespace')
     config = LaunchConfiguration('config')
+    output = LaunchConfiguration('output')
     return LaunchDescription(
         [
             DeclareLaunchArgument('namespace', default_value='', description='where it all lives'),
             DeclareLaunchArgument(
                 'config', default_value=f'{share}/config', description='one YAML file a node'
             ),
+            DeclareLaunchArgument(
+                'output', default_value='identified', description='folder of ~/save'
+            ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(f'{share}/launch/stage.launch.py'),
                 launch_arguments={
                     'namespace': namespace,
                     'config': config,
+                    'output': output,
                     'use_simulated_stage': 'true',
                 }.items(),
             ),

@@ -23,6 +23,7 @@ from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
 
@@ -30,14 +31,15 @@ from launch import LaunchDescription
 def generate_launch_description():
     namespace = LaunchConfiguration('namespace')
     config = LaunchConfiguration('config')
+    output = LaunchConfiguration('output')
 
-    def node(executable, **kwargs):
+    def node(executable, *more, **kwargs):
         return Node(
             package='piezo_ident',
             executable=executable,
             name=executable,
             namespace=namespace,
-            parameters=[PathJoinSubstitution([config, f'{executable}.yaml'])],
+            parameters=[PathJoinSubstitution([config, f'{executable}.yaml']), *more],
             output='screen',
             **kwargs,
         )
@@ -55,9 +57,13 @@ def generate_launch_description():
                 default_value='true',
                 description='false: a DAQ driver publishes displacement and applied_voltage',
             ),
+            DeclareLaunchArgument(
+                'output', default_value='identified', description='folder of ~/save'
+            ),
             node('excitation'),
             node('stage', condition=IfCondition(LaunchConfiguration('use_simulated_stage'))),
-            node('identifier'),
+            # a folder may look like a number
+            node('identifier', {'output': ParameterValue(output, value_type=str)}),
             node('model'),
         ]
     )

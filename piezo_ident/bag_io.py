@@ -17,6 +17,7 @@ Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
 
 A bag is read message by message into flat buffers, so its length is limited by the samples
 alone.  Topics are found by what their blocks say they carry, so remapped names are no obstacle.
+The streams become a record by the way that a live capture takes, so that both are the same.
 A bag whose recorder was killed is refused, or read as far as it goes when that is asked for.
 """
 
@@ -28,11 +29,11 @@ from pathlib import Path
 from typing import Any
 
 from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag
+from piezo_ident.capture import APPLIED, record_of_streams
 from piezo_ident.errors import DataError
-from piezo_ident.join import join, Stream
+from piezo_ident.join import Stream
 from piezo_ident.output import temporary_output
 from piezo_ident.record import Record
-from piezo_ident.sampling import assemble
 from piezo_ident.wire_format import (
     BLOCK_SIZE,
     cut_blocks,
@@ -100,6 +101,9 @@ def read_bag(
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file.
 
+    Where the bag holds ``applied_voltage`` beside the voltage, samples that the amplifier's guard
+    altered are cut out, as in a live capture.
+
     Parameters
     ----------
     path : path
@@ -132,21 +136,13 @@ def read_bag(
         topics = _choose(carried, asked, namespace, path)
         streams = _collect(bag, topics, path)
         faults = bag.faults
-    try:
-        joined = join(streams)
-    except DataError as error:
-        raise DataError(f'{path}: {error}') from None
-    return assemble(
-        joined.t,
-        joined.columns.pop('voltage'),
-        joined.columns.pop('displacement'),
-        joined.segments,
-        {quantity[2:]: x for quantity, x in joined.columns.items()},
+    return record_of_streams(
+        streams,
         name=str(path),
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
         sample_rate=_sample_rate(path),
-        faults=(*faults, *joined.faults),
+        faults=faults,
     ).renamed(path.name)
 
 
@@ -193,7 +189,7 @@ def _choose(
     namespace: str | None,
     path: Path,
 ) -> dict[str, str]:
-    """Return the topic of each quantity."""
+    """Return the topic of each quantity, and of the applied voltage where it is there."""
     prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
     chosen = {}
     for quantity, wish in asked.items():
@@ -208,8 +204,9 @@ def _choose(
             continue
         there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
         # applied_voltage and prediction carry the same quantity under another name
-        named = [t for t in there if t.rpartition('/')[2] == quantity]
-        fit = named if len(there) > 1 and named else there
+        commanded = [t for t in there if t.rpartition('/')[2] != APPLIED] or there
+        named = [t for t in commanded if t.rpartition('/')[2] == quantity]
+        fit = named if len(commanded) > 1 and named else commanded
         if not fit:
             raise DataError(
                 f"{path}: no topic carries 't,{quantity}'"
@@ -223,7 +220,10 @@ def _choose(
             )
         chosen[quantity] = fit[0]
     home = chosen['voltage'].rpartition('/')[0] + '/'
-    for topic, quantity in carried.items():
+    applied = f'{home}{APPLIED}'
+    if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
+        chosen[APPLIED] = applied
+    for topic, quantity in sorted(carried.items(), key=lambda item: item[::-1]):
         if quantity.startswith('x_') and topic.startswith(home):
             if quantity in chosen:
                 raise DataError(

@@ -196,6 +196,7 @@ class _Watch:
     seconds: list[float] = field(default_factory=list)  # of each block that is kept
     runs: list[int] = field(default_factory=list)  # blocks at which the clock restarted
     total: float = 0.0
+    dropped: int = 0  # blocks that are no longer kept
 
     def add(self, t: NDArray[np.float64]) -> None:
         """Take note of a block."""
@@ -224,6 +225,7 @@ class _Watch:
     def drop(self, blocks: int) -> None:
         """Forget the oldest blocks."""
         self.total -= sum(self.seconds[:blocks])
+        self.dropped += blocks
         del self.seconds[:blocks]
         self.runs = [i - blocks for i in self.runs if i > blocks]
 
@@ -337,8 +339,26 @@ class Capture:
         if key == 'voltage':
             self._forgotten += before - watch.total
 
-    def snapshot(self) -> Snapshot:
-        """Return all that was captured up to now, at little cost."""
+    def mark(self) -> dict[str, int]:
+        """Return what tells later what was captured after now; not across `clear`."""
+        return {key: watch.dropped + len(watch.seconds) for key, watch in self._watches.items()}
+
+    def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
+        """Return the measured time of a topic after a mark that is kept [s]."""
+        if key not in self._watches:
+            return 0.0
+        watch = self._watches[key]
+        return sum(watch.seconds[max(0, mark.get(key, 0) - watch.dropped) :])
+
+    def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
+        """
+        Return all that was captured up to now, at little cost.
+
+        Parameters
+        ----------
+        since : mapping of str to int, optional
+            Only what came after this mark; see `mark`.
+        """
         faults = [
             Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
             for key, (count, reason) in self._unreadable.items()
@@ -348,11 +368,18 @@ class Capture:
             action = f'forgotten, {self.limit:g} s are kept'
             faults.append(Fault('capture_limit', where, 1, action))
         streams = {key: stream.copy() for key, stream in self._streams.items()}
+        for key, stream in streams.items():
+            stream.drop(max(0, (since or {}).get(key, 0) - self._watches[key].dropped))
         return Snapshot(streams, tuple(faults), self.tolerance)
 
     def record(self, name: str = 'capture') -> Record:
         """Return what was captured as a record; see `Snapshot.record`."""
         return self.snapshot().record(name)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """What was captured, in order of appearance."""
+        return tuple(self._streams)
 
     @property
     def n(self) -> int:

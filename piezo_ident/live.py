@@ -161,6 +161,11 @@ class Predictor:
         """
         return self.model is not None and bool(self.model.scaling.u(self._lowest) < REST)
 
+    @property
+    def memory_lost(self) -> bool:
+        """Whether blocks come and the plays are not where they must be."""
+        return bool(np.isfinite(self._last)) and not self.memory_known
+
     def set_model(self, model: StageModel) -> None:
         """
         Take a model, in the state that it would have if it had run all along.
@@ -216,6 +221,9 @@ class Predictor:
         elif step <= 0.5 * period:
             if (t[0] <= self._begin and self._blocks > 1) or -step > JUMP_BACK * period:
                 self.restarts += 1
+                if t[0] > 0.5 * period:
+                    # a programme that begins anew begins at zero
+                    self.problem = f'time jumps back from {self._last:.6g} to {t[0]:.6g} s'
                 self._start(t, period)
             else:
                 new = t > self._last + 0.5 * period
@@ -241,7 +249,10 @@ class Predictor:
             return False
         if not (np.isfinite(t).all() and np.isfinite(v).all()):
             # counted when the gap that it leaves is met
-            self.problem = 'a block of voltage holds NaN or infinite numbers; it is left out'
+            self.problem = (
+                f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
+                'it is left out'
+            )
             return False
         if t.size > 1:
             step = np.diff(t)

@@ -227,7 +227,9 @@ def _losses(record: Record, table: Table) -> tuple[str, ...]:
             f'{len(record.pieces)} pieces with {record.n} samples read back as '
             f'{len(back.pieces)} with {back.n}'
         )
-    elif any(a.sample_rate != b.sample_rate for a, b in zip(record, back, strict=True)):
+    elif any(
+        abs(a.sample_rate / b.sample_rate - 1.0) > 1e-9 for a, b in zip(record, back, strict=True)
+    ):
         rates = ', '.join(f'{r:.12g}' for r in dict.fromkeys(p.sample_rate for p in back))
         losses.append(f'sampling rates read back as {rates} Hz')
     before = [s for p in record for s in p.segments]

@@ -47,8 +47,10 @@ ATTRACTION = 1.49618
 REACH = 3
 #: share of the speed with which a particle comes back from a wall of the box
 BOUNCE = 0.5
-#: iterations between two looks at the callback and the stopping rules
+#: iterations between two looks at the stopping rules, and at most at the callback
 STRETCH = 100
+#: work between two looks at the callback, in products of two numbers: some ten milliseconds
+WORK = 1e7
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +151,9 @@ def particle_swarm(
         Stop when the best value fell by less than this share of itself over 1,000 iterations;
         0 (default) runs all iterations.
     callback : callable, optional
-        Called as ``callback(intermediate_result)`` about every 100 iterations; a true answer or
-        `StopIteration` ends the search with what has been found.
+        Called as ``callback(intermediate_result)`` every 100 iterations, more often where many
+        particles or parameters make them slow; a true answer or `StopIteration` ends the search
+        with what has been found.
 
     Returns
     -------
@@ -182,6 +185,7 @@ def particle_swarm(
     own_f[np.isnan(own_f)] = np.inf
     history = [float(own_f.min())]
     nit, status, message = 0, 1, 'the number of iterations was reached'
+    most = max(1, int(WORK / (swarm_size * n * n)))
 
     def result() -> OptimizeResult:
         return OptimizeResult(
@@ -196,17 +200,19 @@ def particle_swarm(
         )
 
     while nit < maxiter:
-        stretch = min(STRETCH, maxiter - nit)
+        stretch = min(most, maxiter - nit, STRETCH - nit % STRETCH)
         random = rng.random((stretch, 2, swarm_size, n))
         if isinstance(fun, Quadratic):
             _fly(fun.P, fun.g, fun.c, low, high, X, V, own, own_f, random)
         else:
             _fly_callable(fun, low, high, X, V, own, own_f, random)
         nit += stretch
-        history.append(float(own_f.min()))
         if callback is not None and _asks_to_stop(callback, result()):
             status, message = 2, 'stopped by the callback'
             break
+        if nit % STRETCH:
+            continue
+        history.append(float(own_f.min()))
         past = history[max(0, len(history) - 1 - 1000 // STRETCH)]
         if nit >= 1000 and past - history[-1] < tol * abs(history[-1]):
             status, message = 0, f'the best value fell by less than {tol:g} in 1,000 iterations'

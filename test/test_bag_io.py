@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from piezo_ident.bag_io import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
+from piezo_ident.capture import APPLIED, Capture
 from piezo_ident.errors import DataError
 from piezo_ident.join import join, Stream
 from piezo_ident.record import Piece, Record, Segment
@@ -278,6 +279,34 @@ def test_remapped_and_further_topics(tmp_path):
         )
     ]
     assert read_bag(write(tmp_path / 'bag2', messages)).n == 1000
+
+
+@pytest.mark.parametrize('voltage', ['voltage', 'drive'])
+def test_applied_voltage_is_met_as_in_a_live_capture(tmp_path, voltage):
+    messages, capture = [], Capture()
+    for k, (v, y) in enumerate(blocks()):
+        # the guard was at work in block 3, its word on block 6 was lost, the stage missed block 8
+        a = Samples(v.t, v.values - (k == 3) * np.linspace(0, 1, 100), v.segment, 'voltage')
+        for topic, key, samples in (
+            (voltage, 'voltage', v),
+            (APPLIED, APPLIED, a),
+            ('displacement', 'displacement', y),
+        ):
+            if (k, key) in ((6, APPLIED), (8, 'displacement')):
+                continue
+            capture.add(key, samples, 10**9 + len(messages) * 10**6)
+            messages.append((f'/left/{topic}', samples))
+    live = capture.record()
+    bag = read_bag(write(tmp_path / 'bag', messages))
+    assert [p.n for p in bag] == [301, 400, 100]
+    assert faults(bag) == {**faults(live), 'guarded_voltage': 99, 'applied_unknown': 100}
+    for one, other in zip(bag, live, strict=True):
+        assert one.segments == other.segments and one.sample_rate == other.sample_rate
+        for column in ('t', 'v', 'y'):
+            np.testing.assert_array_equal(getattr(one, column), getattr(other, column))
+    # whoever asks for it gets it as the voltage
+    asked = read_bag(tmp_path / 'bag', voltage_topic=f'left/{APPLIED}')
+    assert asked.n == 800 and asked.pieces[0].v[399] == messages[10][1].values[99]
 
 
 def test_corrupt_layout_names_topic_and_message(tmp_path):

@@ -228,6 +228,34 @@ def test_a_snapshot_does_not_see_what_comes_later(record):
     assert capture.n == 0 and snapshot.record().n == 10_000
 
 
+def test_what_came_after_a_mark_can_be_had_alone(record):
+    blocks = list(blocks_of(record))
+    capture = capture_of(blocks)
+    mark = capture.mark()
+    assert capture.seconds_since(mark) == 0.0
+    for key, samples in blocks:
+        capture.add(key, samples, 10**12)
+    assert capture.seconds_since(mark) == pytest.approx(1.0)
+    assert_equal(capture.snapshot(mark).record(), record)
+    assert capture.snapshot().record().n == 2 * N
+    # a topic that was not there at the mark is new altogether
+    assert capture.seconds_since({}, 'displacement') == pytest.approx(2.0)
+
+
+def test_a_mark_holds_when_the_oldest_is_forgotten(record):
+    blocks = list(blocks_of(record))
+    capture = capture_of(blocks, limit=2.5)
+    mark = capture.mark()
+    for key, samples in [*blocks] * 2:
+        capture.add(key, samples, 10**12)
+    assert capture.seconds == pytest.approx(2.0)
+    assert capture.seconds_since(mark) == pytest.approx(2.0)
+    assert capture.snapshot(mark).record().n == 2 * N
+    for key, samples in blocks:
+        capture.add(key, samples, 2 * 10**12)
+    assert capture.seconds_since(mark) == pytest.approx(2.0)
+
+
 def test_too_much_missing_in_a_segment_is_refused(record):
     few = without(blocks_of(record), ('voltage', 20))
     refuse_incomplete(capture_of(few).record())

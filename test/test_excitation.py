@@ -32,7 +32,7 @@ import yaml
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[1]
-CONFIG = ('identification', 'validation', 'minor_loops', 'survey')
+CONFIG = ('identification', 'validation', 'minor_loops', 'survey', 'diagnosis', 'holds')
 
 
 def config(name: str) -> Program:

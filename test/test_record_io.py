@@ -81,7 +81,7 @@ def records(draw) -> Record:
 def assert_equal(a: Record, b: Record) -> None:
     assert len(a.pieces) == len(b.pieces)
     for p, q in zip(a, b, strict=True):
-        assert p.sample_rate == q.sample_rate
+        assert p.sample_rate == pytest.approx(q.sample_rate, rel=1e-9)
         np.testing.assert_array_equal(p.t, q.t)
         np.testing.assert_array_equal(p.v, q.v)
         np.testing.assert_array_equal(p.y, q.y)

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident import swarm
 from piezo_ident.errors import ConfigError
 from piezo_ident.excitation import triangle
 from piezo_ident.hysteresis_fit import even_thresholds, Excerpt, factorise, fit_hysteresis
@@ -101,6 +102,28 @@ def test_tolerance_stops_early():
     assert result.nit < 5000
     assert result.status == 0
     assert result.success
+
+
+def test_a_large_swarm_is_asked_more_often_and_finds_the_same(monkeypatch):
+    *_, fun = problem()
+
+    def run(**kwargs):
+        seen = []
+        result = particle_swarm(
+            fun, [(-1, 1)] * 5, rng=rng(), callback=lambda state: seen.append(state.nit), **kwargs
+        )
+        return result, seen
+
+    few, _ = run(maxiter=2030, tol=1e-9)
+    monkeypatch.setattr(swarm, 'WORK', 7 * 40 * 5 * 5)
+    many, seen = run(maxiter=2030, tol=1e-9)
+    assert_array_equal(few.x, many.x)
+    assert (few.nit, few.status) == (many.nit, many.status)
+    assert np.max(np.diff(seen)) == 7 and 1000 in seen
+    # as it comes: at most ten million products between two looks, whatever the size
+    monkeypatch.undo()
+    _, seen = run(maxiter=200, swarm_size=20_000)
+    assert np.max(np.diff(seen)) * 20_000 * 5 * 5 <= 1e7
 
 
 @pytest.mark.parametrize('how', ['true', 'raise'])

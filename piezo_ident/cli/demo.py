@@ -75,7 +75,7 @@ def find_measured(asked: Path | None) -> Path | None:
     return path if path.is_file() else None
 
 
-def demo(out: Path, asked: Path | None, console: Console) -> None:
+def demo(out: Path, asked: Path | None, console: Console) -> int:
     """
     Run the demonstration.
 
@@ -87,23 +87,35 @@ def demo(out: Path, asked: Path | None, console: Console) -> None:
         A measured record; looked for when absent.
     console : Console
         Takes the text.
+
+    Returns
+    -------
+    int
+        Exit code: 1 when the graph did not do what it should, though nodes can run here.
     """
     began = time.monotonic()
     measured = find_measured(asked)
     out.mkdir(parents=True, exist_ok=True)
-    _paper_stage(out, console)
+    problem = _paper_stage(out, console)
     _dense_stage(out, console)
     _measured(out, measured, console)
+    problem = '; '.join(filter(None, [problem, _lacking(out, console)]))
     console.say(f'reports: {out}    {time.monotonic() - began:.0f} s in all')
+    if problem:
+        console.note(f'the graph did not get through: {problem}')
+    return 1 if problem else 0
 
 
-def _paper_stage(out: Path, console: Console) -> None:
+def _paper_stage(out: Path, console: Console) -> str:
+    """Show the first stage, and return why the graph did not get through with it."""
+    problem = ''
     console.say("1. The paper's stage, simulated, identified from voltage and displacement alone")
     if rclpy_is_there():
         try:
-            found, sines = _on_the_graph(out, console)
+            found, sines, problem = _on_the_graph(out, console)
         except PiezoIdentError as error:
-            console.say(f'   the graph did not get through: {error}')
+            problem = str(error)
+            console.say(f'   the graph did not get through: {problem}')
             found, sines = _offline(out, console)
     else:
         console.say('   without ROS: rclpy is not here')
@@ -122,23 +134,26 @@ def _paper_stage(out: Path, console: Console) -> None:
         'just there.  They show that the three steps find a model that is there, no more.'
     )
     console.say()
+    return problem
 
 
-def _on_the_graph(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
+def _on_the_graph(
+    out: Path, console: Console
+) -> tuple[Identification, tuple[SineError, ...], str]:
     from piezo_ident.cli.graph_demo import graph_demo
 
     console.say('   six nodes over DDS: excitation, stage, identifier, model, recorder, player')
     run = graph_demo(out, console)
     console.say(
         '   live, replayed from the bag, read from the bag: the largest relative difference of a '
-        f'parameter is {run.difference:.1e}'
+        f'parameter is {max(run.differences.values()):.1e}'
     )
-    if run.lost:
-        console.say(f'   {run.lost} samples were lost on the way: this machine was too busy')
+    for where, n in run.lost.items():
+        console.say(f'   {n} samples were lost {where}: this machine was too busy')
     for line in run.unclean or ('all nodes ended cleanly',):
         console.say(f'   {line}')
     _keep(run.found, out / 'stage_paper', console, run.record)
-    return run.found, run.sines
+    return run.found, run.sines, run.problem
 
 
 def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
@@ -184,6 +199,29 @@ def _measured(out: Path, path: Path | None, console: Console) -> None:
     _keep(found, out / 'measured', console, record)
     console.say(text_summary(found))
     console.say()
+
+
+def _lacking(out: Path, console: Console) -> str:
+    """Show a diagnosis, and return why the graph did not get through with it."""
+    from piezo_ident.cli.diagnosis_demo import diagnosis_demo, offline_diagnosis_demo
+
+    console.say('4. A stage with creep and rate-dependent hysteresis, which nobody declares')
+    problem = ''
+    if rclpy_is_there():
+        console.say('   ~/run, then ~/diagnose, on the running graph')
+        try:
+            run = diagnosis_demo(out / 'stage_effects', console)
+        except PiezoIdentError as error:
+            problem = str(error)
+            console.say(f'   the graph did not get through: {problem}\n')
+            return problem
+        problem = '; '.join(run.unclean)
+    else:
+        run = offline_diagnosis_demo(console)
+    for line in run.lines():
+        console.say(f'   {line}')
+    console.say()
+    return problem
 
 
 def _play(stage: SimulatedStage, program: str, seed: int) -> Record:

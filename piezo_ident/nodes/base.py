@@ -42,6 +42,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 import rclpy
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -209,6 +210,10 @@ class LabNode(Node):
 
         self.create_service(Trigger, f'~/{name}', answer)
 
+    def await_listeners(self) -> None:
+        """Wait a moment until the last status was heard."""
+        self._status.wait_for_all_acked(Duration(seconds=0.1))
+
     def close(self) -> None:
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
 
@@ -247,6 +252,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     finally:
         if node is not None:
             node.close()
+            node.await_listeners()
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown(timeout_sec=0.5)

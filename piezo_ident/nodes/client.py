@@ -24,7 +24,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.errors import PiezoIdentError
-from piezo_ident.nodes.wire import LATCHED
+from piezo_ident.nodes.wire import LATCHED, STREAM
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
 import rclpy
@@ -32,7 +32,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as PythonParameter
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 __all__ = ['Client']
@@ -53,6 +53,7 @@ class Client:
         self._clients: dict[str, Any] = {}
         self._status: dict[str, dict[str, str]] = {}
         self._texts: dict[str, list[str]] = {}
+        self._counts: dict[str, int] = {}
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._spin, name='client', daemon=True)
         self._thread.start()
@@ -132,11 +133,27 @@ class Client:
         """Return the last status of a node that is followed: state, progress, message, ..."""
         return self._status.get(node, {})
 
+    def forget(self, node: str) -> None:
+        """Forget the last status of a node, so that the next one is a new one."""
+        self._status.pop(node, None)
+
     def listen(self, topic: str) -> list[str]:
         """Listen to a latched text topic, and return the list that its messages go into."""
         texts = self._texts.setdefault(topic, [])
         self.node.create_subscription(String, topic, lambda m: texts.append(m.data), LATCHED)
         return texts
+
+    def count(self, node: str) -> int:
+        """Return how many samples an identifier has captured, by its topic `captured`."""
+        topic = f'{node.rpartition("/")[0]}/captured'.lstrip('/')
+        if topic not in self._counts:
+            self._counts[topic] = 0
+
+            def keep(message: Float64MultiArray) -> None:
+                self._counts[topic] = int(message.data[-1])
+
+            self.node.create_subscription(Float64MultiArray, topic, keep, STREAM)
+        return self._counts[topic]
 
     def wait(
         self,

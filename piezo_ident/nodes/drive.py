@@ -33,6 +33,8 @@ __all__ = ['Drive', 'Streams']
 
 #: states of the excitation in which it has ended, one way or the other, or not begun
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
+#: before the first word since it was asked to start: what it said of an earlier run says nothing
+_UNHEARD = 'unheard'
 #: how long the last blocks may be under way after the excitation says done [s]
 _TAIL = 1.0
 
@@ -61,10 +63,6 @@ class Drive:
         Returns the `Streams` as they are.
     missing : callable
         Returns the topics to which nobody publishes yet, for people; empty when all is there.
-    begin : callable
-        Called right before the excitation is asked to start.
-    ended : callable
-        Called once with None when the programme was captured to its end, else with the reason.
     """
 
     def __init__(
@@ -72,11 +70,10 @@ class Drive:
         node: Node,
         streams: Callable[[], Streams],
         missing: Callable[[], str],
-        begin: Callable[[], None],
-        ended: Callable[[str | None], None],
     ) -> None:
         self._streams, self._missing = streams, missing
-        self._begin, self._ended = begin, ended
+        self._begin: Callable[[], None] = _nothing
+        self._ended: Callable[[str | None], None] = _nothing
         self._set = node.create_client(SetParameters, 'excitation/set_parameters')
         self._start = node.create_client(Trigger, 'excitation/start')
         self._stop = node.create_client(Trigger, 'excitation/stop')
@@ -91,7 +88,19 @@ class Drive:
         """Whether a run is under way."""
         return bool(self._phase)
 
-    def start(self, program: str, limit: float) -> None:
+    @property
+    def is_possible(self) -> bool:
+        """Whether an excitation and a stage are there, as far as is known now."""
+        ready = self._set.service_is_ready() and self._start.service_is_ready()
+        return ready and not self._missing()
+
+    def start(
+        self,
+        program: str,
+        limit: float,
+        ended: Callable[[str | None], None],
+        begin: Callable[[], None] | None = None,
+    ) -> None:
         """
         Begin a run.
 
@@ -101,8 +110,14 @@ class Drive:
             For the excitation's parameter ``program``.
         limit : float
             How long to wait for a sign of the excitation, or of the stage [s].
+        ended : callable
+            Called once with None when the programme was captured to its end, else with the
+            reason; not called after `stop`.
+        begin : callable, optional
+            Called right before the excitation is asked to start.
         """
         self._program, self._limit = program, limit
+        self._begin, self._ended = begin or _nothing, ended
         self._phase, self._future, self.progress = 'finding', None, 0.0
         self._sign = time.monotonic()
 
@@ -167,6 +182,7 @@ class Drive:
         self._begin()
         self._first, self._active, self._done = self._streams(), False, 0.0
         self._seen, self._stage_sign = self._first, time.monotonic()
+        self._state, self._message = _UNHEARD, ''
         self._phase, self._sign = 'starting', time.monotonic()
         self._future = self._start.call_async(Trigger.Request())
 
@@ -175,11 +191,13 @@ class Drive:
         if answer is None:
             return
         if not answer.success:
+            # whatever it plays is not ours to stop
+            self._phase = 'refused'
             self._end(f'the excitation does not start: {answer.message}')
             return
         self._phase, self._sign = 'playing', time.monotonic()
         # the status may have come before the answer
-        self._active = self._state not in _RESTING
+        self._active = self._state not in (*_RESTING, _UNHEARD)
 
     def _answer(self, doing: str) -> Any:
         if self._future.done():
@@ -213,5 +231,9 @@ class Drive:
                 f'{streams.displacement_time:.6g} s; is it running?'
             )
         elif self._silent():
-            said = f' (last: {self._state}, {self._message})' if self._state else ''
+            said = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
             self._end(f'no sign of the excitation for {self._limit:g} s{said}')
+
+
+def _nothing(*_: object) -> None:
+    """Do nothing."""

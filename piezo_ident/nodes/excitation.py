@@ -18,9 +18,11 @@ The excitation node: plays programmes on `voltage`.
 
 Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every programme;
 at real time a block is sent when its first sample is due, counted from the first one.  At any
-other speed there is flow control besides: no more than `in_flight` blocks are on their way, the
-`displacement` that comes back being the answer; at ``rate_factor`` 0 the answers alone set the
-pace.
+other speed there is flow control besides: no more than `in_flight` blocks are on their way to the
+slowest of those who answer on the topics `answers`; at ``rate_factor`` 0 the answers alone set
+the pace.  The first of these topics has to answer, any other is waited for from its first answer
+on: as it stands, the stage on `displacement`, the model on `prediction` once it has a model, and
+the identifier on `captured`.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
 and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
@@ -30,9 +32,6 @@ Two programmes at once would tear the stage to and fro, so a second publisher on
 refused at the start, and reported when it comes later.  An excitation that was killed is seen by
 the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
 for that.  Before the first block this node therefore listens for half a second.
-
-The flow control knows of the stage alone.  Where another node is slower, hand that one's answer to
-the excitation instead: ``-r displacement:=prediction`` waits for the model.
 """
 
 from __future__ import annotations
@@ -49,6 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import ConfigError, PiezoIdentError
 from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.nodes.answers import Answers, answers_problem
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.pacing import BlockClock
@@ -64,8 +64,12 @@ __all__ = ['ExcitationNode', 'main']
 LAST_RAMP = 0.7
 #: how long to listen whether somebody else is playing [s]
 LISTEN = 0.5
+#: how long it may take to meet everybody who could be [s]
+MEET = 2.0
 #: between the match of a subscriber and the first block, for the other side to know of it too [s]
 SETTLE = 0.1
+#: between the first block and the second, to hear who answers [s]
+HEAR = 0.1
 
 
 def read_program(text: str) -> Program:
@@ -90,11 +94,9 @@ class Playing:
     block_size: int
     factor: float
     stop: threading.Event = field(default_factory=threading.Event)
-    answered: threading.Event = field(default_factory=threading.Event)
     hurry: bool = False
     tick: int = 0
     voltage: float | None = None
-    seen: int = 0
     heard_other: bool = False
     clock: BlockClock | None = None
     work: float = 0.0
@@ -120,7 +122,8 @@ class ExcitationNode(LabNode):
         self._build(self.values['program'])
         self._guard_settings()
         self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
-        self._answers: Any = None
+        self._born = time.monotonic()
+        self._answers: Answers | None = None
         self._ears: Any = None
         self.offer('start', self._start)
         self.offer('stop', self._stop)
@@ -129,6 +132,9 @@ class ExcitationNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programmes that cannot be played, and limits that are crossed."""
+        if name == 'answers':
+            none = 'answers must name at least one topic'
+            return answers_problem(value) if value.strip() else none
         if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
             return None
         # while parameters are declared, those that come later are not there yet
@@ -181,9 +187,8 @@ class ExcitationNode(LabNode):
         playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
         self._clean_up()
         if playing.factor != 1.0:
-            self._answers = self.create_subscription(
-                Float64MultiArray, 'displacement', self._on_answer, STREAM
-            )
+            topics = self.values['answers'].split()
+            self._answers = Answers(self, topics, topics[0])
         self._ears = self.create_subscription(Float64MultiArray, 'voltage', self._on_other, STREAM)
         self._playing = playing
         self._rate = (time.monotonic(), 0)
@@ -222,7 +227,7 @@ class ExcitationNode(LabNode):
         """Give back what only a programme needs; on the executor's thread."""
         self._close_ears()
         if self._answers is not None:
-            self.destroy_subscription(self._answers)
+            self._answers.close()
             self._answers = None
 
     def _close_ears(self) -> None:
@@ -230,19 +235,6 @@ class ExcitationNode(LabNode):
         if self._ears is not None:
             self.destroy_subscription(self._ears)
             self._ears = None
-
-    def _on_answer(self, message: Float64MultiArray) -> None:
-        playing = self._playing
-        if playing is None or len(message.data) < 2:
-            return
-        t = message.data[-2]
-        if not math.isfinite(t):
-            return
-        tick = round(t * playing.sequence.sample_rate) + 1
-        # what lies ahead of us is the end of an earlier programme
-        if playing.seen < tick <= playing.tick:
-            playing.seen = tick
-            playing.answered.set()
 
     def _on_other(self, _: Float64MultiArray) -> None:
         playing = self._playing
@@ -268,6 +260,7 @@ class ExcitationNode(LabNode):
 
     def _await_graph(self, playing: Playing) -> None:
         limit, needed = self.values['wait_limit'], self.values['subscribers']
+        self._await_ears(playing)
         begin = time.monotonic()
         self._sleep(playing, begin + LISTEN)
         self._refuse_others()
@@ -279,14 +272,14 @@ class ExcitationNode(LabNode):
                 )
             # without our own ears
             found = self._voltage.get_subscription_count() - 1
-            answers = self._answers is None or self._answers.get_publisher_count() > 0
-            if found >= needed and answers:
+            mute = '' if self._answers is None else self._mute(self._answers)
+            if found >= needed and not mute:
                 break
             if time.monotonic() - begin > limit + LISTEN:
                 what = (
                     f'{max(0, found)} of {needed} subscribers on {self._voltage.topic_name}'
                     if found < needed
-                    else 'nobody publishes displacement, which rate_factor other than 1 needs,'
+                    else f'nobody publishes {mute}, which rate_factor other than 1 needs,'
                 )
                 raise ConfigError(
                     f'{what} after {limit:g} s; start the stage, or set subscribers or wait_limit'
@@ -296,20 +289,48 @@ class ExcitationNode(LabNode):
             self.executor.create_task(self._close_ears)
         self._sleep(playing, time.monotonic() + SETTLE)
 
+    def _await_ears(self, playing: Playing) -> None:
+        """Wait until every publisher has been met: silence before says nothing."""
+        # a node that has just come up does not even know of them
+        self._sleep(playing, self._born + MEET)
+        give_up = time.monotonic() + MEET
+        while time.monotonic() < give_up:
+            ears = self._ears
+            known = self.count_publishers(self._voltage.topic_name)
+            if ears is None or ears.get_publisher_count() >= known:
+                return
+            self._sleep(playing, time.monotonic() + 0.02)
+
+    @staticmethod
+    def _mute(answers: Answers) -> str:
+        """Return the topic on which somebody has to answer, as long as nobody publishes it."""
+        return '' if answers.flow.slowest in answers.published else answers.flow.slowest
+
     def _sleep(self, playing: Playing, until: float) -> None:
         if playing.stop.wait(max(0.0, until - time.monotonic())):
             raise _Stopped
 
     def _play(self, playing: Playing) -> None:
-        sequence, factor = playing.sequence, playing.factor
+        sequence, factor, answers = playing.sequence, playing.factor, self._answers
         clock = BlockClock(factor * sequence.sample_rate, time.monotonic())
         playing.clock = clock
+
+        def pause(seconds: float) -> None:
+            self._sleep(playing, time.monotonic() + seconds)
+
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
-            if factor != 1.0:
-                self._await_answer(playing, start)
+            if answers is not None:
+                answers.wait(self.values['in_flight'], self.values['wait_limit'], pause)
             self._sleep(playing, clock.due(start))
             self._send(playing, sequence.v[start:stop], label)
             clock.note(start, stop - start, time.monotonic())
+            if answers is not None:
+                fs = sequence.sample_rate
+                answers.flow.sent(start / fs, (stop - 1) / fs)
+                if start == 0:
+                    # alone, so that nobody is overrun who has not been heard yet
+                    pause(HEAR)
+                    answers.look()
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
             self.report_status(
                 'running',
@@ -318,21 +339,8 @@ class ExcitationNode(LabNode):
                 level,
                 segment=label,
             )
-
-    def _await_answer(self, playing: Playing, tick: int) -> None:
-        ahead = self.values['in_flight'] * playing.block_size
-        limit = self.values['wait_limit']
-        give_up = time.monotonic() + limit
-        while tick - playing.seen >= ahead:
-            playing.answered.clear()
-            if playing.stop.is_set():
-                raise _Stopped
-            if tick - playing.seen >= ahead and not playing.answered.wait(0.05):
-                if time.monotonic() > give_up:
-                    raise ConfigError(
-                        f'no displacement for {limit:g} s: the last that came back was of '
-                        f't = {playing.seen / playing.sequence.sample_rate:.6g} s'
-                    )
+        if answers is not None:
+            answers.wait(1, self.values['wait_limit'], pause)
 
     def _send(self, playing: Playing, v: NDArray[np.float64], label: str) -> None:
         begin = time.perf_counter()

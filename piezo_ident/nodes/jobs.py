@@ -13,30 +13,58 @@
 # limitations under the License.
 
 
-"""What the identifier's worker does; nothing here knows of topics."""
+"""
+What the identifier's helper does; nothing here knows of topics.
+
+Jobs go to another process, so that each is a partial of a function of this module.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import functools
 import json
 
+import numpy as np
 from piezo_ident.capture import refuse_incomplete, Snapshot
 from piezo_ident.errors import ConfigError
 from piezo_ident.identification import identify
 from piezo_ident.model_io import model_to_yaml
+from piezo_ident.program import parse_program
 from piezo_ident.record import Record
 from piezo_ident.report import steps_to_json, to_json, verdict, write_report
 from piezo_ident.results import Identification, Settings, Steps
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
 from piezo_ident.single_steps import find_delay, find_dynamics, find_hysteresis
 from piezo_ident.validation import free_runs
 
-__all__ = ['Outcome', 'identify_job', 'save_job', 'settings_of', 'share_of']
+__all__ = ['Outcome', 'identify_job', 'save_job', 'settings_of', 'share_of', 'warm_up']
 
 Tick = Callable[[str, float], None]
 
+#: the shortest programme that all three steps take
+_SMALL = """
+limits: [0, 10]
+slew: 500
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.02, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 4, frequency: 100}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 0.5}
+  - {signal: triangle, slope: 100}
+"""
+
 #: where each step stands in the whole, by how long it takes
-_SHARES = {'delay': (0.02, 0.05), 'dynamics': (0.05, 0.8), 'hysteresis': (0.8, 0.98)}
+_SHARES = {
+    'delay': (0.02, 0.05),
+    'dynamics': (0.05, 0.8),
+    'hysteresis': (0.8, 0.98),
+    'residual': (0.02, 0.1),
+    'candidates': (0.1, 0.95),
+    'verdict': (0.95, 0.98),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,38 +140,40 @@ def identify_job(
     steps : Steps, optional
         What was found already; for single steps only.
     """
+    return functools.partial(_identify, snapshot, settings, which, steps)
 
-    def job(tick: Tick) -> Outcome:
-        tick('record', 0.0)
-        record = snapshot.record('capture')
-        tick('record', 0.01)
-        refuse_incomplete(record, snapshot.sent())
-        records = [record]
-        if which in ('delay', 'dynamics'):
-            if which == 'delay':
-                found = find_delay(records, settings, progress=tick)
-            else:
-                found = find_dynamics(records, settings, steps=steps, progress=tick)
-            data = steps_to_json(found, record.pieces[0].sample_rate, records)
-            return Outcome(_said(found), json.dumps(data), len(record.faults), found)
-        if which == 'hysteresis':
-            result = find_hysteresis(records, settings, steps=steps, progress=tick)
+
+def _identify(
+    snapshot: Snapshot, settings: Settings, which: str, steps: Steps | None, tick: Tick
+) -> Outcome:
+    tick('record', 0.0)
+    record = snapshot.record('capture')
+    tick('record', 0.01)
+    refuse_incomplete(record, snapshot.sent())
+    records = [record]
+    if which in ('delay', 'dynamics'):
+        if which == 'delay':
+            found = find_delay(records, settings, progress=tick)
         else:
-            result = identify(records, settings, progress=tick)
-        tick('report', 0.98)
-        runs = free_runs(result.model, records, result.memories)
-        tick('report', 0.99)
-        return Outcome(
-            message=verdict(result),
-            report=json.dumps(to_json(result, records, runs)),
-            warnings=len(result.warnings),
-            steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
-            identification=result,
-            record=record,
-            model=model_to_yaml(result.model),
-        )
-
-    return job
+            found = find_dynamics(records, settings, steps=steps, progress=tick)
+        data = steps_to_json(found, record.pieces[0].sample_rate, records)
+        return Outcome(_said(found), json.dumps(data), len(record.faults), found)
+    if which == 'hysteresis':
+        result = find_hysteresis(records, settings, steps=steps, progress=tick)
+    else:
+        result = identify(records, settings, progress=tick)
+    tick('report', 0.98)
+    runs = free_runs(result.model, records, result.memories)
+    tick('report', 0.99)
+    return Outcome(
+        message=verdict(result),
+        report=json.dumps(to_json(result, records, runs)),
+        warnings=len(result.warnings),
+        steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
+        identification=result,
+        record=record,
+        model=model_to_yaml(result.model),
+    )
 
 
 def _said(steps: Steps) -> str:
@@ -156,9 +186,17 @@ def _said(steps: Steps) -> str:
 
 def save_job(identification: Identification, record: Record, folder: str) -> Callable[[Tick], str]:
     """Return a job that writes model, report and pictures."""
+    return functools.partial(_save, identification, record, folder)
 
-    def job(tick: Tick) -> str:
-        tick('drawing', 0.0)
-        return str(write_report(identification, record, folder, progress=tick))
 
-    return job
+def _save(identification: Identification, record: Record, folder: str, tick: Tick) -> str:
+    tick('drawing', 0.0)
+    return str(write_report(identification, record, folder, progress=tick))
+
+
+def warm_up() -> None:
+    """Compile, or load, all that an identification needs, so that the first one is not slower."""
+    stage = load_stage(find_config('paper', 'stage'))
+    sequence = parse_program(_SMALL).build(stage.model.sample_rate)
+    record = simulate(stage, sequence, np.random.default_rng(0))
+    identify(record, Settings(thresholds=3, max_order=2, swarm_size=4, swarm_iterations=100))

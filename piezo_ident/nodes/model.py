@@ -241,6 +241,8 @@ class ModelNode(LabNode):
         said = [self._turned_down, self._trouble if fresh else '']
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
+        if self._predictor.model is not None and self._predictor.memory_lost:
+            message += '; its memory is unknown until the voltage has been at its lowest'
         text = '; '.join(filter(None, [message, *said]))
         level = WARN if any(said) else OK
         self.report_status(state, 0.0, text, level, models=self._models)

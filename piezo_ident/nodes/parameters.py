@@ -77,7 +77,7 @@ EXCITATION = (
     Declaration(
         'rate_factor',
         1.0,
-        'how many times faster than real time blocks are sent; 0: as fast as the stage answers',
+        'how many times faster than real time blocks are sent; 0: as fast as all answer',
         '1',
         0.0,
         100.0,
@@ -91,7 +91,12 @@ EXCITATION = (
     ),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
     Declaration(
-        'in_flight', 40, 'blocks sent ahead of the answer when rate_factor is not 1', '1', 1, 90
+        'answers',
+        'displacement prediction captured',
+        'topics on which listeners answer, with blanks between; used when rate_factor is not 1',
+    ),
+    Declaration(
+        'in_flight', 40, 'blocks sent ahead of the slowest answer that counts', '1', 1, 90
     ),
 )
 
@@ -144,6 +149,16 @@ IDENTIFIER = (
         's',
         0.5,
         3600.0,
+    ),
+    Declaration('model', '', 'file of a model for ~/diagnose; empty: that identified here'),
+    Declaration(
+        'sweeps_program', 'diagnosis', 'programme that ~/diagnose asks for to have many motions'
+    ),
+    Declaration(
+        'holds_program', 'holds', 'programme that ~/diagnose asks for to have holds after steps'
+    ),
+    Declaration(
+        'requests', 2, 'how often one ~/diagnose may ask the excitation for more', '1', 0, 10
     ),
     Declaration(
         'channels',
@@ -204,6 +219,14 @@ PLAYER = (
     ),
     Declaration('subscribers', 1, 'how many must listen before the first message', '1', 0, 100),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    Declaration(
+        'answers',
+        'captured prediction',
+        'topics on which listeners answer, with blanks between; empty: by time alone',
+    ),
+    Declaration(
+        'in_flight', 40, 'blocks sent ahead of the slowest answer that counts', '1', 1, 90
+    ),
     Declaration('autostart', False, 'start to replay at once', read_only=True),
 )
 

@@ -18,18 +18,28 @@ The player node: replays a bag onto topics with the original spacing, or faster.
 Blocks carry their own times, so the samples that are replayed are the samples that were measured,
 bit by bit, at whatever rate.  The spacing is that of the log times, on a schedule that is counted
 from its start.  Only the measured topics are replayed unless `topics` says otherwise.
+
+Nothing is sent before every topic has met as many subscribers as `subscribers` says.  Whoever
+answers on one of the topics `answers` - the identifier on `captured`, the model on `prediction` -
+is never overrun: no more than `in_flight` blocks of the first topic are on their way to it, and
+the replay is done when it has answered the last one.  Where somebody publishes the first of these
+topics he has to answer; the others are waited for from their first answer on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+import functools
 import threading
 import time
 from typing import Any
 
-from piezo_ident.bag_recovery import Bag, opened_bag, Stored
+import numpy as np
+from piezo_ident.bag_io import MESSAGE_TYPE, typestore
+from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag, Stored
 from piezo_ident.errors import DataError, PiezoIdentError
+from piezo_ident.nodes.answers import Answers, answers_problem
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.taps import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
@@ -43,6 +53,8 @@ __all__ = ['PlayerNode', 'main']
 PATIENCE = 1.5
 #: between the match of the subscribers and the first message, for them to know of it too [s]
 SETTLE = 0.2
+#: how long the first block stands alone for somebody to answer it [s]
+HEAR = 1.0
 #: how often progress is told [s]
 TELL = 0.25
 
@@ -86,6 +98,8 @@ class PlayerNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse names that cannot be."""
+        if name == 'answers':
+            return answers_problem(value)
         return topics_problem(value) if name == 'topics' else None
 
     # services
@@ -162,9 +176,15 @@ class PlayerNode(LabNode):
                 replay.names = ', '.join(chosen.values())
                 replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
                 replay.ready.set()
-                self._await_subscribers(replay, senders)
-                clock = self._send(replay, bag, senders)
-                self._report_end(replay, bag, clock)
+                answers = Answers(self, self.values['answers'].split())
+                try:
+                    self._await_subscribers(replay, senders)
+                    lead = next((t for t in chosen if _is_block(bag, t)), '')
+                    clock = self._send(replay, bag, senders, answers, lead)
+                    open_end = self._await_last(replay, answers)
+                finally:
+                    answers.close()
+                self._report_end(replay, bag, clock, open_end)
         except _Stopped:
             self._report(
                 'stopped',
@@ -231,12 +251,18 @@ class PlayerNode(LabNode):
         if need:
             self._pause(replay, SETTLE)
 
-    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> ReplayClock:
-        """Send every message when it is due."""
+    def _send(
+        self, replay: Replay, bag: Bag, senders: Mapping[str, Any], answers: Answers, lead: str
+    ) -> ReplayClock:
+        """Send every message when it is due; nobody is overrun by the blocks of `lead`."""
+        pause = functools.partial(self._pause, replay)
         rate = self.values['rate']
         clock: ReplayClock | None = None
         first, told = 0, float('-inf')
         for connection, stamp, raw in self._chosen(bag, senders):
+            span = _span(bag, connection, raw) if connection.topic == lead else None
+            if span is not None:
+                answers.wait(self.values['in_flight'], self.values['wait_limit'], pause)
             now = time.monotonic()
             if clock is None:
                 clock, first = ReplayClock(rate, stamp, now), stamp
@@ -256,11 +282,36 @@ class PlayerNode(LabNode):
                 now = time.monotonic()
             senders[connection.topic].publish(raw)
             replay.messages += 1
+            if span is not None and not answers.flow.count:
+                self._hear(replay, answers, span)
+                clock.change_rate(self.values['rate'], stamp, time.monotonic())
+            elif span is not None:
+                answers.flow.sent(*span)
             replay.slipped = clock.slipped
             replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)
         if clock is None:
             raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
         return clock
+
+    def _hear(self, replay: Replay, answers: Answers, span: tuple[float, float]) -> None:
+        """Let the first block stand alone, so that nobody is overrun who was not heard yet."""
+        first = next(iter(self.values['answers'].split()), '')
+        if first in answers.published:
+            answers.flow.expect(first)
+        answers.flow.sent(*span)
+        alone = time.monotonic() + HEAR
+        while answers.published and not answers.flow.answering and time.monotonic() < alone:
+            self._pause(replay, 0.01)
+            answers.look()
+
+    def _await_last(self, replay: Replay, answers: Answers) -> str:
+        """Wait until everybody who answers has answered the last block; return who has not."""
+        answers.look()
+        try:
+            answers.wait(1, self.values['wait_limit'], functools.partial(self._pause, replay))
+        except PiezoIdentError as error:
+            return f'{answers.flow.ahead} blocks were not answered: {error}'
+        return ''
 
     def _chosen(self, bag: Bag, senders: Mapping[str, Any]) -> Iterator[Stored]:
         return bag.messages([c for c in bag.connections if c.topic in senders])
@@ -269,15 +320,14 @@ class PlayerNode(LabNode):
         if replay.stop.wait(seconds):
             raise _Stopped
 
-    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock) -> None:
+    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock, open_end: str) -> None:
         about = f'replayed {replay.messages} messages of {replay.bag}'
         if clock.slipped > 0.1:
             about += f', {clock.slipped:.1f} s slower than asked'
         faults = '; '.join(str(f) for f in bag.faults)
-        if faults:
-            self._report('done', f'{about}; the bag ends early: {faults}', WARN, 100.0)
-        else:
-            self._report('done', about, OK, 100.0)
+        early = f'the bag ends early: {faults}' if faults else ''
+        level = WARN if early or open_end else OK
+        self._report('done', '; '.join(filter(None, [about, early, open_end])), level, 100.0)
 
     # what is told
 
@@ -292,6 +342,21 @@ class PlayerNode(LabNode):
 
     def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
         self.report_status(state, progress, message, level, **self._numbers())
+
+
+def _span(bag: Bag, connection: Connection, raw: bytes) -> tuple[float, float] | None:
+    """Return the times of the first and the last sample of a block, None where it is none."""
+    if connection.msgtype != MESSAGE_TYPE:
+        return None
+    with damage_as_data_error(bag.path):
+        message: Any = typestore().deserialize_cdr(raw, connection.msgtype)
+    if message.data.size < 2 or not np.isfinite(message.data[[0, -2]]).all():
+        return None
+    return float(message.data[0]), float(message.data[-2])
+
+
+def _is_block(bag: Bag, topic: str) -> bool:
+    return any(c.topic == topic and c.msgtype == MESSAGE_TYPE for c in bag.connections)
 
 
 def _profile(connection: Connection) -> QoSProfile:

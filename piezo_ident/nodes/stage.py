@@ -251,7 +251,7 @@ class StageNode(LabNode):
         if self._guard.is_at_rest:
             self._ramp_timer.cancel()
             self._state = 'idle'
-            self._blame('silence', 'no voltage: ramped to rest')
+            self._blame('silence', 'no voltage: ramped to rest', 0)
         self._say()
 
     # reports

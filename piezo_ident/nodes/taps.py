@@ -45,13 +45,13 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-__all__ = ['Taps', 'message_class', 'topics_problem']
+__all__ = ['Aside', 'Taps', 'message_class', 'topics_problem']
 
 #: messages that a subscription keeps until it is emptied: five seconds of blocks
 DEPTH = 1000
 
 
-class _Aside(CallbackGroup):
+class Aside(CallbackGroup):
     """Keeps subscriptions away from the executor."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -144,7 +144,7 @@ class Taps:
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         self._node = node
         self._taps = {topic: Tap(topic) for topic in topics}
-        self._group = _Aside()
+        self._group = Aside()
         self._lock = threading.Lock()
         self._closed = False
 

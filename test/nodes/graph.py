@@ -17,14 +17,16 @@
 A graph of real node processes for tests, and a node in this process that looks at it.
 
     with Graph() as g:
-        stage = g.start('stage', params={'seed': 3})
-        g.start('excitation')
+        g.start_all(('stage', {'seed': 3}), ('excitation', {}))
         seen = g.collect('displacement')
         assert g.call('excitation/start')[0]
-        g.wait(lambda: g.status('excitation')['state'] == 'done', timeout=60, what='programme')
+        g.wait(lambda: g.status('excitation')['state'] == 'done', 'the end of the programme')
 
 Every graph has a ROS domain of its own, so several may run at once; at the end nothing is left,
 whatever happened.
+
+Tests wait for what they want to see, with a limit that only a failure meets.  Where a time is
+itself what is promised, `in_time` prints it, and gives a crowded machine more of it.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ import ctypes
 import fcntl
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import subprocess
@@ -50,6 +53,7 @@ import yaml
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from piezo_ident.nodes.interfaces import STATES
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
 from piezo_ident.wire_format import Samples
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
@@ -58,20 +62,41 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-__all__ = ['Graph', 'Handle']
+__all__ = ['Graph', 'Handle', 'alive', 'in_time']
 
 ROOT = Path(__file__).resolve().parents[2]
-#: a node must be up and have said so within this time [s]; the machine may be busy
-START_LIMIT = 40.0
+#: what has not happened within this time will not happen [s]; the machine may be busy
+LIMIT = 60.0
+#: a question that may have been lost with a dead node is asked again after this time [s]
+AGAIN = 3.0
+#: the observer shares its interpreter with the test, and must not lose what waits for it
+OBSERVED = QoSProfile(depth=20_000)
 #: domains whose ports are clear of the system's own
 DOMAINS = range(1, 100)
 
 
+def in_time(took: float, limit: float, what: str) -> None:
+    """See that something took no longer than promised [s], and print how long it took."""
+    crowd = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    print(f'{what}: {took:.3f} s of {limit:g} s, {crowd:.1f} programs a processor')
+    assert took < limit * crowd, f'{what}: {took:.3f} s, promised are {limit:g} s'
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process is there and is no zombie."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
 def _die_with_parent() -> None:
+    # of the thread that starts it: only the main one may, which outlives them all
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
@@ -89,23 +114,54 @@ def _take_domain() -> tuple[int, IO[str]]:
     raise RuntimeError('all ROS domains are in use')
 
 
+def _shared_memory(pid: int) -> list[Path]:
+    """Return the shared memory of the middleware that a process owns, and would leave behind."""
+    held = []
+    with contextlib.suppress(OSError):
+        held = [os.readlink(fd) for fd in Path(f'/proc/{pid}/fd').iterdir()]
+    locks = [h for h in held if re.fullmatch(r'/dev/shm/fastrtps_[0-9a-f]{16}_el', h)]
+    return [Path(name) for lock in locks for name in (lock, lock.removesuffix('_el'))]
+
+
 class Handle:
     """A node process that a `Graph` started."""
 
     def __init__(
-        self, graph: Graph, name: str, process: subprocess.Popen[bytes], log: Path
+        self,
+        graph: Graph,
+        name: str,
+        command: Sequence[str],
+        log: Path,
+        env: Mapping[str, str] | None = None,
     ) -> None:
         self.graph = graph
         self.name = name
-        self.process = process
-        self._log = log
+        self.command = command
+        self.env = env
         #: whether its end is the test's doing
         self.is_ended = False
+        self._log = log
+        self._said = len(graph.statuses(name))
+        with log.open('wb') as out:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**graph.environment, **(env or {})},
+                start_new_session=True,
+                preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
+            )
 
     @property
     def log(self) -> str:
         """What it wrote on its two outputs."""
         return self._log.read_text(encoding='utf-8', errors='replace')
+
+    @property
+    def has_spoken(self) -> bool:
+        """Whether its first status was heard."""
+        return len(self.graph.statuses(self.name)) > self._said
 
     def status(self) -> dict[str, str]:
         """Return its latest status."""
@@ -113,21 +169,39 @@ class Handle:
 
     def send(self, number: int) -> None:
         """Send it a signal and do not wait."""
-        self.is_ended = number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+        self.is_ended |= number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
         self.process.send_signal(number)
 
-    def stop(self, number: int = signal.SIGINT, timeout: float = 10.0) -> int:
+    def stop(self, number: int = signal.SIGINT) -> int:
         """Send it a signal, wait for its end, and return the exit code."""
         if self.process.poll() is None:
             self.send(number)
-        return self.process.wait(timeout)
+        return self.process.wait(LIMIT)
+
+    def children(self) -> set[int]:
+        """Return the processes that it has started."""
+        tasks = Path(f'/proc/{self.process.pid}/task')
+        texts = [(task / 'children').read_text() for task in tasks.iterdir()]
+        return {int(pid) for text in texts for pid in text.split()}
+
+    def die(self) -> None:
+        """End it outright, and nothing but it."""
+        self.is_ended = True
+        left = _shared_memory(self.process.pid)
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
 
     def kill(self) -> None:
         """End it outright, with all that it started."""
         self.is_ended = True
+        left = _shared_memory(self.process.pid)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(5.0)
+        self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
 
 
 class Graph:
@@ -143,6 +217,7 @@ class Graph:
         self._arrivals: dict[str, list[float]] = {}
         self._texts: dict[str, list[str]] = {}
         self._publishers: dict[str, Any] = {}
+        self._unknown: set[tuple[str, str]] = set()
         self._end = threading.Event()
 
     def __enter__(self) -> Graph:
@@ -163,7 +238,9 @@ class Graph:
             domain_id=self.domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self.node = Node('observer', context=self.context, start_parameter_services=False)
+        self.node = Node(
+            'observer', context=self.context, start_parameter_services=False, enable_rosout=False
+        )
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self.node.create_subscription(
@@ -173,7 +250,7 @@ class Graph:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         try:
             for handle in self.handles:
                 handle.kill()
@@ -185,6 +262,8 @@ class Graph:
             rclpy.shutdown(context=self.context)
             shutil.rmtree(self.folder, ignore_errors=True)
             self._lock.close()
+        if kind is None:
+            assert not self._unknown, f'states that no table knows: {self._unknown}'
 
     def _spin(self) -> None:
         while not self._end.is_set():
@@ -201,7 +280,6 @@ class Graph:
         params: Mapping[str, Any] | None = None,
         namespace: str = '',
         remaps: Mapping[str, str] | None = None,
-        args: Sequence[str] = (),
         *,
         wait: bool = True,
         env: Mapping[str, str] | None = None,
@@ -219,15 +297,12 @@ class Graph:
             Without slash in front.
         remaps : mapping of str to str, optional
             Also ``{'__node': 'other'}``.
-        args : sequence of str, optional
-            Further arguments behind ``--ros-args``.
         wait : bool, optional
-            Whether to wait until it has said something.
+            Whether to wait until it has said something; otherwise its end may be what is tested.
         env : mapping, optional
             Environment on top of the graph's.
         """
         remaps = dict(remaps or {})
-        number = len(self.handles)
         command = [
             sys.executable,
             '-c',
@@ -239,47 +314,65 @@ class Graph:
         for source, target in remaps.items():
             command += ['-r', f'{source}:={target}']
         if params:
-            file = self.folder / f'{number}.yaml'
+            file = self.folder / f'{len(self.handles)}.yaml'
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': dict(params)}}))
             command += ['--params-file', str(file)]
-        command += list(args)
         name = '/'.join(filter(None, [namespace.strip('/'), remaps.get('__node', executable)]))
-        log = self.folder / f'{number}_{name.replace("/", "_")}.log'
-        self.follow(name)
-        before = len(self._statuses[name])
-        with log.open('wb') as out:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env={**self.environment, **(env or {})},
-                start_new_session=True,
-                preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
-            )
-        handle = Handle(self, name, process, log)
+        self.follow(name, executable)
+        handle = Handle(self, name, command, self._log_of(name), env)
         self.handles.append(handle)
         if wait:
-            self.wait(
-                lambda: len(self._statuses[name]) > before, START_LIMIT, f'first status of {name}'
-            )
+            self._heard([handle])
         else:
-            # its end may be what is tested
             handle.is_ended = True
         return handle
 
+    def start_all(self, *nodes: tuple[Any, ...]) -> list[Handle]:
+        """Start nodes at once, each a tuple of the arguments of `start`; wait for all of them."""
+        handles = [self.start(*arguments, wait=False) for arguments in nodes]
+        self._heard(handles)
+        return handles
+
+    def restart(self, handle: Handle, meanwhile: Callable[[], None] = lambda: None) -> Handle:
+        """Start a node once more, and do something again and again until it has spoken."""
+        new = Handle(self, handle.name, handle.command, self._log_of(handle.name), handle.env)
+        self.handles.append(new)
+        self._heard([new], meanwhile)
+        return new
+
+    def handle(self, name: str) -> Handle:
+        """Return the process of a node, the latest one where none is left."""
+        found = [h for h in reversed(self.handles) if h.name == name]
+        return next((h for h in found if h.process.poll() is None), found[0])
+
+    def _log_of(self, name: str) -> Path:
+        return self.folder / f'{len(self.handles)}_{name.replace("/", "_")}.log'
+
+    def _heard(
+        self, handles: Sequence[Handle], meanwhile: Callable[[], None] = lambda: None
+    ) -> None:
+        for handle in handles:
+            handle.is_ended = False
+        for handle in handles:
+            self.wait(
+                lambda h=handle: h.has_spoken, f'{handle.name} to speak', meanwhile=meanwhile
+            )
+
     # looking
 
-    def follow(self, name: str) -> None:
+    def follow(self, name: str, executable: str = '') -> None:
         """Follow the status of a node; `start` does it by itself."""
         if name in self._statuses:
             return
         heard = self._statuses[name] = []
+        known = {s.name for s in STATES if s.node == executable}
 
         def keep(message: DiagnosticStatus) -> None:
             values = {pair.key: pair.value for pair in message.values}
             level = int.from_bytes(message.level, 'little')
             heard.append({**values, 'message': message.message, 'level': str(level)})
+            if known and values['state'] not in known:
+                self._unknown.add((executable, values['state']))
 
         self.node.create_subscription(DiagnosticStatus, f'/{name}/status', keep, LATCHED)
 
@@ -288,7 +381,12 @@ class Graph:
             values = {pair.key: pair.value for pair in status.values}
             level = int.from_bytes(status.level, 'little')
             self._diagnostics.setdefault(status.name.strip('/'), []).append(
-                {**values, 'message': status.message, 'level': str(level)}
+                {
+                    **values,
+                    'message': status.message,
+                    'level': str(level),
+                    'hardware_id': status.hardware_id,
+                }
             )
 
     def status(self, name: str) -> dict[str, str]:
@@ -306,6 +404,10 @@ class Graph:
         heard = self._diagnostics.get(name, [])
         return heard[-1] if heard else {}
 
+    def diagnoses(self, name: str) -> list[dict[str, str]]:
+        """Return all diagnostics of a node that were heard."""
+        return self._diagnostics.get(name, [])
+
     def collect(self, topic: str) -> list[Samples]:
         """Return the blocks of a topic so far; subscribes on first use."""
         if topic not in self._samples:
@@ -318,7 +420,7 @@ class Graph:
                 messages.append(message)
                 samples.append(from_message(message))
 
-            self.node.create_subscription(Float64MultiArray, topic, keep, STREAM)
+            self.node.create_subscription(Float64MultiArray, topic, keep, OBSERVED)
         return self._samples[topic]
 
     def messages(self, topic: str) -> list[Float64MultiArray]:
@@ -338,19 +440,20 @@ class Graph:
             self.node.create_subscription(String, topic, lambda m: texts.append(m.data), LATCHED)
         return self._texts[topic]
 
-    def matched(self, topic: str, publishers: int = 1, timeout: float = 10.0) -> None:
+    def matched(self, topic: str, publishers: int = 1) -> None:
         """Wait until this many publishers of a collected topic are known."""
         self.collect(topic)
         self.wait(
-            lambda: self.node.count_publishers(topic) >= publishers, timeout, f'publishers {topic}'
+            lambda: self.node.count_publishers(topic) >= publishers, f'publishers of {topic}'
         )
 
     def wait(
         self,
         condition: Callable[[], object],
-        timeout: float = 10.0,
-        what: str = 'condition',
-        period: float = 0.01,
+        what: str,
+        timeout: float = LIMIT,
+        *,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> None:
         """Wait until a condition holds; `AssertionError` with the whole state when it does not."""
         deadline = time.monotonic() + timeout
@@ -363,7 +466,15 @@ class Graph:
                 states = {name: self.status(name) for name in self._statuses}
                 logs = {h.name: h.log for h in self.handles if h.log}
                 raise AssertionError(f'{what}: not within {timeout} s; {states}; logs: {logs}')
-            time.sleep(period)
+            meanwhile()
+            time.sleep(0.01)
+
+    def never(self, condition: Callable[[], object], what: str, seconds: float) -> None:
+        """See for some time that something does not happen."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            assert not condition(), f'{what} did happen'
+            time.sleep(0.01)
 
     # acting
 
@@ -371,20 +482,27 @@ class Graph:
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, f'/{service.lstrip("/")}')
         client = self._clients[service]
-        self.wait(client.service_is_ready, timeout, f'service {service}')
-        done = threading.Event()
-        future = client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(timeout):
-            raise AssertionError(f'{service}: no answer within {timeout} s')
-        return future.result()
+        self.wait(client.service_is_ready, f'service {service}', timeout)
+        done, answers = threading.Event(), []
 
-    def call(self, service: str, timeout: float = 10.0) -> tuple[bool, str]:
+        def take(future: Any) -> None:
+            answers.append(future.result())
+            done.set()
+
+        deadline = time.monotonic() + timeout
+        while not done.is_set() and time.monotonic() < deadline:
+            client.call_async(request).add_done_callback(take)
+            done.wait(AGAIN)
+        if not answers:
+            raise AssertionError(f'{service}: no answer within {timeout} s')
+        return answers[0]
+
+    def call(self, service: str, timeout: float = LIMIT) -> tuple[bool, str]:
         """Call a Trigger service and return (success, message)."""
         answer = self._ask(Trigger, service, Trigger.Request(), timeout)
         return bool(answer.success), str(answer.message)
 
-    def set(self, node: str, name: str, value: Any, timeout: float = 10.0) -> tuple[bool, str]:
+    def set(self, node: str, name: str, value: Any, timeout: float = LIMIT) -> tuple[bool, str]:
         """Set a parameter of a node and return (taken, reason)."""
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()]
@@ -392,13 +510,13 @@ class Graph:
         result = self._ask(SetParameters, f'{node}/set_parameters', request, timeout).results[0]
         return bool(result.successful), str(result.reason)
 
-    def get(self, node: str, name: str, timeout: float = 10.0) -> Any:
+    def get(self, node: str, name: str, timeout: float = LIMIT) -> Any:
         """Return the value of a parameter of a node."""
         request = GetParameters.Request(names=[name])
         values = self._ask(GetParameters, f'{node}/get_parameters', request, timeout).values
         return parameter_value_to_python(values[0])
 
-    def parameters(self, node: str, timeout: float = 10.0) -> dict[str, Any]:
+    def parameters(self, node: str, timeout: float = LIMIT) -> dict[str, Any]:
         """Return the descriptors of all parameters of a node by their names."""
         listed = self._ask(
             ListParameters, f'{node}/list_parameters', ListParameters.Request(), timeout
@@ -407,19 +525,19 @@ class Graph:
         answer = self._ask(DescribeParameters, f'{node}/describe_parameters', request, timeout)
         return {d.name: d for d in answer.descriptors}
 
-    def publish(
-        self, topic: str, block: Samples | Float64MultiArray, timeout: float = 10.0
-    ) -> None:
+    def publish(self, topic: str, block: Samples | Float64MultiArray) -> None:
         """Publish a block; before the first one, wait for a subscriber."""
         if topic not in self._publishers:
             publisher = self.node.create_publisher(Float64MultiArray, topic, STREAM)
             self._publishers[topic] = publisher
             own = int(topic in self._samples)
-            self.wait(
-                lambda: publisher.get_subscription_count() > own, timeout, f'listeners to {topic}'
-            )
+            self.wait(lambda: publisher.get_subscription_count() > own, f'listeners to {topic}')
         message = to_message(block) if isinstance(block, Samples) else block
         self._publishers[topic].publish(message)
+
+    def listeners(self, topic: str) -> int:
+        """Return how many listen to a topic on which `publish` was used."""
+        return int(self._publishers[topic].get_subscription_count())
 
     def publish_text(self, topic: str, text: str) -> None:
         """Publish a latched text."""

@@ -16,7 +16,6 @@
 
 import json
 from pathlib import Path
-import signal
 import threading
 import time
 
@@ -29,7 +28,6 @@ from graph import Graph
 from piezo_ident.bag_io import read_bag
 from piezo_ident.bag_recovery import is_unfinished, opened_bag
 from piezo_ident.cli import main
-from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
 from piezo_ident.wire_format import Samples
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -87,7 +85,7 @@ def start(graph: Graph, folder: Path, name: str = 'recorder', **params) -> str:
     """Call start, wait until it records, and return the path."""
     ok, message = graph.call(f'{name}/start')
     assert ok, message
-    graph.wait(lambda: graph.status(name)['state'] == 'recording', what='recording')
+    graph.wait(lambda: graph.status(name)['state'] == 'recording', 'recording')
     return graph.status(name)['path']
 
 
@@ -117,16 +115,16 @@ def test_record_stop_and_refusals(tmp_path):
         assert not g.set('a/recorder', 'output', '')[0]
         assert not g.set('a/recorder', 'flush', 5.0)[0]
         with source:
-            g.wait(lambda: len(source.sent) > 100, what='blocks')
+            g.wait(lambda: len(source.sent) > 100, 'blocks')
             # a topic that appears late
             late = g.node.create_publisher(Float64MultiArray, '/a/residual', STREAM)
-            g.wait(lambda: late.get_subscription_count() == 1, what='recorder hears of it')
+            g.wait(lambda: late.get_subscription_count() == 1, 'recorder hears of it')
             late.publish(to_message(pair(0)[1]))
-            g.wait(lambda: int(g.status('a/recorder')['messages']) > 300, what='messages')
+            g.wait(lambda: int(g.status('a/recorder')['messages']) > 300, 'messages')
         seen = int(g.status('a/recorder')['messages'])
         ok, message = g.call('a/recorder/stop')
         assert (ok, message) == (True, f'closing {path}')
-        g.wait(lambda: g.status('a/recorder')['state'] == 'done', what='closed bag')
+        g.wait(lambda: g.status('a/recorder')['state'] == 'done', 'closed bag')
         status = g.status('a/recorder')
         assert status['lost'] == '0'
         assert int(status['messages']) == 2 * len(source.sent) + 2 >= seen
@@ -134,14 +132,14 @@ def test_record_stop_and_refusals(tmp_path):
         # a second one beside it
         assert start(g, tmp_path, 'a/recorder') == str(tmp_path / 'bag_1')
         assert g.call('a/recorder/stop')[0]
-        g.wait(lambda: g.status('a/recorder')['state'] == 'done', what='closed bag')
+        g.wait(lambda: g.status('a/recorder')['state'] == 'done', 'closed bag')
         # a place that cannot be
         (tmp_path / 'file').write_text('')
         assert g.set('a/recorder', 'output', str(tmp_path / 'file' / 'bag'))[0]
         ok, message = g.call('a/recorder/start')
         assert not ok
         assert 'cannot be written' in message
-        g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), what='diagnostics')
+        g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), 'diagnostics')
     got = contents(tmp_path / 'bag')
     assert arrays(got['/a/voltage']) == [v for v, _ in source.messages]
     assert arrays(got['/a/displacement']) == [y for _, y in source.messages]
@@ -178,6 +176,23 @@ def test_record_stop_and_refusals(tmp_path):
         assert abs(stamps[-1] * 1e-9 - time.time()) < 60
 
 
+def test_flush_says_how_long_a_message_waits(tmp_path):
+    with Graph() as g:
+        source = Source(g)
+        g.start('recorder', {'output': str(tmp_path / 'bag')})
+        sizes = {}
+        with source:
+            for flush in (0.5, 0.05):
+                assert g.set('recorder', 'flush', flush) == (True, '')
+                start(g, tmp_path)
+                seen, sent = len(g.statuses('recorder')), len(source.sent)
+                g.wait(lambda sent=sent: len(source.sent) > sent + 400, '2 s of blocks')
+                sizes[flush] = {s['bytes'] for s in g.statuses('recorder')[seen:]}
+                assert g.call('recorder/stop')[0]
+                g.wait(lambda: g.status('recorder')['state'] == 'done', 'the bag')
+        assert len(sizes[0.5]) <= 8 < len(sizes[0.05])
+
+
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_sigkill_loses_less_than_a_second(tmp_path, storage, capsys):
     with Graph() as g:
@@ -185,7 +200,7 @@ def test_sigkill_loses_less_than_a_second(tmp_path, storage, capsys):
         recorder = g.start('recorder', {'output': str(tmp_path / 'bag'), 'storage': storage})
         start(g, tmp_path)
         with source:
-            g.wait(lambda: len(source.sent) > 500, what='2.5 s of blocks')
+            g.wait(lambda: len(source.sent) > 500, '2.5 s of blocks')
             recorder.kill()
             sent = len(source.sent)
     assert is_unfinished(tmp_path / 'bag')
@@ -200,25 +215,6 @@ def test_sigkill_loses_less_than_a_second(tmp_path, storage, capsys):
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * record.pieces[0].t))
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_close_the_bag(tmp_path, number):
-    storage = 'mcap' if number == signal.SIGINT else 'sqlite3'
-    with Graph() as g:
-        source = Source(g)
-        params = {'output': str(tmp_path / 'bag'), 'autostart': True, 'storage': storage}
-        recorder = g.start('recorder', params)
-        g.wait(lambda: g.status('recorder')['state'] == 'recording', what='recording')
-        with source:
-            g.wait(lambda: int(g.status('recorder')['messages'] or 0) > 50, what='messages')
-            began = time.monotonic()
-            assert recorder.stop(number) == 0
-            assert time.monotonic() - began < 2.0
-    assert not is_unfinished(tmp_path / 'bag')
-    record = read_bag(tmp_path / 'bag')
-    assert record.n >= 2500
-    assert not [f for f in record.faults if f.name == 'truncated_bag']
-
-
 def test_other_topics_types_and_qos(tmp_path):
     params = {'output': str(tmp_path / 'bag'), 'topics': ['voltage', 'drive', '/else/pose', 'odd']}
     with Graph() as g:
@@ -230,7 +226,7 @@ def test_other_topics_types_and_qos(tmp_path):
         drive = g.node.create_publisher(Float64MultiArray, '/lab/drive', STREAM)
         pose = g.node.create_publisher(JointState, '/else/pose', 10)
         for publisher in (voltage, drive, pose):
-            g.wait(lambda p=publisher: p.get_subscription_count() == 1, what=publisher.topic_name)
+            g.wait(lambda p=publisher: p.get_subscription_count() == 1, publisher.topic_name)
         drive.publish(to_message(pair(0)[0]))
         pose.publish(JointState(name=['x'], position=[1.0]))
 
@@ -238,9 +234,9 @@ def test_other_topics_types_and_qos(tmp_path):
             voltage.publish(to_message(pair(0)[0]))
             return int(g.status('recorder')['messages'] or 0) > 5
 
-        g.wait(both, what='messages')
+        g.wait(both, 'messages')
         assert g.call('recorder/stop')[0]
-        g.wait(lambda: g.status('recorder')['state'] == 'done', what='closed bag')
+        g.wait(lambda: g.status('recorder')['state'] == 'done', 'closed bag')
     got = contents(tmp_path / 'bag')
     assert set(got) == {'/voltage', '/lab/drive', '/else/pose'}
     assert len(got['/lab/drive']) == len(got['/else/pose']) == 1
@@ -254,16 +250,5 @@ def test_other_topics_types_and_qos(tmp_path):
 def test_bad_topic_names_end_the_node(tmp_path):
     with Graph() as g:
         recorder = g.start('recorder', {'topics': ['volt age']}, wait=False)
-        assert recorder.process.wait(40) == 2
+        assert recorder.process.wait(60) == 2
         assert 'is no name of a topic' in recorder.log
-
-
-def test_the_configuration_is_declared():
-    root = Path(__file__).resolve().parents[2]
-    for node in ('recorder', 'player'):
-        (section,) = yaml.safe_load((root / 'config' / f'{node}.yaml').read_text()).values()
-        defaults = {
-            d.name: list(d.default) if isinstance(d.default, tuple) else d.default
-            for d in NODES[node]
-        }
-        assert section['ros__parameters'] == defaults

@@ -1,0 +1,82 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Starts every node of an install space, sees it get up with its configuration, and ends it.
+
+    . install/setup.bash && python .ci/installed_nodes.py install/piezo_ident
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+
+#: states of a node that is up
+UP = ('idle', 'waiting')
+START_LIMIT, END_LIMIT = 60.0, 5.0
+
+
+def see(client, space: Path, executable: str, log: Path) -> None:
+    """Start a node, wait for its status, and end it."""
+    command = [
+        str(space / 'lib/piezo_ident' / executable),
+        '--ros-args',
+        '--params-file',
+        str(space / f'share/piezo_ident/config/{executable}.yaml'),
+    ]
+    client.follow(executable)
+    with log.open('wb') as out:
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=log.parent)
+    try:
+        client.wait(
+            lambda: client.status(executable).get('state') in UP or process.poll() is not None,
+            START_LIMIT,
+            executable,
+        )
+        process.send_signal(signal.SIGINT)
+        code = process.wait(END_LIMIT)
+    finally:
+        process.kill()
+    said = log.read_text(encoding='utf-8', errors='replace').strip()
+    if code or said:
+        sys.exit(f'{executable}: exit code {code}: {said}')
+    sys.stdout.write(f'{executable}: {client.status(executable)["state"]}, exit code {code}\n')
+
+
+def main() -> None:
+    """See them all."""
+    space = Path(sys.argv[1]).resolve()
+    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    import piezo_ident
+
+    if not Path(piezo_ident.__file__).is_relative_to(space):
+        sys.exit(f'{piezo_ident.__file__} is not below {space}; source its setup first')
+    from piezo_ident.nodes.client import Client
+    from piezo_ident.nodes.parameters import NODES
+
+    with tempfile.TemporaryDirectory() as folder, Client() as client:
+        for executable in NODES:
+            see(client, space, executable, Path(folder, f'{executable}.log'))
+
+
+if __name__ == '__main__':
+    main()

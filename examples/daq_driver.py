@@ -1,0 +1,98 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A DAQ card in the place of the node `stage`, with all that whoever drives an amplifier owes."""
+
+import sys
+import time
+
+import numpy as np
+from piezo_ident.errors import DataError
+from piezo_ident.follower import Follower, Kind
+from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.wire import from_message, STREAM, to_message
+from piezo_ident.wire_format import Samples
+from std_msgs.msg import Float64MultiArray
+
+RATE = 20_000.0  # Hz, the clock of the card
+PERIOD = 0.01  # s, of what is sent while nobody commands
+LIMITS = ('voltage_low', 'voltage_high', 'slew', 'ramp_slew', 'rest')
+
+
+def convert(v: np.ndarray) -> np.ndarray:
+    """Put v [V] out, and return the displacement [m] that was read on the same ticks."""
+    return 7.5e-6 * v  # your card's call; it may wait until the samples are out
+
+
+class Driver(LabNode):
+    """Publishes what the amplifier got and what the stage did, block by block."""
+
+    executable = 'stage'  # whose name, parameters and config/stage.yaml it takes over
+
+    def __init__(self) -> None:
+        super().__init__()
+        settings = GuardSettings(*(self.values[name] for name in LIMITS), RATE)
+        Guard(settings).process([np.nan])  # compiles what the first block would wait for
+        self.guard = Guard(settings)
+        self.follower = Follower(RATE, self.values['silence'])
+        self.tick, self.heard = 0, time.monotonic()
+        self.y = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
+        self.applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
+        self.v = self.create_subscription(Float64MultiArray, 'voltage', self._on_block, STREAM)
+        self.create_timer(PERIOD, self._on_timer)
+
+    def _on_block(self, message: Float64MultiArray, info: dict) -> None:
+        number = info.get('publication_sequence_number')
+        try:
+            samples = from_message(message)
+        except DataError as error:
+            self.follower.skip(number)
+            return self.report_status('running', 0.0, f'refused: {error}', WARN)
+        verdict = self.follower.judge(samples, number, self.v.get_publisher_count())
+        if not verdict.is_taken:  # of a second publisher, or one that came before, or too late
+            return self.report_status('running', 0.0, f'refused: {verdict.reason}', WARN)
+        self.heard = time.monotonic()
+        if verdict.kind is Kind.GAP:  # for so long the voltage stayed where it was
+            self._move(self.guard.hold(verdict.missing), 'hold:gap')
+        self.tick = verdict.tick  # so that both topics carry the t of the command
+        applied = self.guard.process(samples.values, restarted=verdict.kind is Kind.START)
+        y = self._move(applied.voltage, samples.segment)
+        self.y.publish(to_message(Samples(samples.t, y, samples.segment, 'displacement')))
+        level, said = (WARN, dict(applied.altered)) if applied.altered else (OK, samples.segment)
+        self.report_status('running', 0.0, f'{said}', level)
+
+    def _move(self, v: np.ndarray, segment: str) -> np.ndarray:
+        y, t = convert(v), np.arange(self.tick, self.tick + v.size) / RATE
+        self.tick += v.size
+        self.applied.publish(to_message(Samples(t, v, segment)))
+        return y
+
+    def _on_timer(self) -> None:
+        if time.monotonic() - self.heard > self.values['silence']:
+            self.follower.lose()  # what comes next is a new stream, and joined by a ramp
+            if not self.guard.is_at_rest:
+                self._move(self.guard.idle(round(PERIOD * RATE)), 'ramp:silence')
+                self.report_status('ramping', 0.0, 'no voltage: ramping to rest', WARN)
+
+    def close(self) -> None:
+        """Be at rest before the node ends."""
+        while not self.guard.is_at_rest:
+            self._move(self.guard.idle(round(PERIOD * RATE), 0.7), 'ramp:stop')
+            time.sleep(PERIOD)
+
+
+if __name__ == '__main__':
+    sys.exit(run(Driver))

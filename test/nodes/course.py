@@ -1,0 +1,156 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What tests play and compare: a short programme, its blocks, the stage's answer, models as numbers.
+
+Blocks are large, so that a whole record fits into the queues of its readers, whatever else the
+machine does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+import itertools
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.model import StageModel
+from piezo_ident.model_io import model_from_dict, parse_yaml
+from piezo_ident.program import parse_program
+from piezo_ident.record import Record
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.wire_format import cut_blocks, Samples
+import yaml
+
+FS = 20_000.0
+#: three seconds with all that the three steps stand on
+PROGRAM = """
+limits: [0, 10]
+sample_rate: 20000
+seed: 1
+rest: 0
+slew: 40
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 8, frequency: 20}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
+  - {signal: triangle, slope: 40}
+  - {signal: idle, duration: 0.1}
+"""
+#: a second of this and that
+SHORT = """
+limits: [0, 10]
+slew: 50
+segments:
+  - {signal: idle, duration: 0.05}
+  - {signal: step, bias: 5, size: 1, hold: 0.0501, count: 3}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 0.3}
+  - {signal: sine, bias: 5, amplitude: 5, frequency: 50, duration: 0.4}
+"""
+#: near the upper limit for long enough to be stopped there
+HIGH = """
+limits: [0, 10]
+slew: 200
+segments:
+  - {signal: hold, level: 9, duration: 120}
+"""
+#: parameters of an identifier that is quick
+SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'thresholds': '10'}
+#: the same for one that may take what it can get of the machine
+QUICK = {**SETTINGS, 'nice': 0}
+SIZE = 1000
+
+
+def paper(**changes: object) -> str:
+    """Return the YAML of the paper's stage as a model."""
+    data = yaml.safe_load(find_config('paper', 'stage').read_text())
+    data.pop('sensor')
+    data.pop('seed')
+    return yaml.safe_dump({**data, **changes})
+
+
+def model_of(text: str) -> StageModel:
+    """Return the model in a text."""
+    return model_from_dict(parse_yaml(text, 'test'))
+
+
+def numbers(model: StageModel) -> NDArray[np.float64]:
+    """Return all parameters of a model."""
+    h, g, s = model.hysteresis, model.dynamics, model.scaling
+    single = [h.p1, h.p2, s.v0, s.V, s.y0, s.Y, model.delay.total]
+    return np.concatenate([h.thresholds, h.weights, single, g.a, g.b])
+
+
+def block(
+    tick: int, values: ArrayLike, segment: str = 'hold', quantity: str = 'voltage'
+) -> Samples:
+    """Return a block from a tick on."""
+    x = np.asarray(values, dtype=np.float64)
+    return Samples(np.arange(tick, tick + x.size) / FS, x, segment, quantity)
+
+
+def level(value: float, blocks: int, tick: int = 0, segment: str = 'hold') -> list[Samples]:
+    """Return blocks of 100 samples of a constant voltage."""
+    return [block(tick + 100 * k, np.full(100, value), segment) for k in range(blocks)]
+
+
+def column(blocks: Iterable[Samples]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return t and values of blocks in one piece."""
+    several = list(blocks)
+    return np.concatenate([b.t for b in several]), np.concatenate([b.values for b in several])
+
+
+def cut(samples: Samples, *at: int) -> list[Samples]:
+    """Return a block cut into smaller ones."""
+    edges = [0, *at, samples.t.size]
+    return [
+        replace(samples, t=samples.t[a:b], values=samples.values[a:b])
+        for a, b in itertools.pairwise(edges)
+    ]
+
+
+def voltage_of(program: str, size: int = SIZE) -> list[Samples]:
+    """Return the blocks of a programme."""
+    sequence = parse_program(program).build(FS)
+    return [
+        block(a, sequence.v[a:b], label)
+        for a, b, label in cut_blocks(sequence.n, sequence.segments, size)
+    ]
+
+
+def simulated(program: str = PROGRAM, seed: int = 1) -> Record:
+    """Return what the paper's stage answers."""
+    stage = load_stage(find_config('paper', 'stage'))
+    return simulate(stage, parse_program(program).build(), np.random.default_rng(seed))
+
+
+def pairs_of(record: Record, size: int = SIZE) -> list[tuple[Samples, Samples]]:
+    """Return (voltage, displacement) of each block of a record of one piece."""
+    (piece,) = record
+    return [
+        (
+            Samples(piece.t[a:b], piece.v[a:b], label, 'voltage'),
+            Samples(piece.t[a:b], piece.y[a:b], label, 'displacement'),
+        )
+        for a, b, label in cut_blocks(piece.n, piece.segments, size)
+    ]
+
+
+def first_of(blocks: Sequence[Samples], segment: str) -> int:
+    """Return which block begins a segment."""
+    return next(i for i, b in enumerate(blocks) if b.segment == segment)

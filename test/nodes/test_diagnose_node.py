@@ -1,0 +1,272 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+A stage lacks something that nobody tells the identifier: it finds out on the running graph.
+
+Two stages in two namespaces, one that creeps, one whose hysteresis depends on the rate, are
+identified and then diagnosed from nothing: what data that takes, the identifier asks for.
+"""
+
+import json
+import time
+
+from course import FS, paper, PROGRAM, SETTINGS
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from graph import Graph
+from piezo_ident.model_io import load_model, model_from_dict, parse_yaml
+from piezo_ident.program import parse_program
+from piezo_ident.shipped import find_config
+import yaml
+
+TRUTHS = ('creep', 'rate_dependent_hysteresis')
+#: eight seconds with two amplitudes, minor loops and a multisine, but no hold
+SWEEPS = """
+limits: [0, 10]
+seed: 3
+slew: 80
+segments:
+  - {signal: idle, duration: 1}
+  - {signal: sine, name: 1Hz-first, bias: 5, amplitude: 5, frequency: 1, periods: 2}
+  - {signal: sine, name: 80Hz-large, bias: 5, amplitude: 4.5, frequency: 80, duration: 0.4}
+  - {signal: sine, name: 80Hz-small, bias: 5, amplitude: 1.5, frequency: 80, duration: 0.4}
+  - {signal: minor_loops, biases: [2.5, 5, 7.5], amplitude: 1.5, cycles: 1, slope: 40}
+  - signal: multisine
+    bias: 5
+    amplitude: 4.5
+    lowest: 2
+    highest: 200
+    period: 0.5
+    periods: 2
+  - {signal: sine, name: 1Hz-last, bias: 5, amplitude: 5, frequency: 1, periods: 1}
+  - {signal: idle, duration: 1}
+"""
+#: nine seconds, most of them at rest
+HOLDS = """
+limits: [0, 10]
+slew: 200
+segments:
+  - {signal: idle, duration: 1}
+  - {signal: hold, level: 5, duration: 1}
+  - {signal: hold, level: 10, duration: 3}
+  - {signal: hold, level: 5, duration: 2}
+  - {signal: idle, duration: 2}
+"""
+IDENTIFIER = {
+    **SETTINGS,
+    'program': PROGRAM,
+    'sweeps_program': SWEEPS,
+    'holds_program': HOLDS,
+    'excitation_limit': 5.0,
+    'nice': 0,
+}
+#: two diagnoses at once, on a machine that does other things [s]
+LONG = 240.0
+ENDS = ('done', 'failed', 'cancelled')
+
+
+def stage_with(effect, folder):
+    """Write a stage that has one of the effects of the shipped one, and return its path."""
+    data = yaml.safe_load(find_config('effects', 'stage').read_text())
+    data['effects'] = [e for e in data['effects'] if e['name'] == effect]
+    path = folder / f'{effect}.yaml'
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
+
+
+@pytest.fixture(scope='module')
+def lab(tmp_path_factory):
+    """Return a graph with both stages, the identifiers and all that they need."""
+    folder = tmp_path_factory.mktemp('stages')
+    with Graph() as g:
+        g.start_all(
+            *(
+                (node, params, truth)
+                for truth in TRUTHS
+                for node, params in (
+                    ('stage', {'stage': stage_with(truth, folder), 'seed': 3}),
+                    ('excitation', {'rate_factor': 0.0, 'subscribers': 3}),
+                    ('identifier', IDENTIFIER),
+                    ('model', {}),
+                )
+            )
+        )
+        for truth in TRUTHS:
+            g.matched(f'{truth}/residual')
+            g.texts(f'{truth}/model')
+            g.texts(f'{truth}/report')
+        yield g
+
+
+def begin(g, truth, service):
+    """Call a service of an identifier, and return how much of its status was heard before."""
+    seen = len(g.statuses(f'{truth}/identifier'))
+    ok, message = g.call(f'{truth}/identifier/{service}')
+    assert ok, message
+    return seen
+
+
+def end_of(g, truth, seen, timeout=LONG):
+    """Wait for the end of what an identifier does, and return all that it said until then."""
+    said = g.statuses(f'{truth}/identifier')
+    g.wait(lambda: any(s['state'] in ENDS for s in said[seen:]), f'end of {truth}', timeout)
+    last = next(i for i, s in enumerate(said) if i >= seen and s['state'] in ENDS)
+    return said[seen : last + 1]
+
+
+def rms(blocks):
+    """Return the rms of a residual in % of the stroke of 71 um."""
+    e = np.concatenate([b.values for b in blocks])
+    return 100.0 * float(np.sqrt(np.mean(e**2))) / 71e-6
+
+
+def play(g, truth, program):
+    """Have a programme played while nobody asks for it, and return its residual."""
+    residual = g.collect(f'{truth}/residual')
+    samples = len(residual)
+    assert g.set(f'{truth}/excitation', 'program', program) == (True, '')
+    seen = len(g.statuses(f'{truth}/excitation'))
+    assert g.call(f'{truth}/excitation/start')[0]
+    said = g.statuses(f'{truth}/excitation')
+    g.wait(lambda: any(s['state'] == 'done' for s in said[seen:]), 'the programme')
+    end = parse_program(program).build(FS).duration
+    g.wait(lambda: abs(residual[-1].t[-1] - end) < 2 / FS, 'its last residual')
+    return residual[samples:]
+
+
+@pytest.fixture(scope='module')
+def stories(lab):
+    """Return what each identifier said from ~/diagnose on; both were only told to ~/run."""
+    for truth in TRUTHS:
+        ok, reason = lab.call(f'{truth}/identifier/diagnose')
+        assert not ok and 'there is no model to judge; call ~/run' in reason
+    for truth, seen in [(truth, begin(lab, truth, 'run')) for truth in TRUTHS]:
+        assert end_of(lab, truth, seen)[-1]['state'] == 'done'
+        lab.wait(lambda truth=truth: lab.texts(f'{truth}/model'), 'the model')
+        taken = lambda truth=truth: lab.status(f'{truth}/model')['state'] == 'predicting'  # noqa: E731
+        lab.wait(taken, 'the model to be taken over')
+    begun = time.monotonic()
+    told = [(truth, begin(lab, truth, 'diagnose')) for truth in TRUTHS]
+    found = {truth: end_of(lab, truth, seen) for truth, seen in told}
+    print(f'both diagnoses: {time.monotonic() - begun:.0f} s')
+    return found
+
+
+@pytest.mark.parametrize('truth', TRUTHS)
+def test_it_asks_for_what_it_lacks_and_tells_creep_from_rate_dependence(lab, stories, truth):
+    said = stories[truth]
+    assert said[-1]['state'] == 'done', said[-1]
+    exciting = [s['message'] for s in said if s['state'] == 'exciting']
+    # how much was captured follows
+    asked = list(dict.fromkeys(': '.join(m.split(': ')[:2]) for m in exciting))
+    print(truth, asked, said[-1]['message'])
+    assert [a.split(':')[0] for a in asked] == ['asking for sweeps', 'asking for holds']
+    assert 'no motion was captured beside' in asked[0]
+    assert truth in asked[1] and 'without a hold of at least 2 s after a step' in asked[1]
+    assert {s['state'] for s in said} == {'exciting', 'diagnosing', 'done'}
+    report = json.loads(lab.texts(f'{truth}/report')[-1])
+    assert report['records'] == ['capture 1', 'capture 2']
+    assert (report['verdict'], [e['name'] for e in report['effects']]) == ('named', [truth])
+    assert said[-1]['message'] == report['sentence'].rstrip('.')
+    error = report['error']
+    assert error['after']['overall'] < 0.3 * error['before']['overall']
+
+
+@pytest.mark.parametrize('truth', TRUTHS)
+def test_the_residual_falls_when_the_refined_model_is_taken_over(lab, stories, truth):
+    models = lab.texts(f'{truth}/model')
+    assert len(models) == 2
+    first, refined = (model_from_dict(parse_yaml(text, truth)) for text in models)
+    assert not first.effects and [e.name for e in refined.effects] == [truth]
+    lab.wait(lambda: lab.status(f'{truth}/model')['models'] == '2', 'the refined model')
+    residual = lab.collect(f'{truth}/residual')
+    starts = [i for i, b in enumerate(residual) if b.t[0] == 0.0]
+    # sweeps and holds were played with the first model
+    before = rms(residual[starts[-2] : starts[-1]])
+    after = rms(play(lab, truth, SWEEPS))
+    print(f'{truth}: residual {before:.3f} -> {after:.3f} % of stroke')
+    assert after < 0.5 * before
+
+
+def test_save_writes_both_reports(lab, stories, tmp_path):
+    truth = TRUTHS[1]
+    assert lab.set(f'{truth}/identifier', 'output', str(tmp_path / 'out'))[0]
+    last = end_of(lab, truth, begin(lab, truth, 'save'))[-1]
+    assert last['state'] == 'done' and last['message'].count('report.html') == 2, last
+    folder = tmp_path / 'out'
+    assert not load_model(folder / 'model.yaml').effects
+    assert [e.name for e in load_model(folder / 'diagnosis/model.yaml').effects] == [truth]
+    written = json.loads((folder / 'diagnosis/diagnosis.json').read_text())
+    assert written == json.loads(lab.texts(f'{truth}/report')[-1])
+    assert (folder / 'diagnosis/report.html').is_file()
+
+
+def test_cancel_stops_the_work_and_changes_nothing(lab, stories):
+    truth = TRUTHS[0]
+    node = f'{truth}/identifier'
+    models, reports = len(lab.texts(f'{truth}/model')), len(lab.texts(f'{truth}/report'))
+    seen = begin(lab, truth, 'diagnose')
+    lab.wait(lambda: lab.status(node)['message'] == 'candidates', 'the candidates')
+    ok, reason = lab.call(f'{node}/diagnose')
+    assert not ok and 'busy: diagnosis' in reason
+    asked = time.monotonic()
+    assert lab.call(f'{node}/cancel')[0]
+    last = end_of(lab, truth, seen)[-1]
+    print(f'cancelled in {time.monotonic() - asked:.2f} s')
+    assert last['state'] == 'cancelled' and 'nothing was changed' in last['message']
+    assert len(lab.texts(f'{truth}/model')) == models
+    assert len(lab.texts(f'{truth}/report')) == reports
+
+
+def test_cancel_ramps_what_was_asked_for_to_rest(lab, stories):
+    truth = TRUTHS[0]
+    node, drive = f'{truth}/identifier', f'{truth}/excitation'
+    assert lab.call(f'{node}/clear')[0]
+    assert lab.set(drive, 'rate_factor', 1.0) == (True, '')
+    begin(lab, truth, 'diagnose')
+    lab.wait(lambda: lab.status(drive).get('segment') == 'sine:1Hz-first', 'the sine')
+    assert lab.call(f'{node}/cancel')[0]
+    lab.wait(lambda: lab.status(node)['state'] == 'cancelled', 'cancelled')
+    lab.wait(lambda: lab.status(drive)['state'] == 'stopped', 'stopped')
+    assert lab.call(f'{node}/clear')[0]
+    assert lab.set(node, 'requests', 0) == (True, '')
+    ok, reason = lab.call(f'{node}/diagnose')
+    assert not ok and 'nothing was captured' in reason and 'no more than 0 requests' in reason
+
+
+def test_a_model_file_can_be_judged_too(lab, tmp_path):
+    file = tmp_path / 'model.yaml'
+    file.write_text(paper())
+    lab.start('identifier', {'model': str(file), 'excitation_limit': 1.0}, 'alone')
+    ok, reason = lab.call('alone/identifier/diagnose')
+    assert not ok and 'nothing was captured' in reason
+    assert 'no excitation and stage are there to be asked' in reason
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'reason'),
+    [
+        ('model', '/nowhere.yaml', 'no such file'),
+        ('sweeps_program', ' ', 'must not be empty'),
+        ('requests', 11, 'requests'),
+    ],
+)
+def test_bad_parameters_are_refused(lab, name, value, reason):
+    ok, said = lab.set(f'{TRUTHS[0]}/identifier', name, value)
+    assert not ok and reason in said

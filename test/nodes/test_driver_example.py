@@ -1,0 +1,151 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The driver of the documentation in the place of the stage, and what it guarantees."""
+
+from pathlib import Path
+import signal
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from graph import Graph, Handle
+from piezo_ident.wire_format import Samples
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / 'examples/daq_driver.py'
+FS = 20_000.0
+SILENCE, RAMP = 1.0, 20.0
+PROGRAM = """
+limits: [0, 10]
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: sine, bias: 5, amplitude: 4, frequency: 5, duration: 0.4}
+"""
+
+
+@pytest.fixture
+def lab():
+    with Graph() as g:
+        for topic in ('displacement', 'applied_voltage'):
+            g.collect(topic)
+        command = [sys.executable, str(EXAMPLE), '--ros-args', '-p', f'silence:={SILENCE}']
+        g.follow('stage', 'stage')
+        g.handles.append(Handle(g, 'stage', command, g.folder / 'driver.log'))
+        g.wait(lambda: g.statuses('stage'), 'the driver')
+        for topic in ('displacement', 'applied_voltage'):
+            g.matched(topic)
+        yield g
+
+
+def column(blocks: list[Samples], name: str = 'values') -> np.ndarray:
+    return np.concatenate([getattr(b, name) for b in blocks] or [np.empty(0)])
+
+
+def block(tick: int, v: np.ndarray | float, n: int = 100, segment: str = 'hold') -> Samples:
+    return Samples(np.arange(tick, tick + n) / FS, np.full(n, 0.0) + v, segment)
+
+
+def send(g: Graph, volts: list[float]) -> None:
+    """Publish blocks of a hundred samples from t = 0 on, no faster than they are answered."""
+    y = g.collect('displacement')
+    want = len(y)
+    for k, v in enumerate(volts):
+        g.publish('voltage', block(100 * k, v))
+        want += 1
+        if k % 20 == 19:
+            g.wait(lambda n=want: len(y) == n, 'answers')
+
+
+def at_rest(g: Graph) -> bool:
+    applied = g.collect('applied_voltage')
+    return bool(applied) and applied[-1].values[-1] == 0.0
+
+
+def test_a_programme_is_followed_bit_by_bit(lab):
+    lab.start('identifier')
+    lab.start('excitation', {'program': PROGRAM, 'subscribers': 2})
+    voltage = lab.collect('voltage')
+    assert lab.call('excitation/start')[0]
+    lab.wait(lambda: lab.status('excitation')['state'] == 'done', 'the programme')
+    applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
+    lab.wait(lambda: len(applied) == len(y) == len(voltage), 'all answers')
+    assert [b.segment for b in y] == [b.segment for b in voltage]
+    assert column(applied).tobytes() == column(voltage).tobytes()
+    for back in (applied, y):
+        assert column(back, 't').tobytes() == column(voltage, 't').tobytes()
+    np.testing.assert_array_equal(column(y), 7.5e-6 * column(voltage))
+    seconds = f'{column(voltage).size / FS:.3f} s'
+    lab.wait(
+        lambda: lab.status('identifier')['message'].count(seconds) >= 2, 'both streams captured'
+    )
+
+
+def test_silence_and_what_comes_after_it(lab):
+    applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
+    # up by a ramp, too high, and then nothing more
+    send(lab, [9.0] * 60 + [11.0] * 20)
+    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'silence')
+    lab.wait(lambda: at_rest(lab), 'rest')
+    v = column(applied)
+    assert v.max() <= 10.0
+    # no sample is faster than the ramps allow but where the stream itself steps from 9 V to 10 V
+    steps = np.abs(np.diff(v)) * FS
+    assert np.count_nonzero(steps > 1.01 * RAMP) == 1
+    assert {b.segment for b in applied} == {'hold', 'ramp:silence'}
+    assert len(y) == 80
+    # t goes on without a gap, so that the two topics join
+    np.testing.assert_allclose(np.diff(column(applied, 't')), 1 / FS, rtol=1e-6)
+    # a new stream at 5 V is joined by a ramp
+    before = v.size
+    send(lab, [5.0] * 160)
+    joined = column(applied)[before:]
+    assert np.abs(np.diff(joined)).max() * FS <= 1.01 * RAMP
+    assert joined[:16_000][-1] == 5.0
+
+
+def test_a_second_publisher_is_refused(lab):
+    y = lab.collect('displacement')
+    lab.start('excitation', {'program': PROGRAM.replace('0.4', '5.0'), 'subscribers': 1})
+    assert lab.call('excitation/start')[0]
+    lab.wait(lambda: len(y) > 40, 'a stream')
+    for k in range(5):
+        lab.publish('voltage', block(10_000_000 + 100 * k, 0.5, segment='foreign'))
+    lab.wait(
+        lambda: any('second publisher' in s['message'] for s in lab.statuses('stage')), 'refusal'
+    )
+    seen = len(y)
+    lab.wait(lambda: len(y) > seen + 40, 'the stream going on')
+    assert 'foreign' not in {b.segment for b in y}
+    assert np.all(np.diff(column(y, 't')) > 0)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_at_rest(lab, number):
+    send(lab, [9.0] * 100)
+    (driver,) = lab.handles
+    driver.send(number)
+    assert driver.process.wait(20.0) == 0 and driver.log == ''
+    lab.wait(lambda: at_rest(lab), 'rest')
+
+
+def test_the_page_shows_this_file():
+    page = (ROOT / 'docs/driver.md').read_text(encoding='utf-8')
+    code = EXAMPLE.read_text(encoding='utf-8').partition('limitations under the License.\n')[2]
+    shown = page.partition('```python\n')[2].partition('```')[0]
+    assert shown.strip() == code.strip()

@@ -1,0 +1,122 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""SIGINT and SIGTERM end every node in two seconds whatever it does, with the drive at rest."""
+
+import signal
+import time
+
+from course import block, column, FS, HIGH, level, pairs_of, paper, SETTINGS, simulated
+from graph import alive, Graph, in_time
+import numpy as np
+from piezo_ident.bag_io import read_bag, write_bag
+from piezo_ident.bag_recovery import is_unfinished
+import pytest
+
+#: how soon a node has to be gone [s]
+PROMISED = 2.0
+
+
+def end(g: Graph, number: int) -> None:
+    """Send a signal to all nodes at once, and see that each ends in time with exit code 0."""
+    begin, took = time.monotonic(), {}
+    for handle in g.handles:
+        handle.send(number)
+
+    def look() -> bool:
+        for handle in g.handles:
+            if handle.name not in took and handle.process.poll() is not None:
+                took[handle.name] = time.monotonic() - begin
+        return len(took) == len(g.handles)
+
+    g.wait(look, 'the end of all nodes')
+    for handle in g.handles:
+        assert handle.process.returncode == 0, (handle.name, handle.log)
+        assert handle.log == '', handle.name
+        in_time(took[handle.name], PROMISED, f'{handle.name} after signal {number}')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_in_the_middle_of_everything(number, tmp_path):
+    record = simulated()
+    write_bag(record, tmp_path / 'old')
+    (tmp_path / 'model.yaml').write_text(paper())
+    storage = 'mcap' if number == signal.SIGINT else 'sqlite3'
+    with Graph() as g:
+        applied, fed = g.collect('applied_voltage'), g.collect('fed/applied_voltage')
+        voltage, slow = g.collect('voltage'), g.collect('slow/voltage')
+        prediction, replayed = g.collect('prediction'), g.collect('replay/voltage')
+        g.start_all(
+            ('excitation', {'program': HIGH, 'subscribers': 4, 'block_size': 500}),
+            ('stage', {'seed': 3}),
+            ('model', {'model': str(tmp_path / 'model.yaml')}),
+            ('recorder', {'output': str(tmp_path / 'new'), 'storage': storage, 'autostart': True}),
+            # ramps of their own that are too slow for a node that has to end
+            ('excitation', {'program': HIGH, 'ramp_slew': 0.5, 'block_size': 500}, 'slow'),
+            ('stage', {'ramp_slew': 1.0, 'silence': 600.0}, 'fed'),
+            ('identifier', {**SETTINGS, 'thresholds': '100', 'swarm_iterations': 10**7}, 'busy'),
+            (
+                'player',
+                {
+                    'bag': str(tmp_path / 'old'),
+                    'rate': 0.01,
+                    'topics': ['voltage'],
+                    'autostart': True,
+                },
+                'replay',
+            ),
+        )
+        for pair in pairs_of(record):
+            for b in pair:
+                g.publish(f'busy/{b.quantity}', b)
+            time.sleep(0.005)
+        g.wait(lambda: '3.370 s of displacement' in g.status('busy/identifier')['message'], 'data')
+        assert g.call('busy/identifier/identify')[0]
+        for where in ('', 'slow/'):
+            assert g.call(f'{where}excitation/start')[0]
+        for b in [block(0, np.linspace(0, 10, 10_000)), *level(10.0, 3, 10_000)]:
+            g.publish('fed/voltage', b)
+        g.wait(lambda: slow and slow[-1].values[-1] == 9.0, 'the slow one at 9 V')
+        assert g.call('slow/excitation/stop')[0]
+        g.wait(lambda: slow[-1].segment == 'ramp:stop', 'the slow ramp')
+        g.wait(lambda: fed and fed[-1].values[-1] == 10.0, 'the other stage at 10 V')
+        g.wait(lambda: applied and applied[-1].values[-1] == 9.0, '9 V')
+        g.wait(lambda: prediction and replayed, 'model and player at work')
+        g.wait(lambda: g.status('busy/identifier')['message'] == 'hysteresis', 'the swarm')
+        g.wait(lambda: int(g.status('recorder')['messages']) > 20, 'the recorder at work')
+        helpers = g.handle('busy/identifier').children()
+        assert helpers
+        end(g, number)
+        for stream in (voltage, slow, applied, fed):
+            g.wait(lambda s=stream: s[-1].values[-1] == 0.0, 'rest')
+        for stream in (voltage, slow, fed):
+            t, v = column(stream)
+            assert stream[-1].segment == 'ramp:stop'
+            assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
+            assert np.abs(np.diff(v)).max() * FS < 201.0
+        assert np.abs(np.diff(column(applied)[1])).max() * FS < 201.0
+        for node, state in (('busy/identifier', 'cancelled'), ('replay/player', 'stopped')):
+            g.wait(lambda n=node, s=state: g.status(n)['state'] == s, f'{node} to be {state}')
+        g.wait(lambda: not any(alive(pid) for pid in helpers), 'the end of the helper')
+    assert not is_unfinished(tmp_path / 'new')
+    kept = read_bag(tmp_path / 'new')
+    assert kept.n > 0 and not [f for f in kept.faults if f.name == 'truncated_bag']
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_at_rest(number):
+    with Graph() as g:
+        nodes = ('excitation', 'stage', 'identifier', 'model', 'recorder', 'player')
+        g.start_all(*((node,) for node in nodes))
+        end(g, number)

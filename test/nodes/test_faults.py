@@ -1,0 +1,453 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Faults of the stream on the running graph: each is said, and none makes a model in silence."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import json
+import re
+import signal
+
+from course import (
+    block,
+    column,
+    cut,
+    first_of,
+    FS,
+    model_of,
+    PROGRAM,
+    QUICK,
+    voltage_of,
+)
+from graph import alive, Graph
+import numpy as np
+from piezo_ident.nodes.wire import STREAM, to_message
+from piezo_ident.wire_format import Samples
+import pytest
+from std_msgs.msg import Float64MultiArray
+
+BLOCKS = voltage_of(PROGRAM)
+#: a block in the middle of the noise
+K = first_of(BLOCKS, 'noise') + 8
+#: blocks under way at once; more of this size do not fit into the middleware's shared memory
+AHEAD = 10
+
+
+def captured(g: Graph, name: str = 'identifier') -> dict[str, float]:
+    """Return the seconds of each topic that an identifier says it has."""
+    # at the end of a work, the status is about that
+    idle = g.status(name)['state'] == 'idle'
+    text = g.status(name)['message'] if idle else g.diagnostics(name).get('topics', '')
+    found = re.findall(r'([0-9.]+) s of (\w+)', text)
+    return {key: float(seconds) for seconds, key in found}
+
+
+def warned(g: Graph, node: str, said: str, since: int) -> None:
+    """Wait for a warning in the status of a node."""
+    g.wait(
+        lambda: any(said in s['message'] and s['level'] != '0' for s in g.statuses(node)[since:]),
+        f'{node} to say {said!r}',
+    )
+
+
+def identified(g: Graph, name: str = 'identifier') -> dict[str, str]:
+    """Identify, and return the status at the end."""
+    seen = len(g.statuses(name))
+    ok, reason = g.call(f'{name}/identify')
+    assert ok, reason
+    ends = ('done', 'failed', 'cancelled')
+    g.wait(lambda: any(s['state'] in ends for s in g.statuses(name)[seen:]), 'the end of the work')
+    return g.status(name)
+
+
+class Rig:
+    """Stage, identifier and model; the test plays the excitation."""
+
+    def __init__(self, g: Graph) -> None:
+        self.g = g
+        self.answers = g.collect('displacement')
+        self.applied = g.collect('applied_voltage')
+        self.prediction = g.collect('prediction')
+        self.models, self.reports = g.texts('model'), g.texts('report')
+        g.start_all(('stage', {'seed': 3}), ('identifier', QUICK), ('model',))
+        self.rest(clear=False)
+        self.meet()
+
+    def meet(self, tick: int = 0, volts: float = 0.0) -> int:
+        """Keep a voltage until everybody hears everybody; return the tick from which to go on."""
+        before, since = captured(self.g), len(self.g.diagnoses('model'))
+
+        def met() -> bool:
+            now = captured(self.g)
+            return len([k for k in now if now[k] > before.get(k, 0.0)]) == 3 and any(
+                float(d['rate']) > 0.0 for d in self.g.diagnoses('model')[since + 1 :]
+            )
+
+        self.g.wait(met, 'everybody to hear everybody', meanwhile=self.holding(tick, volts))
+        return self.answered()
+
+    def holding(self, tick: int, volts: float) -> Callable[[], None]:
+        """Return a function that sends the next block of a constant voltage."""
+        ticks = iter(range(tick, 10**9, 500))
+
+        def more() -> None:
+            self.sent.append(block(next(ticks), np.full(500, volts), 'hold:wait'))
+            self.g.publish('voltage', self.sent[-1])
+
+        return more
+
+    def answered(self) -> int:
+        """Wait for the answer to the last block, and return the next tick."""
+        last = self.sent[-1].t[-1]
+        self.g.wait(
+            lambda: self.answers and self.answers[-1].t[-1] == last == self.applied[-1].t[-1],
+            'the last answer',
+        )
+        return round(last * FS) + 1
+
+    def rest(self, *, clear: bool = True) -> None:
+        """Let the stage go to rest, and the identifier forget."""
+        g = self.g
+        assert g.set('stage', 'silence', 0.05)[0]
+        g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+        # from here on a test may take its time
+        assert g.set('stage', 'silence', 600.0)[0]
+        if clear:
+            assert g.call('identifier/clear')[0]
+        self.sent = []
+        self.begin = {key: len(self.heard(key)) for key in ('displacement', 'applied_voltage')}
+        self.since = {node: len(g.statuses(node)) for node in ('stage', 'identifier', 'model')}
+
+    def heard(self, key: str) -> list[Samples]:
+        return {'displacement': self.answers, 'applied_voltage': self.applied}[key]
+
+    def send(self, blocks: list[Samples], refused: int = 0) -> None:
+        """Send blocks no faster than they are answered; all but the refused ones are."""
+        before = len(self.answers)
+        for k, b in enumerate(blocks):
+            self.g.publish('voltage', b)
+            self.sent.append(b)
+            self.g.wait(lambda k=k: len(self.answers) > before + k - AHEAD, 'answers')
+        count = before + len(blocks) - refused
+        self.g.wait(lambda: len(self.answers) == count, f'{len(blocks) - refused} answers')
+
+    def settle(self) -> None:
+        """Wait until the identifier has all that was sent and answered."""
+        new = {key: self.heard(key)[begin:] for key, begin in self.begin.items()}
+        new['voltage'] = self.sent
+        wanted = {key: sum(b.t.size for b in blocks) / FS for key, blocks in new.items()}
+        self.g.wait(lambda: captured(self.g) == pytest.approx(wanted, abs=6e-4), f'{wanted}')
+
+    def warned(self, node: str, said: str) -> None:
+        warned(self.g, node, said, self.since[node])
+
+    def is_safe(self) -> None:
+        """See that what was applied kept to limits and slew."""
+        t, v = column(self.applied[self.begin['applied_voltage'] :])
+        assert v.min() >= 0.0 and v.max() <= 10.0
+        steps = np.abs(np.diff(v))[np.rint(np.diff(t) * FS) == 1]
+        assert steps.max() * FS <= 40_000.0 * (1 + 1e-9)
+
+
+@pytest.fixture(scope='module')
+def graph():
+    with Graph() as g:
+        yield Rig(g)
+
+
+@pytest.fixture
+def rig(graph):
+    graph.rest()
+    return graph
+
+
+def with_nan(samples: Samples, n: int = 100) -> Samples:
+    values = samples.values.copy()
+    values[300 : 300 + n] = np.nan
+    return replace(samples, values=values)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """
+    A fault of the stream, and what has to come of it.
+
+    Attributes
+    ----------
+    blocks : list
+        What is sent in place of `BLOCKS`.
+    said : dict
+        What the nodes say of it as it comes.
+    refused : int
+        Blocks that the stage does not take.
+    failure : str
+        The reason why no model is made; empty when one is made.
+    warnings : set of str
+        What the report names when one is made.
+    """
+
+    blocks: list[Samples]
+    said: dict[str, str]
+    refused: int = 0
+    failure: str = ''
+    warnings: frozenset[str] = frozenset()
+
+
+FAULTS = {
+    'nothing is wrong': Fault(BLOCKS, {}),
+    'another block size mid-stream': Fault(
+        [
+            *BLOCKS[:K],
+            *(c for b in BLOCKS[K : K + 5] for c in cut(b, 7, 340, 341)),
+            *BLOCKS[K + 5 :],
+        ],
+        {},
+    ),
+    'half a block is dropped': Fault(
+        [*BLOCKS[:K], *cut(BLOCKS[K], 500)[1:], *BLOCKS[K + 1 :]],
+        {
+            'stage': '500 samples are missing at t = 1.445 s',
+            'model': '500 samples of voltage are missing',
+            'identifier': '500 samples of voltage are missing',
+        },
+        warnings=frozenset({'gap'}),
+    ),
+    'three blocks are dropped': Fault(
+        [*BLOCKS[:K], *BLOCKS[K + 3 :]],
+        {
+            'stage': '3000 samples are missing at t = 1.57 s',
+            'model': '3000 samples of voltage are missing',
+            'identifier': '3000 samples of voltage are missing',
+        },
+        failure='of the noise segments are missing',
+    ),
+    'a block comes twice': Fault(
+        [*BLOCKS[: K + 1], *BLOCKS[K:]],
+        {
+            'stage': 'the block at t = 1.42 s came twice',
+            'model': 'samples at t = 1.42 s came again or out of turn',
+            'identifier': '1000 samples of voltage came twice or out of turn',
+        },
+        refused=1,
+        warnings=frozenset({'repeated_rows'}),
+    ),
+    'two blocks are swapped': Fault(
+        [*BLOCKS[:K], BLOCKS[K + 1], BLOCKS[K], *BLOCKS[K + 2 :]],
+        {
+            'stage': 'the block at t = 1.42 s came too late',
+            'model': '1000 samples of voltage are missing',
+            'identifier': '1000 samples of displacement are missing',
+        },
+        refused=1,
+        failure='of the noise segments are missing',
+    ),
+    'some samples are no numbers': Fault(
+        [*BLOCKS[:K], with_nan(BLOCKS[K]), *BLOCKS[K + 1 :]],
+        {
+            'stage': '100 samples are no numbers: the last command stays in force',
+            'model': 'the block of voltage at t = 1.42 s holds NaN or infinite numbers',
+        },
+        warnings=frozenset({'not_finite'}),
+    ),
+    'many samples are no numbers': Fault(
+        [*BLOCKS[:K], *(with_nan(b, 400) for b in BLOCKS[K : K + 3]), *BLOCKS[K + 3 :]],
+        {
+            'stage': '400 samples are no numbers: the last command stays in force',
+            'model': 'the block of voltage at t = 1.52 s holds NaN or infinite numbers',
+        },
+        failure='NaN or infinite',
+    ),
+}
+
+
+@pytest.mark.parametrize('name', FAULTS)
+def test_what_is_wrong_with_the_stream_is_said_and_makes_no_bad_model(rig, name):
+    fault = FAULTS[name]
+    models, reports = len(rig.models), len(rig.reports)
+    rig.send(fault.blocks, fault.refused)
+    for node, said in fault.said.items():
+        rig.warned(node, said)
+    rig.settle()
+    rig.is_safe()
+    if not fault.said:
+        for node in ('stage', 'identifier', 'model'):
+            assert {s['level'] for s in rig.g.statuses(node)[rig.since[node] + 1 :]} <= {'0'}, node
+    end = identified(rig.g)
+    if fault.failure:
+        assert end['state'] == 'failed' and end['level'] == '2'
+        assert fault.failure in end['message'] and '\n' not in end['message']
+        assert len(rig.models) == models and len(rig.reports) == reports
+        return
+    assert end['state'] == 'done', end
+    rig.g.wait(lambda: len(rig.models) > models and len(rig.reports) > reports, 'the model')
+    report, model = json.loads(rig.reports[-1]), model_of(rig.models[-1])
+    assert {f['name'] for f in report['data_faults']} == fault.warnings
+    assert end['level'] == ('1' if fault.warnings else '0')
+    for warning in fault.warnings:
+        assert any(warning in w for w in model.identification['warnings'])
+    assert is_good(rig.models[-1])
+
+
+def test_blocks_of_a_second_publisher_change_nothing(rig):
+    g = rig.g
+    second = g.node.create_publisher(Float64MultiArray, 'voltage', STREAM)
+    try:
+        g.wait(lambda: second.get_subscription_count() == 3, 'the second publisher to be heard')
+        g.wait(lambda: g.diagnostics('stage').get('publishers') == '2', 'two publishers')
+        before = int(g.diagnostics('stage')['refused_second'])
+        # of another programme: earlier, at the same time, and far ahead
+        strange = [block(0, np.full(1000, 3.0)), replace(BLOCKS[K], values=np.full(1000, 3.0))]
+        strange.append(block(10**7, np.full(1000, 3.0), 'triangle'))
+        rig.send(BLOCKS[:K])
+        for b in strange:
+            second.publish(to_message(b))
+            at = f'second publisher: its block at t = {b.t[0]:.6g} s is not of the stream'
+            rig.warned('stage', at)
+        rig.sent += strange
+        rig.send(BLOCKS[K:])
+        rig.settle()
+        rig.warned('model', 'samples of voltage are missing before t = 500 s')
+        rig.warned('model', 'time jumps back from 500.05 to')
+        rig.warned('identifier', 'samples of voltage are missing')
+        rig.is_safe()
+        assert (
+            column(rig.applied)[1].tobytes()
+            == column([*rig.applied[: rig.begin['applied_voltage']], *BLOCKS])[1].tobytes()
+        )
+        g.wait(
+            lambda: int(g.diagnostics('stage')['refused_second']) == before + 3, 'three refused'
+        )
+    finally:
+        g.node.destroy_publisher(second)
+    models = len(rig.models)
+    end = identified(g)
+    assert (end['state'], end['level']) == ('done', '1'), end
+    g.wait(lambda: len(rig.models) > models, 'the model')
+    assert {f['name'] for f in json.loads(rig.reports[-1])['data_faults']} == {'unmatched'}
+    assert is_good(rig.models[-1])
+
+
+def test_a_stage_that_stops_answering_and_answers_late(rig):
+    stage = rig.g.handle('stage')
+    rig.send(BLOCKS[:K])
+    stage.send(signal.SIGSTOP)
+    try:
+        count = len(rig.answers)
+        for b in BLOCKS[K : K + 6]:
+            rig.g.publish('voltage', b)
+            rig.sent.append(b)
+        rig.settle()
+        assert len(rig.answers) == count
+        models = len(rig.models)
+        end = identified(rig.g)
+        assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
+    finally:
+        stage.send(signal.SIGCONT)
+    rig.g.wait(lambda: len(rig.answers) == count + 6, 'what waited for the stage')
+    rig.send(BLOCKS[K + 6 :])
+    rig.settle()
+    rig.is_safe()
+    assert len(rig.models) == models
+    end = identified(rig.g)
+    assert (end['state'], end['level']) == ('done', '0'), end
+
+
+def is_good(model: str) -> bool:
+    """Return whether a model errs no more than one of data without faults."""
+    errors = model_of(model).identification['errors']
+    return bool(0.0 < min(errors['fitted'], errors['selection']) < 0.01)
+
+
+def shifted(blocks: list[Samples], tick: int) -> list[Samples]:
+    """Return blocks that begin at another tick."""
+    by = tick - round(blocks[0].t[0] * FS)
+    return [replace(b, t=(np.rint(b.t * FS) + by) / FS) for b in blocks]
+
+
+def test_a_stage_that_is_killed_and_comes_back_joins_by_a_ramp(rig):
+    g, models = rig.g, len(rig.models)
+    rig.send(BLOCKS[:K])
+    g.handle('stage').kill()
+    volts = BLOCKS[K - 1].values[-1]
+    hold = rig.holding(rig.answered(), volts)
+    applied = len(rig.applied)
+    g.restart(g.handle('stage'), hold)
+    g.wait(
+        lambda: len(rig.applied) > applied and rig.applied[-1].values[-1] == volts,
+        'the end of the ramp',
+        meanwhile=hold,
+    )
+    assert g.set('stage', 'silence', 600.0)[0]
+    rig.warned('stage', 'samples changed while the stream is joined by a ramp')
+    ramp = column(rig.applied[applied:])[1]
+    assert ramp[0] == pytest.approx(0.0, abs=0.01)
+    assert np.abs(np.diff(ramp)).max() * FS == pytest.approx(20.0, rel=1e-3)
+    # the identifier hears the new one too
+    rig.send(shifted(BLOCKS[K:], rig.meet(rig.answered(), volts)))
+    rig.settle()
+    rig.warned('identifier', 'samples of displacement are missing')
+    end = identified(g)
+    assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
+    assert len(rig.models) == models
+
+
+def test_a_model_node_that_is_killed_and_comes_back(rig):
+    g = rig.g
+    rig.send(BLOCKS)
+    rig.settle()
+    assert identified(g)['state'] == 'done'
+    rig.rest()
+    rig.send(BLOCKS[:K])
+    g.handle('model').kill()
+    node = g.restart(g.handle('model'))
+    g.wait(lambda: node.status()['message'] == 'with topic model', 'the latched model')
+    tick = rig.meet(rig.answered(), BLOCKS[K - 1].values[-1])
+    # in the middle of a stream it cannot know the memory, and says so
+    unknown = 'its memory is unknown until the voltage has been at its lowest'
+    g.wait(lambda: unknown in node.status()['message'], unknown)
+    count, rest = len(rig.prediction), shifted(BLOCKS[K:], tick)
+    rig.send(rest)
+    g.wait(lambda: len(rig.prediction) == count + len(rest), 'predictions')
+    assert column(rig.prediction[count:])[0].tobytes() == column(rest)[0].tobytes()
+    g.wait(lambda: node.status()['message'] == 'with topic model', 'a memory that is known')
+    y = column(rig.answers[-20:])[1]
+    np.testing.assert_allclose(column(rig.prediction[-20:])[1], y, atol=1e-3 * np.ptp(y))
+
+
+def test_an_identifier_that_is_killed_and_comes_back(rig):
+    g, models = rig.g, len(rig.models)
+    old = g.handle('identifier')
+    rig.send(BLOCKS)
+    rig.settle()
+    assert g.set('identifier', 'swarm_iterations', 10_000_000)[0]
+    assert g.set('identifier', 'thresholds', '100')[0]
+    assert g.call('identifier/identify')[0]
+    g.wait(lambda: old.status()['message'] == 'hysteresis', 'the swarm')
+    started = old.children()
+    assert started
+    old.die()
+    g.wait(lambda: not any(alive(pid) for pid in started), 'the end of what it had started')
+    rig.rest(clear=False)
+    rig.send(BLOCKS[:K])
+    new = g.restart(old)
+    # what it has missed it does not make up
+    tick = rig.meet(rig.answered(), BLOCKS[K - 1].values[-1])
+    rig.send(shifted(BLOCKS[K:], tick))
+    end = identified(g)
+    assert new.status() == end
+    assert (end['state'], end['level']) == ('done', '1'), end
+    g.wait(lambda: len(rig.models) > models, 'the model')
+    said = model_of(rig.models[-1]).identification['warnings']
+    assert any('no step rises above the noise' in w for w in said), said

@@ -1,0 +1,133 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Faster than real time on a running graph: whoever answers is never overrun."""
+
+from pathlib import Path
+import signal
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from graph import Graph
+from piezo_ident.bag_io import MESSAGE_TYPE
+from piezo_ident.bag_writer import BagWriter
+from piezo_ident.model_io import save_model
+from piezo_ident.nodes.wire import to_message
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage
+from piezo_ident.wire_format import Samples
+from rclpy.serialization import serialize_message
+
+FS = 20_000.0
+N = 1000
+PROGRAM = """
+limits: [0, 10]
+segments:
+  - {signal: sine, bias: 5, amplitude: 4, frequency: 5, duration: 5}
+"""
+
+
+def bag(path: Path) -> Path:
+    """Write a bag of N pairs of blocks that came at once."""
+    writer = BagWriter(path)
+    for quantity in ('voltage', 'displacement'):
+        writer.add_topic(f'/{quantity}', MESSAGE_TYPE)
+    for k in range(N):
+        t = np.arange(100 * k, 100 * (k + 1)) / FS
+        for quantity, scale in (('voltage', 1.0), ('displacement', 1e-6)):
+            block = Samples(t, scale * np.sin(t), 'noise', quantity)
+            writer.write(f'/{quantity}', 10**18 + 50_000 * k, serialize_message(to_message(block)))
+    writer.close()
+    return path
+
+
+def captured(g: Graph) -> int:
+    """Return how many samples of both streams the identifier says it has."""
+    blocks = g.collect('captured')
+    return int(blocks[-1].values[-1]) if blocks else 0
+
+
+def play(g: Graph, node: str) -> tuple[str, dict[str, str]]:
+    """Start a node and return its answer, and its status at the end."""
+    before = len(g.statuses(node))
+    ok, message = g.call(f'{node}/start')
+    assert ok, message
+
+    def ends() -> list[dict[str, str]]:
+        return [s for s in g.statuses(node)[before:] if s['state'] in ('done', 'failed')]
+
+    g.wait(ends, f'end of {node}')
+    return message, ends()[0]
+
+
+def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
+    with Graph() as g:
+        g.collect('captured')
+        identifier = g.start('identifier')
+        g.start('player', {'bag': str(bag(tmp_path / 'bag')), 'rate': 100.0, 'wait_limit': 1.0})
+        g.matched('captured')
+        for round_ in (1, 2):
+            _, status = play(g, 'player')
+            assert (status['state'], status['messages']) == ('done', str(2 * N))
+            # without the flow control it loses most of them: they are due within 50 ms in all
+            g.wait(lambda r=round_: captured(g) == 100 * N * r, 'all samples')
+        last = g.collect('captured')[-1]
+        assert last.quantity == 'captured' and last.segment == 'noise'
+        assert last.t[-1] == (100 * N - 1) / FS
+        # one that says no more is waited for, but not for ever
+        identifier.send(signal.SIGSTOP)
+        _, status = play(g, 'player')
+        assert status['state'] == 'failed' and 'no captured for 1 s' in status['message']
+        assert 0 < int(status['messages']) < 2 * 90
+        identifier.send(signal.SIGCONT)
+        # one that has gone is not waited for
+        assert identifier.stop() == 0
+        assert g.set('player', 'subscribers', 0)[0]
+        assert play(g, 'player')[1]['state'] == 'done'
+        for value, reason in (
+            ('a b a', 'each topic once'),
+            ('a b!', "answers: 'b!' is no name of a topic"),
+        ):
+            ok, why = g.set('player', 'answers', value)
+            assert not ok and reason in why
+
+
+def test_the_whole_graph_as_fast_as_all_answer(tmp_path):
+    save_model(load_stage(find_config('paper', 'stage')).model, tmp_path / 'model.yaml')
+    with Graph() as g:
+        prediction = g.collect('prediction')
+        g.collect('captured')
+        g.start('stage')
+        g.start('identifier')
+        g.start('model', {'model': str(tmp_path / 'model.yaml')})
+        g.start('excitation', {'program': PROGRAM, 'rate_factor': 0.0, 'subscribers': 3})
+        g.matched('captured')
+        message, status = play(g, 'excitation')
+        samples = int(message.split()[-2])
+        assert status['state'] == 'done'
+        g.wait(lambda: captured(g) == samples, 'all samples captured')
+        g.wait(lambda: g.diagnostics('stage').get('samples') == str(samples), 'all answered')
+        assert g.diagnostics('stage')['lost'] == '0'
+        g.wait(lambda: sum(b.t.size for b in prediction) == samples, 'all predicted')
+        for value, reason in (
+            ('', 'at least one topic'),
+            ('a a', 'each topic once'),
+            ('~~', 'no name of a topic'),
+        ):
+            ok, why = g.set('excitation', 'answers', value)
+            assert not ok and reason in why

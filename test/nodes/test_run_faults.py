@@ -1,0 +1,198 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Nodes that fail in a run: each is said, the stage is safe, and no bad model is made of it."""
+
+import re
+import signal
+
+from course import column, FS, HIGH, model_of, PROGRAM, QUICK, simulated
+from graph import Graph
+import numpy as np
+from piezo_ident.bag_io import write_bag
+import pytest
+
+RESTING = ('idle', 'done', 'failed', 'cancelled', 'stopped', '')
+
+
+@pytest.fixture(scope='module')
+def graph():
+    with Graph() as g:
+        g.collect('applied_voltage')
+        g.texts('model')
+        g.start_all(
+            ('excitation', {'block_size': 500, 'subscribers': 2}),
+            ('stage', {'seed': 3}),
+            ('identifier', QUICK),
+        )
+        g.matched('applied_voltage')
+        yield g
+
+
+@pytest.fixture
+def lab(graph):
+    """Return the graph at rest."""
+    assert graph.set('stage', 'ramp_slew', 20.0)[0]
+    graph.call('identifier/cancel')
+    graph.call('excitation/stop')
+    for node in ('identifier', 'excitation', 'stage'):
+        graph.wait(lambda n=node: graph.status(n)['state'] in RESTING, f'{node} at rest')
+    return graph
+
+
+def run(g: Graph, program: str) -> int:
+    """Call ``~/run``, and return how many statuses came before."""
+    seen = len(g.statuses('identifier'))
+    assert g.set('identifier', 'program', program)[0]
+    ok, reason = g.call('identifier/run')
+    assert ok, reason
+    return seen
+
+
+def ended(g: Graph, seen: int, state: str) -> str:
+    """Wait for the end of a run, and return its message."""
+
+    def over() -> list[dict[str, str]]:
+        new = g.statuses('identifier')[seen:]
+        return [s for s in new if s['state'] in ('done', 'failed', 'cancelled')]
+
+    g.wait(over, 'the end of the run')
+    assert over()[0]['state'] == state, over()
+    return over()[0]['message']
+
+
+def at_nine_volts(g: Graph) -> None:
+    applied = g.collect('applied_voltage')
+    g.wait(lambda: applied and applied[-1].values[-1] == 9.0, '9 V')
+
+
+def test_two_excitations_on_one_topic(lab):
+    applied = lab.collect('applied_voltage')
+    assert lab.set('excitation', 'program', HIGH)[0]
+    assert lab.call('excitation/start')[0]
+    at_nine_volts(lab)
+    since = len(applied)
+    # one of the same name is told by its blocks
+    own = {'~/start': '/twin/start', '~/status': '/other/twin/status'}
+    lab.follow('other/twin', 'excitation')
+    twin = lab.start('excitation', {'program': HIGH}, remaps=own, wait=False)
+    lab.wait(lambda: lab.status('other/twin')['state'], 'the twin')
+    assert lab.call('twin/start')[0]
+    lab.wait(lambda: lab.status('other/twin')['state'] == 'failed', 'the twin to give up')
+    said = lab.status('other/twin')['message']
+    assert 'another /excitation is playing on /voltage' in said
+    assert twin.stop() == 0
+    other = lab.start('excitation', {'program': HIGH}, remaps={'__node': 'other'})
+    ok, reason = lab.call('other/start')
+    assert not ok and '/excitation publishes on /voltage too; end it first' in reason
+    warning = 'second publisher /other on voltage'
+    lab.wait(lambda: warning in lab.status('excitation')['message'], warning)
+    assert lab.status('excitation')['level'] == '1'
+    assert other.stop() == 0
+    lab.wait(lambda: lab.status('excitation')['level'] == '0', 'the warning to be taken back')
+    assert set(column(applied[since:])[1]) == {9.0}
+
+
+def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
+    applied, models = lab.collect('applied_voltage'), len(lab.texts('model'))
+    # slow enough for the next stream to meet it on its way
+    assert lab.set('stage', 'ramp_slew', 0.5)[0]
+    seen = run(lab, HIGH)
+    at_nine_volts(lab)
+    killed = lab.handle('excitation')
+    killed.kill()
+    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'the ramp')
+    assert lab.status('stage')['level'] == '1'
+    assert 'no voltage for' in lab.status('stage')['message']
+    lab.restart(killed)
+    assert 'the excitation ended early (idle)' in ended(lab, seen, 'failed')
+    lab.wait(lambda: applied[-1].values[-1] < 8.999, 'the ramp to be under way')
+    seen = run(lab, PROGRAM)
+    lab.wait(lambda: applied[-1].segment == 'idle', 'the next stream')
+    first = next(k for k in reversed(range(len(applied))) if applied[k].segment != 'idle') + 1
+    assert applied[first - 1].segment == 'ramp:silence' and applied[first].t[0] == 0.0
+    step = applied[first].values[0] - applied[first - 1].values[-1]
+    assert abs(step) * FS <= 0.6, 'the applied voltage jumps'
+    down = column(b for b in applied if b.segment == 'ramp:silence')[1]
+    assert np.abs(np.diff(down)).max() * FS <= 0.6
+    # so slow a ramp leaves nothing of the programme as it was commanded
+    reason = ended(lab, seen, 'failed')
+    assert re.search('not usable|nowhere the commanded one', reason), reason
+    assert len(lab.texts('model')) == models
+
+
+def test_a_stage_that_stops_answering_in_a_run(lab):
+    models, stage = len(lab.texts('model')), lab.handle('stage')
+    assert lab.set('identifier', 'excitation_limit', 2.0)[0]
+    seen = run(lab, HIGH)
+    at_nine_volts(lab)
+    stage.send(signal.SIGSTOP)
+    try:
+        reason = ended(lab, seen, 'failed')
+        assert 'the stage has given no displacement for 2 s' in reason
+        lab.wait(lambda: lab.status('excitation')['state'] == 'stopped', 'the excitation to stop')
+    finally:
+        stage.send(signal.SIGCONT)
+    assert lab.set('identifier', 'excitation_limit', 20.0)[0]
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'the stage at rest')
+    assert lab.collect('applied_voltage')[-1].values[-1] == 0.0
+    assert len(lab.texts('model')) == models
+
+
+def test_an_identifier_that_is_killed_in_a_run(lab):
+    models, applied = len(lab.texts('model')), lab.collect('applied_voltage')
+    run(lab, HIGH)
+    at_nine_volts(lab)
+    lab.handle('identifier').die()
+    new = lab.restart(lab.handle('identifier'))
+    # nobody stops the programme, and it is not started again over itself
+    seen = run(lab, PROGRAM)
+    reason = ended(lab, seen, 'failed')
+    assert 'a programme is being played already; call ~/stop first' in reason
+    assert new.status()['level'] == '2' and applied[-1].values[-1] == 9.0
+    assert lab.call('excitation/stop')[0]
+    lab.wait(lambda: lab.status('excitation')['state'] == 'stopped', 'the excitation to stop')
+    assert len(lab.texts('model')) == models
+
+
+@pytest.mark.parametrize('share', [0.3, 0.6])
+def test_a_bag_that_ends_early(graph, tmp_path, share):
+    if 'replay/player' not in [h.name for h in graph.handles]:
+        graph.texts('replay/model')
+        graph.start_all(('player', {}, 'replay'), ('identifier', QUICK, 'replay'))
+    write_bag(simulated(), tmp_path / 'bag')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    graph.call('replay/identifier/clear')
+    assert graph.set('replay/player', 'bag', str(tmp_path / 'bag'))[0]
+    assert graph.set('replay/player', 'rate', 2.0)[0]
+    seen = len(graph.statuses('replay/player'))
+    ok, reason = graph.call('replay/player/start')
+    assert ok, reason
+    ends = ('done', 'failed')
+    graph.wait(
+        lambda: any(s['state'] in ends for s in graph.statuses('replay/player')[seen:]),
+        'the end of the bag',
+    )
+    end = graph.status('replay/player')
+    assert (end['state'], end['level']) == ('done', '1')
+    assert 'the bag ends early: truncated_bag' in end['message']
+    assert graph.call('replay/identifier/identify')[0]
+    graph.wait(lambda: graph.status('replay/identifier')['state'] in ends, 'the end of the work')
+    end = graph.status('replay/identifier')
+    assert (end['state'], end['level']) == ('done', '1'), end
+    graph.wait(lambda: graph.texts('replay/model'), 'the model')
+    said = ' '.join(model_of(graph.texts('replay/model')[-1]).identification['warnings'])
+    assert 'no segments labelled noise and triangle' in said

@@ -1,0 +1,131 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Graphs in namespaces side by side, and one under other names, hear only themselves."""
+
+import json
+
+from course import column, FS, model_of, numbers, PROGRAM, QUICK, voltage_of
+from graph import Graph
+import numpy as np
+from piezo_ident.bag_recovery import opened_bag
+
+#: of every topic of the graph
+NAMES = {
+    'voltage': 'command',
+    'displacement': 'position',
+    'applied_voltage': 'amplifier',
+    'prediction': 'expected',
+    'residual': 'misfit',
+    'preview': 'shown',
+    'captured': 'taken',
+    'model': 'learnt',
+    'report': 'findings',
+}
+#: where the excitation has another name too
+DRIVE = {
+    f'excitation/{name}': f'drive/{name}' for name in ('start', 'stop', 'set_parameters', 'status')
+}
+NODES = ('excitation', 'stage', 'identifier', 'model')
+WHERE = {'a/': 'a/excitation', 'b/': 'b/excitation', '': 'drive'}
+
+
+def test_three_graphs_side_by_side(tmp_path):
+    excitation = {'subscribers': 4, 'block_size': 500}
+    identifier = {**QUICK, 'program': PROGRAM}
+    with Graph() as g:
+        applied = {
+            w: g.collect(f'{w}{"amplifier" if not w else "applied_voltage"}') for w in WHERE
+        }
+        voltage = {w: g.collect(f'{w}{"command" if not w else "voltage"}') for w in WHERE}
+        expected = {w: g.collect(f'{w}{"expected" if not w else "prediction"}') for w in WHERE}
+        models = {w: g.texts(f'{w}{"learnt" if not w else "model"}') for w in WHERE}
+        reports = {w: g.texts(f'{w}{"findings" if not w else "report"}') for w in WHERE}
+        g.start_all(
+            *(
+                spec
+                for where, name in (('a', 'paper'), ('b', 'dense'))
+                for spec in (
+                    ('stage', {'stage': name, 'seed': 1}, where),
+                    ('excitation', excitation, where),
+                    ('identifier', identifier, where),
+                    ('model', {}, where),
+                )
+            ),
+            ('stage', {'stage': 'paper', 'seed': 1}, '', {**NAMES, '__node': 'table'}),
+            ('excitation', {**excitation, 'subscribers': 5}, '', {**NAMES, '__node': 'drive'}),
+            ('identifier', identifier, '', {**NAMES, **DRIVE}),
+            ('model', {}, '', NAMES),
+            ('recorder', {'output': str(tmp_path / 'bag'), 'autostart': True}, '', NAMES),
+            ('player', {'topics': ['report']}, '', NAMES),
+        )
+        g.wait(lambda: g.status('recorder')['state'] == 'recording', 'the recording')
+        for where in WHERE:
+            ok, reason = g.call(f'{where}identifier/run')
+            assert ok, reason
+        for where in WHERE:
+            g.wait(
+                lambda w=where: g.status(f'{w}identifier')['state'] in ('done', 'failed'),
+                f'the end of the run in /{where}',
+            )
+            assert g.status(f'{where}identifier')['state'] == 'done'
+
+        # each has the whole programme and nothing but it
+        sent = column(voltage_of(PROGRAM))
+        for where in WHERE:
+            g.wait(lambda w=where: len(applied[w]) == len(voltage[w]), 'the last block')
+            for stream in (voltage[where], applied[where]):
+                t, v = column(stream)
+                assert t.tobytes() == sent[0].tobytes() and v.tobytes() == sent[1].tobytes()
+            kept = g.diagnoses(f'{where}identifier')
+            g.wait(lambda k=kept: k and k[-1]['state'] == 'done', 'diagnostics')
+            assert float(kept[-1]['captured']) == round(sent[0].size / FS, 3)
+            assert kept[-1]['lost'] == '0'
+            assert kept[-1]['hardware_id'] == f'/{where}'.rstrip('/') or '/'
+        for name in NAMES:
+            assert g.node.count_publishers(f'/{name}') == 0, name
+
+        # the same stage has the same model whatever it is called, another stage has another
+        g.wait(lambda: all(models.values()) and all(reports.values()), 'models and reports')
+        found = {where: numbers(model_of(models[where][-1])) for where in WHERE}
+        np.testing.assert_allclose(found['a/'], found[''], rtol=1e-12)
+        assert found['a/'].tolist() != found['b/'].tolist()
+        assert len({json.loads(r[-1])['verdict'] for r in reports.values()}) == 2
+        for where in WHERE:
+            g.wait(
+                lambda w=where: g.status(f'{w}model')['message'] == 'with topic model',
+                'the model to be taken over',
+            )
+
+        # one of them goes on, and the others are silent
+        heard = {where: len(voltage[where]) for where in WHERE}
+        foreseen = len(expected['b/'])
+        assert g.set('b/excitation', 'program', PROGRAM)[0]
+        assert g.call('b/excitation/start')[0]
+        g.wait(lambda: len(expected['b/']) > foreseen, 'a prediction')
+        assert g.call('b/excitation/stop')[0]
+        g.wait(lambda: g.status('b/excitation')['state'] == 'stopped', 'the stop')
+        assert {w: len(voltage[w]) for w in ('a/', '')} == {w: heard[w] for w in ('a/', '')}
+        assert not expected['a/'] and not expected['']
+
+        # the bag has the names of this graph, and is played under them
+        assert g.call('recorder/stop')[0]
+        g.wait(lambda: g.status('recorder')['state'] == 'done', 'the bag')
+        with opened_bag(tmp_path / 'bag') as bag:
+            topics = {c.topic for c in bag.connections if c.msgcount}
+        assert topics == {'/command', '/position', '/amplifier', '/learnt', '/findings'}
+        assert g.set('player', 'bag', str(tmp_path / 'bag'))[0]
+        assert g.call('player/start')[0]
+        g.wait(lambda: len(reports['']) == 2, 'the recorded report')
+        assert reports[''][0] == reports[''][1]

@@ -1,0 +1,230 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The graph as it runs is the graph of the tables, from topics to parameters."""
+
+import json
+
+from course import HIGH, model_of, PROGRAM, QUICK
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from graph import Graph
+import numpy as np
+from piezo_ident.bag_io import read_bag
+from piezo_ident.nodes.interfaces import DIAGNOSTICS, SERVICES, STATES, TOPICS
+from piezo_ident.nodes.parameters import NODES
+from piezo_ident.nodes.wire import LATCHED
+import pytest
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+#: what `Graph` keeps beside the values of a diagnosis
+OTHERS = {'message', 'level', 'hardware_id'}
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('whole')
+    with Graph() as g:
+        g.texts('model')
+        g.texts('report')
+        g.start_all(
+            ('excitation', {'subscribers': 3, 'block_size': 500}),
+            ('stage', {'seed': 3}),
+            ('identifier', {**QUICK, 'program': PROGRAM, 'output': str(folder / 'saved')}),
+            ('model', {'window': 0.5}),
+            ('recorder', {'output': str(folder / 'bag')}),
+            ('player', {'bag': str(folder / 'bag'), 'rate': 0.01}),
+        )
+        g.output = folder
+        yield g
+
+
+def ended(g, node, call, states=('done', 'failed')):
+    """Call a service, wait for the end of what it began, and return the status then."""
+    seen = len(g.statuses(node))
+    ok, reason = g.call(call)
+    assert ok, reason
+    g.wait(lambda: any(s['state'] in states for s in g.statuses(node)[seen:]), f'end of {call}')
+    return g.status(node)
+
+
+def publishers(g, topic):
+    """Return who publishes a topic, as the middleware tells."""
+    found = g.node.get_publishers_info_by_topic(topic)
+    return {i.node_name: i for i in found if i.node_name != 'observer'}
+
+
+def subscribers(g, topic):
+    """Return who listens to a topic, but for those who listen to whatever there is."""
+    found = g.node.get_subscriptions_info_by_topic(topic)
+    return {i.node_name for i in found} - {'observer', 'recorder'}
+
+
+def test_a_run_through_the_whole_graph(whole):
+    assert ended(whole, 'recorder', 'recorder/start', ('recording',))['state'] == 'recording'
+    end = ended(whole, 'identifier', 'identifier/run')
+    assert (end['state'], end['level'], end['progress']) == ('done', '0', '100'), end
+    whole.wait(lambda: whole.texts('model') and whole.texts('report'), 'model and report')
+    report = json.loads(whole.texts('report')[-1])
+    assert report['data_faults'] == [] and report['delay']['samples'] == 3
+    assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
+    whole.wait(lambda: whole.status('model')['message'] == 'with topic model', 'the model')
+    assert ended(whole, 'identifier', 'identifier/save')['state'] == 'done'
+    assert (whole.output / 'saved/model.yaml').is_file()
+    assert ended(whole, 'recorder', 'recorder/stop')['state'] == 'done'
+    record = read_bag(whole.output / 'bag')
+    assert record.n == round(3.37 * 20_000) and record.faults == ()
+
+
+def test_topics_are_those_of_the_table(whole):
+    of_one = [t for t in TOPICS if t.publishers != ('every node',)]
+    # a programme that waits for answers
+    assert whole.set('excitation', 'rate_factor', 2.0)[0]
+    assert whole.set('excitation', 'program', HIGH)[0]
+    assert whole.call('excitation/start')[0]
+    for t in of_one:
+        wanted = set(t.publishers) - {'player'}, set(t.subscribers) - {'player'}
+        whole.wait(
+            lambda t=t, w=wanted: (
+                (set(publishers(whole, f'/{t.name}')), subscribers(whole, f'/{t.name}')) == w
+            ),
+            f'{wanted} on {t.name}',
+        )
+    for t in TOPICS:
+        for name in [f'/{n}/status' for n in NODES] if t.name == '~/status' else [f'/{t.name}']:
+            name = name.replace('//', '/')
+            found = publishers(whole, name)
+            if t.name == '/diagnostics':
+                assert set(found) == set(NODES)
+            for node, info in found.items():
+                assert t.name != '~/status' or name == f'/{node}/status'
+                assert info.topic_type == t.type
+                latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                assert latched == ('transient local' in t.qos), name
+                assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE, name
+            assert found, name
+    # some values are there only while a stream comes
+    whole.wait(lambda: 'head_room' in whole.diagnostics('model'), 'the head-room')
+    assert ended(whole, 'excitation', 'excitation/stop', ('stopped',))['state'] == 'stopped'
+    assert whole.set('excitation', 'rate_factor', 1.0)[0]
+    # a replay on its way
+    assert whole.call('player/start')[0]
+    for t in of_one:
+        wanted = 'player' in t.publishers, 'player' in t.subscribers
+        whole.wait(
+            lambda t=t, w=wanted: (
+                ('player' in publishers(whole, f'/{t.name}')) == w[0]
+                and ('player' in subscribers(whole, f'/{t.name}')) == w[1]
+            ),
+            f'the player on {t.name}',
+        )
+    assert ended(whole, 'player', 'player/stop', ('stopped',))['state'] == 'stopped'
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_services_are_those_of_the_table(whole, node):
+    found = whole.node.get_service_names_and_types_by_node(node, '/')
+    triggers = {name for name, types in found if types == ['std_srvs/srv/Trigger']}
+    assert triggers == {f'/{node}/{s.name}' for s in SERVICES if s.node == node}
+
+
+def test_what_is_latched_is_heard_by_who_comes_late(whole):
+    heard = {}
+    for node in NODES:
+        whole.node.create_subscription(
+            DiagnosticStatus, f'/{node}/status', lambda m, n=node: heard.update({n: m}), LATCHED
+        )
+    whole.wait(lambda: set(heard) == set(NODES), 'the last words')
+    for node, message in heard.items():
+        values = {pair.key: pair.value for pair in message.values}
+        assert values['state'] in {s.name for s in STATES if s.node == node}
+        assert 0.0 <= float(values['progress']) <= 100.0
+        assert message.message
+        assert (message.name, message.hardware_id) == (f'/{node}', '/')
+
+
+def test_diagnostics_are_those_of_the_table(whole):
+    arrays = []
+    subscription = whole.node.create_subscription(
+        DiagnosticArray, '/diagnostics', arrays.append, 100
+    )
+    for node in NODES:
+        always = {v.name for v in DIAGNOSTICS if v.node == node and not v.when}
+        every = {v.name for v in DIAGNOSTICS if v.node == node}
+        whole.wait(
+            lambda n=node, e=every: e <= {k for d in whole.diagnoses(n) for k in d},
+            f'all values of {node}',
+        )
+        for found in whole.diagnoses(node):
+            assert always <= set(found) - OTHERS <= every, node
+            for value in DIAGNOSTICS:
+                if value.node == node and value.unit and value.name in found:
+                    assert float(found[value.name]) is not None
+    # once a second, by their own stamps
+    whole.wait(lambda: len(arrays) >= 4 * len(NODES), 'some more')
+    stamps = {}
+    for array in arrays:
+        (status,) = array.status
+        assert status.hardware_id == '/'
+        stamp = array.header.stamp
+        stamps.setdefault(status.name, []).append(stamp.sec + 1e-9 * stamp.nanosec)
+    assert set(stamps) == {f'/{node}' for node in NODES}
+    assert 0.8 < np.median(np.concatenate([np.diff(t) for t in stamps.values()])) < 1.5
+    whole.node.destroy_subscription(subscription)
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_parameters_are_those_of_the_table(whole, node):
+    found = whole.parameters(node)
+    foreign = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+    assert {n for n in found if not n.startswith(foreign)} == {d.name for d in NODES[node]}
+    for d in NODES[node]:
+        described = found[d.name]
+        assert d.description in described.description
+        assert not d.unit or f'[{d.unit}]' in described.description
+        assert all(choice in described.description for choice in d.choices)
+        assert described.read_only == d.read_only
+        ranges = [*described.floating_point_range, *described.integer_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [] if d.low is None else [(d.low, d.high)]
+        )
+        value = whole.get(node, d.name)
+        assert isinstance(value, list if isinstance(d.default, tuple) else type(d.default))
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_bad_parameters_are_refused_with_the_reason(whole, node):
+    for d in NODES[node]:
+        value = whole.get(node, d.name)
+        bad = [[True] if isinstance(d.default, str) else 'text' if not d.choices else 1]
+        if d.low is not None:
+            one = type(d.default)(1)
+            bad += [d.low - one, d.high + one]
+        if isinstance(d.default, float):
+            bad += [float('nan'), 1]
+        bad += ['nonsense'] * bool(d.choices)
+        bad += [value] * d.read_only
+        for wrong in bad:
+            taken, reason = whole.set(node, d.name, wrong)
+            assert not taken, (d.name, wrong)
+            assert d.name in reason or 'parameter type' in reason, (d.name, wrong, reason)
+        after = whole.get(node, d.name)
+        assert after == value, d.name
+        if not d.read_only:
+            assert whole.set(node, d.name, value) == (True, ''), d.name
+
+
+def test_what_is_no_parameter_is_refused(whole):
+    for node in NODES:
+        taken, reason = whole.set(node, 'nonsense', 1)
+        assert not taken and 'undeclared parameter' in reason
