@@ -208,8 +208,8 @@ def test_bad_parameters_are_refused_with_the_reason(whole, node):
         value = whole.get(node, d.name)
         bad = [[True] if isinstance(d.default, str) else 'text' if not d.choices else 1]
         if d.low is not None:
-            one = type(d.default)(1)
-            bad += [d.low - one, d.high + one]
+            kind = type(d.default)
+            bad += [kind(d.low - 1 - abs(d.low) // 100), kind(d.high + 1 + d.high // 100)]
         if isinstance(d.default, float):
             bad += [float('nan'), 1]
         bad += ['nonsense'] * bool(d.choices)
