@@ -41,7 +41,7 @@ from piezo_ident.effects import catalogue, find_effect
 __all__ = ['Findings', 'candidates_of', 'judge', 'rivals_of', 'takes', 'untestable_of']
 
 #: least share of the explainable part that a name stands for; below the second nothing is added
-NAMED, ADDED = 0.85, 0.5
+NAMED, ADDED = 0.92, 0.5
 #: a gain below this share of what is left, or below this rms [% of stroke], is no effect
 LEAST_GAIN, SMALLEST = 0.10, 0.05
 #: how much better than on turned residuals a gain must be
