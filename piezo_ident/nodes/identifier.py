@@ -35,6 +35,7 @@ from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.diagnosis_jobs import Judgement, save_both_job
 from piezo_ident.nodes.drive import Drive, Streams
 from piezo_ident.nodes.inquiry import Inquiry
+from piezo_ident.nodes.intake import Intake
 from piezo_ident.nodes.jobs import (
     identify_job,
     Outcome,
@@ -57,8 +58,8 @@ _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 POLL = 0.05
 #: how often it is told how much was captured [s]
 TELL = 0.5
-#: how many blocks of voltage and displacement are answered at once
-ANSWER = 20
+#: how often it is looked for what has come [s]
+DRAIN = 0.02
 #: how long the end of the node waits for the work to end [s]
 PATIENCE = 1.7
 
@@ -86,17 +87,17 @@ class IdentifierNode(LabNode):
             self._take_file(self.values['model'])
         self._counted, self._counted_at = 0, time.monotonic()
         self._passed: dict[str, int] = {}
-        self._unanswered = 0
         self._newest = Samples(np.empty(0), np.empty(0))
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
         self._captured = self.create_publisher(Float64MultiArray, 'captured', STREAM)
-        self._heard: dict[str, Any] = {}
+        self._intake = Intake(self, self._take)
         for key in ('voltage', 'displacement', APPLIED):
-            self._listen(key, key)
+            self._intake.listen(key, key)
         for topic in self.values['channels'].split():
-            self._listen(topic, '')
+            self._intake.listen(topic, '')
         self._drive = Drive(self, self._streams, self._unheard)
+        self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
         self.offer('run', self._run)
@@ -108,12 +109,20 @@ class IdentifierNode(LabNode):
         self.offer('clear', self._clear)
         self.offer('save', self._save)
 
+    def offer(self, name: str, handler: Callable[[], str]) -> None:
+        """Offer a service; what was sent before the call counts as captured."""
+
+        def drained() -> str:
+            self._drain()
+            return handler()
+
+        super().offer(name, drained)
+
     # capture
 
-    def _listen(self, topic: str, key: str) -> None:
-        take = functools.partial(self._take, topic, key)
-        subscription = self.create_subscription(Float64MultiArray, topic, take, STREAM)
-        self._heard[topic] = subscription
+    def _drain(self) -> None:
+        if self._intake.drain() and self._newest.t.size:
+            self._answer()
 
     def _take(
         self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
@@ -134,13 +143,9 @@ class IdentifierNode(LabNode):
         self._passed[topic] = self._passed.get(topic, 0) + samples.t.size
         if key in ('voltage', 'displacement') and samples.t.size:
             self._newest = samples
-            self._unanswered += 1
-            if self._unanswered >= ANSWER:
-                self._answer()
 
     def _answer(self) -> None:
         """Tell how far the capture is, so that a fast sender does not run away from it."""
-        self._unanswered = 0
         taken = min(self._passed.get('voltage', 0), self._passed.get('displacement', 0))
         row = Samples(
             self._newest.t[-1:], np.array([float(taken)]), self._newest.segment, 'captured'
@@ -162,11 +167,7 @@ class IdentifierNode(LabNode):
 
     def _unheard(self) -> str:
         # what is sent before publisher and subscription have met is lost
-        return ', '.join(
-            topic
-            for topic, subscription in self._heard.items()
-            if topic not in ('voltage', APPLIED) and not subscription.get_publisher_count()
-        )
+        return ', '.join(t for t in self._intake.unpublished if t not in ('voltage', APPLIED))
 
     # state
 
@@ -175,8 +176,6 @@ class IdentifierNode(LabNode):
         self.report_status(state, progress, message, level)
 
     def _poll(self) -> None:
-        if self._unanswered:
-            self._answer()
         if self._drive.running:
             self._drive.poll()
         if self._drive.running:

@@ -130,7 +130,7 @@ TOPICS = (
         ('identifier',),
         ('excitation', 'player'),
         _STREAM,
-        'one row, every 20 blocks or 50 ms: t of the newest sample, number of samples with both',
+        'one row, every 20 ms while blocks come: t of the newest sample, samples of both streams',
     ),
     Topic('prediction', ARRAY, ('model',), ('excitation', 'player'), _STREAM, 'blocks of (t, m)'),
     Topic(

@@ -32,20 +32,14 @@ itself what is promised, `in_time` prints it, and gives a crowded machine more o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import contextlib
-import ctypes
-import fcntl
 import os
 from pathlib import Path
-import re
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from typing import Any, IO
+from typing import Any
 
 import pytest
 import yaml
@@ -56,6 +50,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from piezo_ident.nodes.interfaces import STATES
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
 from piezo_ident.wire_format import Samples
+from processes import alive, Handle, in_time, LIMIT, take_domain
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 import rclpy
 from rclpy.context import Context
@@ -70,138 +65,10 @@ from std_srvs.srv import Trigger
 __all__ = ['Graph', 'Handle', 'alive', 'in_time']
 
 ROOT = Path(__file__).resolve().parents[2]
-#: what has not happened within this time will not happen [s]; the machine may be busy
-LIMIT = 60.0
 #: a question that may have been lost with a dead node is asked again after this time [s]
 AGAIN = 3.0
 #: the observer shares its interpreter with the test, and must not lose what waits for it
 OBSERVED = QoSProfile(depth=20_000)
-#: domains whose ports are clear of the system's own
-DOMAINS = range(1, 100)
-
-
-def in_time(took: float, limit: float, what: str) -> None:
-    """See that something took no longer than promised [s], and print how long it took."""
-    crowd = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
-    print(f'{what}: {took:.3f} s of {limit:g} s, {crowd:.1f} programs a processor')
-    assert took < limit * crowd, f'{what}: {took:.3f} s, promised are {limit:g} s'
-
-
-def alive(pid: int) -> bool:
-    """Return whether a process is there and is no zombie."""
-    try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except OSError:
-        return False
-
-
-def _die_with_parent() -> None:
-    # of the thread that starts it: only the main one may, which outlives them all
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-
-
-def _take_domain() -> tuple[int, IO[str]]:
-    """Return a domain that no other graph on this machine uses, and the lock that holds it."""
-    for k in range(len(DOMAINS)):
-        domain = DOMAINS[(os.getpid() + k) % len(DOMAINS)]
-        lock = (Path(tempfile.gettempdir()) / f'piezo_ident_domain_{domain}.lock').open('a')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-            continue
-        return domain, lock
-    raise RuntimeError('all ROS domains are in use')
-
-
-def _shared_memory(pid: int) -> list[Path]:
-    """Return the shared memory of the middleware that a process owns, and would leave behind."""
-    held = []
-    with contextlib.suppress(OSError):
-        held = [os.readlink(fd) for fd in Path(f'/proc/{pid}/fd').iterdir()]
-    locks = [h for h in held if re.fullmatch(r'/dev/shm/fastrtps_[0-9a-f]{16}_el', h)]
-    return [Path(name) for lock in locks for name in (lock, lock.removesuffix('_el'))]
-
-
-class Handle:
-    """A node process that a `Graph` started."""
-
-    def __init__(
-        self,
-        graph: Graph,
-        name: str,
-        command: Sequence[str],
-        log: Path,
-        env: Mapping[str, str] | None = None,
-    ) -> None:
-        self.graph = graph
-        self.name = name
-        self.command = command
-        self.env = env
-        #: whether its end is the test's doing
-        self.is_ended = False
-        self._log = log
-        self._said = len(graph.statuses(name))
-        with log.open('wb') as out:
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env={**graph.environment, **(env or {})},
-                start_new_session=True,
-                preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
-            )
-
-    @property
-    def log(self) -> str:
-        """What it wrote on its two outputs."""
-        return self._log.read_text(encoding='utf-8', errors='replace')
-
-    @property
-    def has_spoken(self) -> bool:
-        """Whether its first status was heard."""
-        return len(self.graph.statuses(self.name)) > self._said
-
-    def status(self) -> dict[str, str]:
-        """Return its latest status."""
-        return self.graph.status(self.name)
-
-    def send(self, number: int) -> None:
-        """Send it a signal and do not wait."""
-        self.is_ended |= number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-        self.process.send_signal(number)
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        """Send it a signal, wait for its end, and return the exit code."""
-        if self.process.poll() is None:
-            self.send(number)
-        return self.process.wait(LIMIT)
-
-    def children(self) -> set[int]:
-        """Return the processes that it has started."""
-        tasks = Path(f'/proc/{self.process.pid}/task')
-        texts = [(task / 'children').read_text() for task in tasks.iterdir()]
-        return {int(pid) for text in texts for pid in text.split()}
-
-    def die(self) -> None:
-        """End it outright, and nothing but it."""
-        self.is_ended = True
-        left = _shared_memory(self.process.pid)
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait(LIMIT)
-        for path in left:
-            path.unlink(missing_ok=True)
-
-    def kill(self) -> None:
-        """End it outright, with all that it started."""
-        self.is_ended = True
-        left = _shared_memory(self.process.pid)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(LIMIT)
-        for path in left:
-            path.unlink(missing_ok=True)
 
 
 class Graph:
@@ -221,7 +88,7 @@ class Graph:
         self._end = threading.Event()
 
     def __enter__(self) -> Graph:
-        self.domain, self._lock = _take_domain()
+        self.domain, self._lock = take_domain()
         self.folder = Path(tempfile.mkdtemp(prefix='piezo_ident_graph_'))
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         self.environment = {

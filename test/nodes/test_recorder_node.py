@@ -16,6 +16,7 @@
 
 import json
 from pathlib import Path
+import shutil
 import threading
 import time
 
@@ -176,7 +177,7 @@ def test_record_stop_and_refusals(tmp_path):
         assert abs(stamps[-1] * 1e-9 - time.time()) < 60
 
 
-def test_flush_says_how_long_a_message_waits(tmp_path):
+def test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said(tmp_path):
     with Graph() as g:
         source = Source(g)
         g.start('recorder', {'output': str(tmp_path / 'bag')})
@@ -190,7 +191,14 @@ def test_flush_says_how_long_a_message_waits(tmp_path):
                 sizes[flush] = {s['bytes'] for s in g.statuses('recorder')[seen:]}
                 assert g.call('recorder/stop')[0]
                 g.wait(lambda: g.status('recorder')['state'] == 'done', 'the bag')
+            path = start(g, tmp_path)
+            shutil.rmtree(path)
+            assert g.call('recorder/stop')[0]
         assert len(sizes[0.5]) <= 8 < len(sizes[0.05])
+        g.wait(lambda: g.status('recorder')['state'] == 'failed', 'the failure')
+        status = g.status('recorder')
+        assert status['level'] == '2' and path in status['message'], status
+        g.wait(lambda: g.diagnostics('recorder')['level'] == '2', 'the same in diagnostics')
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

@@ -1,0 +1,161 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Node processes for tests: how they are started and ended, and what they may leave behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import contextlib
+import ctypes
+import fcntl
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+from typing import Any, IO
+
+__all__ = ['LIMIT', 'Handle', 'alive', 'in_time', 'take_domain']
+
+#: what has not happened within this time will not happen [s]; the machine may be busy
+LIMIT = 60.0
+#: domains whose ports are clear of the system's own
+DOMAINS = range(1, 100)
+
+
+def in_time(took: float, limit: float, what: str) -> None:
+    """See that something took no longer than promised [s], and print how long it took."""
+    crowd = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    print(f'{what}: {took:.3f} s of {limit:g} s, {crowd:.1f} programs a processor')
+    assert took < limit * crowd, f'{what}: {took:.3f} s, promised are {limit:g} s'
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process is there and is no zombie."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+def _die_with_parent() -> None:
+    # of the thread that starts it: only the main one may, which outlives them all
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def take_domain() -> tuple[int, IO[str]]:
+    """Return a domain that no other graph on this machine uses, and the lock that holds it."""
+    for k in range(len(DOMAINS)):
+        domain = DOMAINS[(os.getpid() + k) % len(DOMAINS)]
+        lock = (Path(tempfile.gettempdir()) / f'piezo_ident_domain_{domain}.lock').open('a')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        return domain, lock
+    raise RuntimeError('all ROS domains are in use')
+
+
+def _shared_memory(pid: int) -> list[Path]:
+    """Return the shared memory of the middleware that a process owns, and would leave behind."""
+    held = []
+    with contextlib.suppress(OSError):
+        held = [os.readlink(fd) for fd in Path(f'/proc/{pid}/fd').iterdir()]
+    locks = [h for h in held if re.fullmatch(r'/dev/shm/fastrtps_[0-9a-f]{16}_el', h)]
+    return [Path(name) for lock in locks for name in (lock, lock.removesuffix('_el'))]
+
+
+class Handle:
+    """A node process that a `Graph` started."""
+
+    def __init__(
+        self,
+        graph: Any,
+        name: str,
+        command: Sequence[str],
+        log: Path,
+        env: Mapping[str, str] | None = None,
+    ) -> None:
+        self.graph = graph
+        self.name = name
+        self.command = command
+        self.env = env
+        #: whether its end is the test's doing
+        self.is_ended = False
+        self._log = log
+        self._said = len(graph.statuses(name))
+        with log.open('wb') as out:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**graph.environment, **(env or {})},
+                start_new_session=True,
+                preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
+            )
+
+    @property
+    def log(self) -> str:
+        """What it wrote on its two outputs."""
+        return self._log.read_text(encoding='utf-8', errors='replace')
+
+    @property
+    def has_spoken(self) -> bool:
+        """Whether its first status was heard."""
+        return len(self.graph.statuses(self.name)) > self._said
+
+    def status(self) -> dict[str, str]:
+        """Return its latest status."""
+        return self.graph.status(self.name)
+
+    def send(self, number: int) -> None:
+        """Send it a signal and do not wait."""
+        self.is_ended |= number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+        self.process.send_signal(number)
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """Send it a signal, wait for its end, and return the exit code."""
+        if self.process.poll() is None:
+            self.send(number)
+        return self.process.wait(LIMIT)
+
+    def children(self) -> set[int]:
+        """Return the processes that it has started."""
+        tasks = Path(f'/proc/{self.process.pid}/task')
+        texts = [(task / 'children').read_text() for task in tasks.iterdir()]
+        return {int(pid) for text in texts for pid in text.split()}
+
+    def die(self) -> None:
+        """End it outright, and nothing but it."""
+        self.is_ended = True
+        left = _shared_memory(self.process.pid)
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
+
+    def kill(self) -> None:
+        """End it outright, with all that it started."""
+        self.is_ended = True
+        left = _shared_memory(self.process.pid)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
