@@ -36,6 +36,7 @@ import os
 from pathlib import Path
 import platform
 import random
+import shlex
 import sys
 import tempfile
 import threading
@@ -359,9 +360,9 @@ def main() -> int:
     lines = [
         '# The running graph, measured',
         '',
-        f'    .venv/bin/python benchmarks/bench_live.py {" ".join(sys.argv[1:])}',
+        f'    .venv/bin/python benchmarks/bench_live.py {shlex.join(sys.argv[1:])}',
         '',
-        f'On {machine()}.',
+        f'On {machine()}; load average before it {os.getloadavg()[0]:.1f}.',
         '',
         'Excitation, stage, identifier, model and recorder, each a process of its own, and an '
         'observer.',

@@ -66,6 +66,8 @@ LAST_RAMP = 0.7
 LISTEN = 0.5
 #: how long it may take to meet everybody who could be [s]
 MEET = 2.0
+#: how long it takes a new node to know of most others [s]
+YOUTH = 1.0
 #: between the match of a subscriber and the first block, for the other side to know of it too [s]
 SETTLE = 0.1
 #: between the first block and the second, to hear who answers [s]
@@ -292,7 +294,7 @@ class ExcitationNode(LabNode):
     def _await_ears(self, playing: Playing) -> None:
         """Wait until every publisher has been met: silence before says nothing."""
         # a node that has just come up does not even know of them
-        self._sleep(playing, self._born + MEET)
+        self._sleep(playing, self._born + YOUTH)
         give_up = time.monotonic() + MEET
         while time.monotonic() < give_up:
             ears = self._ears
@@ -385,12 +387,13 @@ class ExcitationNode(LabNode):
             self._clean_up()
         foreign = self._other_publishers()
         self._second = f'second publisher {foreign[0]} on voltage' if foreign else ''
+        values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
         if playing is None:
-            return (WARN if foreign else OK), self._second or 'nothing played yet', {}
+            return (WARN if foreign else OK), self._second or 'nothing played yet', values
         now = time.monotonic()
         (then, before), self._rate = self._rate, (now, playing.tick)
         clock = playing.clock
-        values: dict[str, object] = {
+        values |= {
             'rate': f'{(playing.tick - before) / max(now - then, 1e-9):.1f}',
             'samples': playing.tick,
             'segment': playing.segment,

@@ -240,6 +240,7 @@ _PLAYED = 'a first start'
 _MODEL = 'there is a model'
 
 DIAGNOSTICS = (
+    Value('excitation', 'publishers', 'of voltage, this node included', '1'),
     Value('excitation', 'rate', 'samples sent', '1/s', _PLAYED),
     Value('excitation', 'samples', 'sent since the start', '1', _PLAYED),
     Value('excitation', 'segment', 'that is played', '', _PLAYED),

@@ -112,11 +112,3 @@ def test_in_the_middle_of_everything(number, tmp_path):
     assert not is_unfinished(tmp_path / 'new')
     kept = read_bag(tmp_path / 'new')
     assert kept.n > 0 and not [f for f in kept.faults if f.name == 'truncated_bag']
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_at_rest(number):
-    with Graph() as g:
-        nodes = ('excitation', 'stage', 'identifier', 'model', 'recorder', 'player')
-        g.start_all(*((node,) for node in nodes))
-        end(g, number)

@@ -15,10 +15,12 @@
 """The graph as it runs is the graph of the tables, from topics to parameters."""
 
 import json
+import signal
+import time
 
 from course import HIGH, model_of, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph import Graph
+from graph import Graph, in_time
 import numpy as np
 from piezo_ident.bag_io import read_bag
 from piezo_ident.nodes.interfaces import DIAGNOSTICS, SERVICES, STATES, TOPICS
@@ -40,7 +42,7 @@ def whole(tmp_path_factory):
         g.start_all(
             ('excitation', {'subscribers': 3, 'block_size': 500}),
             ('stage', {'seed': 3}),
-            ('identifier', {**QUICK, 'program': PROGRAM, 'output': str(folder / 'saved')}),
+            ('identifier', {**QUICK, 'program': PROGRAM}),
             ('model', {'window': 0.5}),
             ('recorder', {'output': str(folder / 'bag')}),
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.01}),
@@ -79,8 +81,6 @@ def test_a_run_through_the_whole_graph(whole):
     assert report['data_faults'] == [] and report['delay']['samples'] == 3
     assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
     whole.wait(lambda: whole.status('model')['message'] == 'with topic model', 'the model')
-    assert ended(whole, 'identifier', 'identifier/save')['state'] == 'done'
-    assert (whole.output / 'saved/model.yaml').is_file()
     assert ended(whole, 'recorder', 'recorder/stop')['state'] == 'done'
     record = read_bag(whole.output / 'bag')
     assert record.n == round(3.37 * 20_000) and record.faults == ()
@@ -228,3 +228,14 @@ def test_what_is_no_parameter_is_refused(whole):
     for node in NODES:
         taken, reason = whole.set(node, 'nonsense', 1)
         assert not taken and 'undeclared parameter' in reason
+
+
+def test_a_signal_ends_what_is_at_rest(whole):
+    begin = time.monotonic()
+    for node in NODES:
+        whole.handle(node).send(signal.SIGTERM)
+    for node in NODES:
+        handle = whole.handle(node)
+        assert handle.process.wait(60) == 0, (node, handle.log)
+        assert handle.log == '', node
+    in_time(time.monotonic() - begin, 2.0, 'the end of six nodes at rest')
