@@ -120,7 +120,7 @@ def diagnose(
     rounds, taken, fitted = search.run(base)
     if not taken:
         fitted = base
-    findings = judge(rows, base, fitted, taken, noise)
+    findings = judge(rows, base, fitted, taken, noise, search.left_out)
     progress('verdict', 0.0)
     result = assemble(
         simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings
@@ -172,6 +172,10 @@ class _Search:
         self._rng = np.random.default_rng(settings.seed)
         names = settings.effects or tuple(catalogue())
         self._candidates = [find_effect(name) for name in names if name not in settings.without]
+        have = {setting.name for setting in simulator.model.effects}
+        tried = have | {effect.name for effect in self._candidates}
+        #: effects that nobody can find, since they are not tried
+        self.left_out = frozenset(catalogue()) - tried
         self._count = 0
 
     def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:

@@ -22,7 +22,7 @@ unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,16 @@ AHEAD = 1.6
 BOUGHT = 0.95
 #: what two effects may leave without a difference, % of stroke: H is never right to more than that
 INDISTINCT = 0.01
+#: effects that imitate each other on most data: one is no answer while another was not tried
+LOOK_ALIKES = (
+    ('creep', 'thermal_drift', 'gain_drift'),
+    ('creep', 'rate_dependent_hysteresis'),
+    ('even_nonlinearity', 'preload_loss', 'noncongruent_minor_loops'),
+    ('even_nonlinearity', 'sensor_nonlinearity'),
+    ('noncongruent_minor_loops', 'sensor_nonlinearity'),
+    ('slew_limit', 'amplifier_lag'),
+    ('delay_change', 'amplifier_lag', 'changed_dynamics'),
+)
 #: a candidate is not testable when a refit of the base swallows all but this share of it
 SWALLOWED = 1e-4
 
@@ -151,6 +161,7 @@ def judge(
     fitted: Fitted,
     taken: Sequence[Round],
     noise: float,
+    left_out: Collection[str] = (),
 ) -> Findings:
     """
     Return the verdict.
@@ -164,6 +175,8 @@ def judge(
         The rounds whose best contender was added.
     noise : float
         Mean square of the noise of a row.
+    left_out : collection of str, optional
+        Effects that were not tried.
     """
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
@@ -182,14 +195,24 @@ def judge(
     if share < NAMED:
         return Findings('partly_explained', share, effects, None, rest)
     for names in groups:
-        if len(names) > 1:
-            return Findings('class', share, effects, _class(names[:3]), rest)
+        untried = [name for name in _look_alikes(names[0]) if name in left_out]
+        if len(names) > 1 or untried:
+            group = _class((*names, *untried)[:3], untried)
+            return Findings('class', share, effects, group, rest)
     return Findings('named', share, effects, None, rest)
 
 
-def _class(names: Sequence[str]) -> Class:
+def _look_alikes(name: str) -> list[str]:
+    found = dict.fromkeys(other for group in LOOK_ALIKES if name in group for other in group)
+    return [other for other in found if other != name]
+
+
+def _class(names: Sequence[str], untried: Sequence[str]) -> Class:
     needs = dict.fromkeys(find_effect(name).needs for name in names)
-    return Class(tuple(names), 'record ' + '; and '.join(n for n in needs if n))
+    todo = 'record ' + '; and '.join(n for n in needs if n)
+    if untried:
+        todo = f'diagnose again with {" and ".join(untried)} among the candidates; {todo}'
+    return Class(tuple(names), todo)
 
 
 def candidates_of(

@@ -53,6 +53,8 @@ from std_srvs.srv import Trigger
 __all__ = ['LabNode', 'run']
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+#: how long a thread may keep the interpreter while another one waits for it [s]
+SWITCH = 2e-4
 
 
 class LabNode(Node):
@@ -228,6 +230,8 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
         Exit code: 0 after a clean end, 2 when the node could not start.
     """
     stop = threading.Event()
+    # a thread beside the executor, one that reads YAML say, must not hold a block up for long
+    sys.setswitchinterval(SWITCH)
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor()
 

@@ -38,8 +38,8 @@ from std_msgs.msg import Float64MultiArray, String
 __all__ = ['ModelNode', 'main']
 
 QUANTITIES = ('displacement', 'prediction', 'residual')
-#: how long a problem of the stream stays in the status [s]
-REMEMBER = 5.0
+#: how long a problem of the stream stays in the status [s], and how many of them
+REMEMBER, MOST = 5.0, 4
 
 
 class ModelNode(LabNode):
@@ -55,7 +55,7 @@ class ModelNode(LabNode):
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
         self._source, self._turned_down, self._unreadable = '', '', 0
-        self._trouble, self._trouble_at = '', 0.0
+        self._troubles: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
         self._models = 0
@@ -216,7 +216,9 @@ class ModelNode(LabNode):
     # status and diagnostics
 
     def _meet(self, problem: str) -> None:
-        self._trouble, self._trouble_at = problem, time.monotonic()
+        # a status that comes too fast is overwritten on its way: each tells the last few problems
+        self._troubles.pop(problem, None)
+        self._troubles[problem] = time.monotonic()
         self._tell()
 
     def _verdict(self) -> str:
@@ -237,8 +239,9 @@ class ModelNode(LabNode):
         return 100.0 * self._error.rms / abs(model.scaling.Y)
 
     def _tell(self) -> None:
-        fresh = time.monotonic() - self._trouble_at < REMEMBER
-        said = [self._turned_down, self._trouble if fresh else '']
+        fresh = [p for p, at in self._troubles.items() if time.monotonic() - at < REMEMBER]
+        self._troubles = {p: self._troubles[p] for p in fresh[-MOST:]}
+        said = [self._turned_down, *self._troubles]
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
         if self._predictor.model is not None and self._predictor.memory_lost:

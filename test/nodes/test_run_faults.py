@@ -126,9 +126,10 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     lab.restart(killed)
     assert 'the excitation ended early (idle)' in ended(lab, seen, 'failed')
     lab.wait(lambda: applied[-1].values[-1] < 8.999, 'the ramp to be under way')
+    since = len(applied)
     seen = run(lab, PROGRAM)
-    lab.wait(lambda: applied[-1].segment == 'idle', 'the next stream')
-    first = next(k for k in reversed(range(len(applied))) if applied[k].segment != 'idle') + 1
+    lab.wait(lambda: any(b.segment == 'idle' for b in applied[since:]), 'the next stream')
+    first = next(k for k in range(since, len(applied)) if applied[k].segment == 'idle')
     assert applied[first - 1].segment == 'ramp:silence' and applied[first].t[0] == 0.0
     step = applied[first].values[0] - applied[first - 1].values[-1]
     assert abs(step) * FS <= 0.6, 'the applied voltage jumps'
