@@ -32,6 +32,7 @@ __all__ = [
     'Prepared',
     'Run',
     'common_rate',
+    'drive_creep',
     'noise_floor',
     'prepare',
     'refuse_closed_loop',
@@ -283,7 +284,8 @@ def refuse_closed_loop(record: Record) -> None:
     Refuse a record in which the drive moves and the position does not.
 
     A stage under voltage control cannot do that; a position controller that makes up for creep
-    does exactly that, and then the voltage is the answer and the position the command.
+    does exactly that, and then the voltage is the answer and the position the command.  How far
+    it creeps is read from the drive.
 
     Raises
     ------
@@ -306,9 +308,43 @@ def refuse_closed_loop(record: Record) -> None:
             followed = abs(y[stop] - y[start]) / record.stroke
             if stop - start >= 4 and moved > 0.005 and followed < 0.05 * moved:
                 t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
+                creep = drive_creep(piece, start * window, stop * window)
+                said = (
+                    ''
+                    if creep is None
+                    else '; there the drive makes up for '
+                    f'creep of {creep:.2g} V a decade of time, '
+                    f'{100.0 * creep / span:.2g} % of its range'
+                )
                 raise IdentificationError(
                     f'{record.name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by '
                     f'{moved:.1%} of its range while the position moves by {followed:.2%} of its '
                     'stroke: a position controller was on, so the position is no response to '
-                    'the voltage; record in open loop'
+                    f'the voltage{said}; record in open loop'
                 )
+
+
+def drive_creep(piece: Piece, start: int, stop: int) -> float | None:
+    """
+    Return by how much the drive moves a decade of time while the position is held [V].
+
+    Parameters
+    ----------
+    piece : Piece
+    start, stop : int
+        The hold.
+
+    Returns
+    -------
+    float or None
+        None where a straight line in time describes the drive as well: that is drift.
+    """
+    t, v = piece.t[start:stop] - piece.t[start] + 1.0 / piece.sample_rate, piece.v[start:stop]
+    left, slope = {}, {}
+    # a second, and a tenth of the whole, for what the controller does at first
+    late = t > min(1.0, 0.1 * t[-1])
+    for name, x in (('log', np.log10(t)), ('line', t)):
+        fit = np.polynomial.Polynomial.fit(x[late], v[late], 1)
+        left[name] = float(np.sum((v[late] - fit(x[late])) ** 2))
+        slope[name] = float(fit.convert().coef[-1])
+    return abs(slope['log']) if left['log'] < 0.5 * left['line'] else None

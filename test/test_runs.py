@@ -23,6 +23,7 @@ from piezo_ident.excitation import triangle
 from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.runs import (
     common_rate,
+    drive_creep,
     END_HELD,
     noise_floor,
     refuse_closed_loop,
@@ -177,6 +178,16 @@ def test_position_controller_is_noticed():
     with pytest.raises(IdentificationError, match=r'mine: from .* position controller') as caught:
         refuse_closed_loop(hold(0.1, 0.0))
     assert 'open loop' in str(caught.value)
+    assert 'creep of 0.1 V a decade of time, 1 % of its range' in str(caught.value)
+
+
+def test_the_drive_that_holds_a_position_shows_creep_or_drift():
+    t = np.arange(1, 10_001) / 1000.0
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(t.size)
+    for law, per_decade in ((np.log10(t), 0.1), (t / t[-1], None)):
+        v = 5.0 - 0.1 * law + noise
+        found = drive_creep(piece(v, np.full(t.size, 1e-6)), 0, t.size)
+        assert found == (per_decade if per_decade is None else pytest.approx(0.1, rel=0.02))
 
 
 def test_open_loop_passes():
