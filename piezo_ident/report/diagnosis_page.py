@@ -36,6 +36,7 @@ from piezo_ident.report.diagnosis_tables import (
 )
 from piezo_ident.report.html import cards, document, figures, listed, Shown, table
 from piezo_ident.report.numbers import number
+from piezo_ident.report.reversals import reversal_sentence, reversal_table
 from piezo_ident.report.tables import Table
 
 __all__ = ['diagnosis_page']
@@ -78,7 +79,9 @@ def diagnosis_page(
         *map(table, error_tables(diagnosis)),
         _optional(unseen_table(unseen)),
         '<h2>The residual before and after</h2>\n',
+        _paragraph(reversal_sentence(diagnosis)),
         figures(pictures, 'residual', 'signature', 'spectrum', 'coherence'),
+        _optional(reversal_table(diagnosis)),
         '<h2>What was added</h2>\n',
         *_added(diagnosis),
         '<h2>What was not, and why</h2>\n',
@@ -110,7 +113,7 @@ def _optional(content: Table | None) -> str:
 
 
 def _paragraph(text: str) -> str:
-    return f'<p>{escape(text)}</p>\n'
+    return f'<p>{escape(text)}</p>\n' if text else ''
 
 
 def _group(diagnosis: Diagnosis) -> str:

@@ -30,6 +30,7 @@ from piezo_ident.report.diagnosis_tables import (
     unseen_table,
 )
 from piezo_ident.report.numbers import number
+from piezo_ident.report.reversals import reversal_sentence
 from piezo_ident.report.text import columns, printable, WIDTH
 
 __all__ = ['diagnosis_summary']
@@ -60,6 +61,9 @@ def diagnosis_summary(diagnosis: Diagnosis, unseen: Sequence[Unseen] = ()) -> st
         head = ('records that took no part', *table.head[1:])
         rows = [(printable(row[0]), *row[1:]) for row in table.rows]
         lines += ['', *columns([head, *rows])]
+    near = reversal_sentence(diagnosis)
+    if near:
+        lines += ['', *textwrap.wrap(printable(near), WIDTH)]
     lines += ['', *_facts(diagnosis)]
     lines += _effects(diagnosis)
     if diagnosis.group is not None:
