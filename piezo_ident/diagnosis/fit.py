@@ -49,7 +49,7 @@ __all__ = [
 WEIGHT_SPREAD = 0.1
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
 #: how far G may be retuned: about samples of delay, their squares, and two relaxations
-RETUNING = (5.0, 200.0, 1.0, 1.0)
+RETUNING = (20.0, 800.0, 1.0, 1.0)
 #: relative size of a finite difference in the logarithm of a parameter
 LOG_STEP = 1e-2
 #: finite difference of a weight of H, normalised
