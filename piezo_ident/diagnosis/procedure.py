@@ -36,8 +36,8 @@ from piezo_ident.diagnosis.fit import (
     fit_base,
     fit_jointly,
     Fitted,
-    RETUNING,
 )
+from piezo_ident.diagnosis.handles import RETUNING
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
