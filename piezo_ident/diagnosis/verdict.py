@@ -64,7 +64,10 @@ LOOK_ALIKES = (
     ('even_nonlinearity', 'sensor_nonlinearity'),
     ('noncongruent_minor_loops', 'sensor_nonlinearity'),
     ('slew_limit', 'amplifier_lag'),
-    ('delay_change', 'amplifier_lag', 'changed_dynamics'),
+    # all linear
+    ('delay_change', 'amplifier_lag', 'changed_dynamics', 'input_feedthrough'),
+    # both act where a full stroke turns
+    ('backlash', 'saturation'),
 )
 #: a candidate is not testable when a refit of the base swallows all but this share of it
 SWALLOWED = 1e-4
