@@ -171,6 +171,15 @@ def test_a_candidate_that_is_left_out_is_not_named(truths):
     assert 'creep' not in {c.name for c in result.candidates}
 
 
+def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    result = diagnose(model, record, DiagnosisSettings(effects=('creep',)))
+    assert [e.name for e in result.effects] == ['creep']
+    assert result.verdict == 'class' and result.group.names[0] == 'creep'
+    assert 'thermal_drift' in result.group.names
+    assert 'diagnose again with' in result.group.separating_experiment
+
+
 def test_every_step_can_be_cancelled(truths):
     model, record, _ = measured(None, 0.0, 1)
     for step in ('residual', 'candidates', 'verdict'):

@@ -1,0 +1,78 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Several nodes in one process: the same topics, the same numbers, one end."""
+
+import signal
+import subprocess
+import sys
+
+from course import block, model_of, PROGRAM, QUICK
+from graph import Graph
+import numpy as np
+import pytest
+import yaml
+
+CODE = 'import sys; from piezo_ident.nodes.composed import main; sys.exit(main())'
+
+
+@pytest.mark.parametrize(
+    ('names', 'said'),
+    [
+        ([], 'name each node once'),
+        (['stage', 'stage'], 'name each node once'),
+        (['stage', 'moddel'], "there is no node 'moddel'"),
+    ],
+)
+def test_names_that_make_no_sense_are_refused(names, said):
+    command = [sys.executable, '-c', CODE, *names]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert said in done.stderr and done.stderr.count('\n') == 1
+
+
+def test_stage_model_and_identifier_in_one_process():
+    with Graph() as g:
+        for name in ('stage', 'model', 'identifier'):
+            g.follow(f'lab/{name}', name)
+        answers, predictions = g.collect('lab/displacement'), g.collect('lab/prediction')
+        models = g.texts('lab/model')
+        file = g.folder / 'composed.yaml'
+        own = {**QUICK, 'program': PROGRAM}
+        file.write_text(yaml.safe_dump({'/lab/identifier': {'ros__parameters': own}}))
+        command = [sys.executable, '-c', CODE, 'stage', 'model', 'identifier', '--ros-args']
+        command += ['-r', '__ns:=/lab', '--params-file', str(file)]
+        process = subprocess.Popen(command, env=g.environment)
+        try:
+            g.wait(
+                lambda: all(
+                    g.status(f'lab/{n}')['state'] for n in ('stage', 'model', 'identifier')
+                ),
+                'all three to speak',
+            )
+            g.start('excitation', {'subscribers': 3}, 'lab')
+            ok, reason = g.call('lab/identifier/run')
+            assert ok, reason
+            g.wait(lambda: g.status('lab/identifier')['state'] in ('done', 'failed'), 'the run')
+            assert g.status('lab/identifier')['state'] == 'done', g.status('lab/identifier')
+            g.wait(lambda: models, 'the model')
+            assert model_of(models[-1]).delay.samples == 3
+            g.wait(lambda: g.status('lab/model')['state'] == 'predicting', 'a prediction')
+            before = len(predictions)
+            g.publish('lab/voltage', block(10**7, np.full(100, 0.0), 'hold'))
+            g.wait(lambda: len(predictions) > before, 'the prediction of a block')
+            assert answers
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(10.0) == 0
