@@ -55,6 +55,8 @@ Job = Callable[[Tick], Any]
 EVERY = 0.02
 #: how long a job may go on after it was cancelled, before its process is ended [s]
 GRACE = 0.8
+#: of a large array so many bytes go at once, and then others have their turn for so long [s]
+CHUNK, TURN = 1 << 20, 2e-3
 
 
 class _GoneError(Exception):
@@ -120,9 +122,12 @@ class _Channel:
     def _write(self, part: memoryview) -> None:
         while part.nbytes:
             try:
-                part = part[self._writing.write(part) :]
+                part = part[self._writing.write(part[:CHUNK]) :]
             except BrokenPipeError:
                 raise _GoneError from None
+            if part.nbytes:
+                # minutes of samples in one go would take a whole core from who must be in time
+                time.sleep(TURN)
 
     def _read(self, size: int) -> memoryview:
         memory, done = memoryview(bytearray(size)), 0
