@@ -42,7 +42,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.errors import PiezoIdentError
 from piezo_ident.identification import identify
 from piezo_ident.model import StageModel
 from piezo_ident.prediction import predict_record
@@ -200,9 +199,10 @@ def judged(case: Case) -> Row:
             identify_time=took,
             diagnose_time=spent,
         )
-    except PiezoIdentError as error:
-        nan = float('nan')
-        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, nan, nan, str(error))
+    # what a case dies of is its row, not the end of hours of others
+    except Exception as error:  # noqa: BLE001
+        nan, said = float('nan'), f'{type(error).__name__}: {error}'
+        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, nan, nan, said)
 
 
 def outcome(case: Case, row: Row) -> str:
