@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.dynamics import Dynamics, filter_arx
 from piezo_ident.errors import IdentificationError
+from piezo_ident.lagged import lag_products
 from piezo_ident.least_squares import ROWS, triangular_factor
 from scipy import signal
 
@@ -239,6 +240,15 @@ def stabilised(dynamics: Dynamics, radius: float = 0.9995) -> Dynamics:
     return Dynamics(a=a, b=b)
 
 
+_Lags = tuple[NDArray[np.float64], int, float, int]
+
+
+def _inner(one: _Lags, other: _Lags, n: int) -> NDArray[np.float64]:
+    """Return the sums of products of two groups of lags, each (signal, first row, sign, lags)."""
+    (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
+    return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
+
+
 def instrumental_variables(
     u: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -273,18 +283,18 @@ def instrumental_variables(
     delayed = np.concatenate([np.zeros(d), u[: u.size - d]])
     first = max(na, nb)
 
-    def lags(x: NDArray[np.float64], count: int, offset: int) -> NDArray[np.float64]:
-        return np.stack([x[first - offset - i : x.size - offset - i] for i in range(count)], 1)
-
+    n = u.size - first
     for _ in range(iterations):
         one = np.ones(1)
         y_sim = filter_arx(model.a, model.b, delayed, at_rest=False)
         yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, delayed, y_sim))
-        phi = np.hstack([-lags(yf, na, 1), lags(uf, nb, 0)])
-        z = np.hstack([-lags(sf, na, 1), lags(uf, nb, 0)])
-        scale = np.linalg.norm(z, axis=0)
+        u_lags = (uf, first, 1.0, nb)
+        z, phi = ((sf, first - 1, -1.0, na), u_lags), ((yf, first - 1, -1.0, na), u_lags)
+        A = np.block([[_inner(x, other, n) for other in phi] for x in z])
+        right = np.concatenate([_inner(x, (yf, first, 1.0, 1), n) for x in z])[:, 0]
+        scale = np.sqrt(np.concatenate([np.diag(_inner(x, x, n)) for x in z]))
         scale[scale == 0.0] = 1.0
-        theta = np.linalg.lstsq((z / scale).T @ phi, (z / scale).T @ yf[first:], rcond=None)[0]
+        theta = np.linalg.lstsq(A / scale[:, None], right / scale, rcond=None)[0]
         candidate = Dynamics(a=theta[:na], b=theta[na:])
         if not candidate.is_stable:
             return candidate

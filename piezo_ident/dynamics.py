@@ -27,43 +27,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.block import Block
+from piezo_ident.core_loops import coefficients, recursion
 from piezo_ident.errors import ModelError
-from piezo_ident.kernel import kernel
 from piezo_ident.record import frozen_array
 
 __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
 
 #: longest pure delay that a model may have [samples]
 MAX_DELAY = 1_000_000
-
-
-@kernel
-def _filter(
-    b: NDArray[np.float64],
-    a: NDArray[np.float64],
-    x: NDArray[np.float64],
-    z: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    # transposed direct form II; a = (a1, a2, ...) padded to m numbers, b = (b1, b2, ...) to m + 1,
-    # z holds m numbers
-    m = a.size
-    for k in range(x.size):
-        u = x[k]
-        y = z[0] + b[0] * u
-        for i in range(m - 1):
-            z[i] = z[i + 1] + b[i + 1] * u - a[i] * y
-        z[m - 1] = b[m] * u - a[m - 1] * y
-        out[k] = y
-
-
-def _padded(b: NDArray[np.float64], a: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    # one more coefficient of b than of a keeps the kernel's inner loop free of cases
-    m = max(a.size, b.size - 1, 1)
-    b_long, a_long = np.zeros(m + 1), np.zeros(m)
-    b_long[: b.size] = b
-    a_long[: a.size] = a
-    return b_long, a_long
+#: longest memory that is told of dynamics [samples]: more than any record has
+MAX_MEMORY = 2**40
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +77,7 @@ class Dynamics:
     @property
     def gain(self) -> float:
         """Static gain G(1), infinite for an integrator."""
-        numerator, denominator = float(self.b.sum()), 1.0 + float(self.a.sum())
-        return numerator / denominator if denominator != 0.0 else float('inf')
+        return _static_gain(self.b, self.a)
 
     @property
     def poles(self) -> NDArray[np.complex128]:
@@ -121,6 +93,15 @@ class Dynamics:
     def is_stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
         return self.radius < 1.0
+
+    def memory(self, share: float) -> int:
+        """Return after how many samples its slowest pole has fallen to a share of its start."""
+        radius = self.radius
+        if radius >= 1.0:
+            return MAX_MEMORY
+        if radius < share:
+            return self.b.size
+        return min(MAX_MEMORY, self.b.size + int(np.log(share) / np.log(radius)))
 
     def normalised(self) -> Dynamics:
         """
@@ -219,20 +200,18 @@ def filter_arx(
     -------
     ndarray, shape (n,)
     """
-    b_long, a_long = _padded(b, a)
-    z = _rest_state(b_long, a_long, float(x[0])) if at_rest else np.zeros(a_long.size)
-    out = np.empty(x.size)
-    _filter(b_long, a_long, np.ascontiguousarray(x), z, out)
-    return out
+    n_w, n_y = b.size - 1, a.size
+    w, y = np.empty(n_w + x.size), np.empty(n_y + x.size)
+    w[n_w:] = x
+    w[:n_w] = x[0] if at_rest else 0.0
+    y[:n_y] = x[0] * _static_gain(b, a) if at_rest else 0.0
+    recursion(*coefficients(b, a), w, y)
+    return y[n_y:]
 
 
-def _rest_state(
-    b_long: NDArray[np.float64], a_long: NDArray[np.float64], x0: float
-) -> NDArray[np.float64]:
-    y0 = x0 * b_long.sum() / (1.0 + a_long.sum())
-    # z[i] = sum over the coefficients still to come, found by running the recursion backwards
-    terms = b_long[1:] * x0 - a_long * y0
-    return np.ascontiguousarray(np.cumsum(terms[::-1])[::-1])
+def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:
+    numerator, denominator = float(b.sum()), 1.0 + float(a.sum())
+    return numerator / denominator if denominator != 0.0 else float('inf')
 
 
 class DynamicsOperator:
@@ -240,19 +219,23 @@ class DynamicsOperator:
 
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics = dynamics
-        self._b, self._a = _padded(dynamics.b, dynamics.a)
-        self._z = np.zeros(self._a.size)
+        self._coefficients = coefficients(dynamics.b, dynamics.a)
+        self._past_w, self._past_y = np.zeros(dynamics.b.size - 1), np.zeros(dynamics.a.size)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to equilibrium with a constant signal."""
-        self._z = _rest_state(self._b, self._a, x0)
-        return x0 * self.dynamics.gain
+        rest = x0 * self.dynamics.gain
+        self._past_w[:], self._past_y[:] = x0, rest
+        return rest
 
     def process(self, block: Block) -> Block:
         """Return the block filtered."""
-        out = np.empty(block.x.size)
-        _filter(self._b, self._a, np.ascontiguousarray(block.x), self._z, out)
-        return block.with_signal(out)
+        w = np.concatenate([self._past_w, block.x])
+        y = np.empty(self._past_y.size + block.x.size)
+        y[: self._past_y.size] = self._past_y
+        recursion(*self._coefficients, w, y)
+        self._past_w, self._past_y = w[block.x.size :].copy(), y[block.x.size :].copy()
+        return block.with_signal(y[self._past_y.size :])
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ from numpy.typing import NDArray
 from piezo_ident.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.errors import IdentificationError
 from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.kernel import kernel
+from piezo_ident.lagged import stretches_of
 from piezo_ident.least_squares import bounded_least_squares, triangular_factor
 from piezo_ident.play import initial_memory, play_columns
 from piezo_ident.swarm import particle_swarm, Quadratic
@@ -56,6 +58,8 @@ Solver = Literal['swarm', 'least_squares']
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
 #: a play that moves less than this share of what it is cannot be told from the offset
 STILL = 1e-8
+#: what may be left of the start of G where the samples used begin
+FORGOTTEN = 1e-13
 #: how far the voltage may move within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
 
@@ -101,7 +105,7 @@ class Excerpt:
     @property
     def rows(self) -> int:
         """Rows that these samples become; white noise is independent from row to row."""
-        return sum((stop - start) // self.row for start, stop in _stretches(self.use))
+        return sum((stop - start) // self.row for start, stop in stretches_of(self.use))
 
 
 def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
@@ -109,7 +113,17 @@ def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
     Return `count` evenly spaced thresholds from 0 over the excited swing, without the 0.
 
     The play at r = 0 is the linear term, so `count` operators have ``count - 1`` thresholds.
+
+    Raises
+    ------
+    IdentificationError
+        When there is no swing.
     """
+    if not swing > 0.0:
+        raise IdentificationError(
+            'hysteresis: the voltage never moves in the data fitted; record a triangle over the '
+            'range'
+        )
     return swing * np.arange(1, count) / count
 
 
@@ -129,18 +143,21 @@ def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
     return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
 
 
-def _stretches(use: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _binned(x: NDArray[np.float64], use: NDArray[np.bool_], row: int) -> NDArray[np.float64]:
+@kernel
+def _bin(
+    x: NDArray[np.float64], stretches: NDArray[np.int64], row: int, out: NDArray[np.float64]
+) -> None:
     # averages never reach across a hole in the mask; the last incomplete row is left out
-    parts = []
-    for start, stop in _stretches(use):
-        n = (stop - start) // row
-        parts.append(x[start : start + n * row].reshape(n, row).mean(axis=1))
-    return np.concatenate(parts) * np.sqrt(row) if parts else np.empty(0)
+    share = 1.0 / np.sqrt(row)
+    place = 0
+    for m in range(stretches.shape[0]):
+        for i in range((stretches[m, 1] - stretches[m, 0]) // row):
+            start = stretches[m, 0] + i * row
+            total = 0.0
+            for k in range(row):
+                total += x[start + k]
+            out[place] = share * total
+            place += 1
 
 
 def factorise(
@@ -169,20 +186,24 @@ def factorise(
 
     def rows() -> Iterator[NDArray[np.float64]]:
         for i, excerpt in enumerate(excerpts):
-            row = excerpt.row
-            memory = excerpt.start(thresholds)
-            columns = []
+            row, memory = excerpt.row, excerpt.start(thresholds)
+            stretches = np.array(stretches_of(excerpt.use)).reshape(-1, 2)
+            n = int(np.sum((stretches[:, 1] - stretches[:, 0]) // row))
+            block = np.zeros((k + m + 3, n))
+            block[i] = np.sqrt(row)
+            # the plays need all that came before the samples used, G only what it remembers
+            begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
+            begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
+            stretches -= begin
             for j in range(m + 2):
                 if j < m:
                     raw = play_columns(excerpt.u, thresholds[j : j + 1], memory[j : j + 1])[0]
                 else:
                     raw = excerpt.u ** (3 if j == m else 1)
-                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw))
-                columns.append(_binned(filtered, excerpt.use, row))
-            y = _binned(excerpt.x, excerpt.use, row)
-            offsets = np.zeros((k, y.size))
-            offsets[i] = np.sqrt(row)
-            yield np.vstack([offsets, *columns, y]).T
+                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw[begin:end]))
+                _bin(filtered, stretches, row, block[k + j])
+            _bin(np.array(excerpt.x[begin:end]), stretches, row, block[-1])
+            yield block.T
 
     return triangular_factor(rows(), k + m + 3)
 

@@ -63,6 +63,8 @@ from scipy.optimize import OptimizeResult
 
 __all__ = ['errors_of', 'identify']
 
+#: change of G within the excited band below which the band is too narrow to know G by
+HARDLY = 0.1
 #: measured and modelled small-signal gain may differ by this share before it is said
 SLOPE_TOLERANCE = 0.05
 
@@ -109,7 +111,7 @@ def identify(
     else:
         found = _unlabelled(runs, rate, scaling, settings, progress)
     model, delay, dynamics, fit, rows, said, missing, memories = found
-    warnings += [*said, *_check(delay, dynamics, fit, floor, scaling)]
+    warnings += [*said, *_check(delay, dynamics, fit, floor, scaling), *_unseen(dynamics, model)]
     wrong = misspelt([label for record in records for label in record.labels])
     if wrong:
         warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
@@ -457,6 +459,22 @@ def _check(
                 'more iterations would bring it closer'
             )
     return said
+
+
+def _unseen(dynamics: DynamicsResult, model: StageModel) -> list[str]:
+    """Say when the excitation ends where G has hardly begun to act."""
+    # a band that ends near half the sampling rate leaves nothing to see
+    if not dynamics.band < 0.2 * model.sample_rate:
+        return []
+    G = model.dynamics.response([dynamics.band], model.sample_rate)[0]
+    change = float(np.abs(G - 1.0))
+    if change > HARDLY:
+        return []
+    return [
+        f'the noise drives the stage up to {dynamics.band:.3g} Hz, where G is within '
+        f'{100 * change:.2g} % of its static gain: what it does beyond is not known; record noise '
+        'up to higher frequencies'
+    ]
 
 
 def _story(result: Identification, names: list[str]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from typing import Any, cast, TypeVar
 
 from numba import njit
 
-__all__ = ['kernel']
+__all__ = ['kernel', 'ordered_kernel']
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -35,3 +35,12 @@ def kernel(function: F) -> F:
     bits wherever it is cut.
     """
     return cast(F, njit(cache=True, nogil=True, fastmath={'reassoc'})(function))
+
+
+def ordered_kernel(function: F) -> F:
+    """
+    Compile a function that adds in the very order in which it is written.
+
+    For sums that run in vector lanes side by side, or that several loops must form alike.
+    """
+    return cast(F, njit(cache=True, nogil=True)(function))

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import ModelError
 from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.kernel import kernel
 from piezo_ident.model import Scaling, StageModel, Stream
 from piezo_ident.play import weighted_plays
 from piezo_ident.wire_format import Samples
@@ -43,8 +44,41 @@ RECENT = 5.0
 BRIDGE = 0.5
 #: time that jumps back by more samples than this is a restart, not a late block
 JUMP_BACK = 1000
+#: fastest sample clock [s], and most blocks that are kept, whatever the times say
+SHORTEST, MOST_BLOCKS = 1e-7, 100_000
 #: share of the voltage range within which the stage is at its lowest, where memory is known
 REST = 0.01
+
+
+#: what may be wrong with a block
+FINE, NOT_FINITE, NOT_UNIFORM = range(3)
+
+
+@kernel
+def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
+    shortest, longest = np.inf, 0.0
+    for k in range(t.size):
+        if not (np.isfinite(t[k]) and np.isfinite(v[k])):
+            return NOT_FINITE
+        if k:
+            step = t[k] - t[k - 1]
+            shortest, longest = min(shortest, step), max(longest, step)
+    if t.size > 1 and not (shortest > 0.999 * SHORTEST and longest < 1.5 * shortest):
+        return NOT_UNIFORM
+    return FINE
+
+
+@kernel
+def _turns(v: NDArray[np.float64], out: NDArray[np.float64]) -> int:
+    # first and last sample, and every one at which the direction changes
+    n, before = 0, 0.0
+    for k in range(v.size):
+        after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
+        if k == 0 or after != before:
+            out[n] = v[k]
+            n += 1
+        before = after
+    return n
 
 
 class TurningPoints:
@@ -73,10 +107,10 @@ class TurningPoints:
     def add(self, v: NDArray[np.float64]) -> None:
         """Add a stretch of voltage."""
         # most samples of a block are on their way somewhere
-        step = np.sign(np.diff(v))
-        turns = np.concatenate([[True], step[1:] != step[:-1], [True]]) if v.size > 1 else [True]
+        turns = np.empty(v.size)
+        count = _turns(np.array(v, dtype=np.float64), turns)
         points = self._points
-        for x in v[turns].tolist():
+        for x in turns[:count].tolist():
             if points and x == points[-1]:
                 continue
             if len(points) > 1 and (points[-1] - points[-2]) * (x - points[-1]) > 0.0:
@@ -211,7 +245,8 @@ class Predictor:
         samples : Samples
             Of voltage.
         """
-        t, v = samples.t, samples.values
+        # copies: what is remembered does not change with the message, and is whole to the kernels
+        t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
         if not self._usable(t, v):
             return None
         n, step = t.size, float(t[0]) - self._last
@@ -247,19 +282,16 @@ class Predictor:
     def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
         if not t.size:
             return False
-        if not (np.isfinite(t).all() and np.isfinite(v).all()):
+        fault = _fault(t, v)
+        if fault == NOT_FINITE:
             # counted when the gap that it leaves is met
             self.problem = (
                 f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
                 'it is left out'
             )
-            return False
-        if t.size > 1:
-            step = np.diff(t)
-            if not (step.min() > 0.0 and step.max() < 1.5 * step.min()):
-                self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
-                return False
-        return True
+        elif fault == NOT_UNIFORM:
+            self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
+        return bool(fault == FINE)
 
     def _start(self, t: NDArray[np.float64], period: float) -> None:
         self._clear()
@@ -297,7 +329,8 @@ class Predictor:
     def _remember(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         self._lowest = min(self._lowest, float(v.min()))
         self._recent.append((t, v))
-        while t[-1] - self._recent[0][0][-1] > RECENT:
+        recent = self._recent
+        while t[-1] - recent[0][0][-1] > RECENT or len(recent) > MOST_BLOCKS:
             self._old.add(self._recent.popleft()[1])
 
 
@@ -315,3 +348,5 @@ def warm_up() -> None:
     t = np.arange(100) / 1000.0
     predictor.process(Samples(t, t))
     predictor.set_model(model)
+    TurningPoints().add(t)
+    memory_after(model, t)

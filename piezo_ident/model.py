@@ -35,6 +35,7 @@ from piezo_ident.block import Block, Chain, Operator
 from piezo_ident.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.effects import find_effect
 from piezo_ident.errors import ModelError
+from piezo_ident.fused import fused, FusedOperator
 from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record import Piece, Record
 
@@ -251,12 +252,13 @@ class StageModel:
         """
         self.check_rate(piece)
         stream = self.stream(memory)
+        if not stream.sees_more:
+            return stream.process(piece.v)
         y = np.empty(piece.n)
-        t = piece.t
         for start in range(0, piece.n, CHUNK):
             cut = slice(start, start + CHUNK)
             channels = {name: x[cut] for name, x in piece.channels.items()}
-            y[cut] = stream.process(piece.v[cut], t[cut], channels)
+            y[cut] = stream.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
         return y
 
     def predict(
@@ -304,10 +306,12 @@ class StageModel:
         """Return a warning when the voltage leaves the range in which the model was identified."""
         low, high = self.scaling.range
         slack = 1e-3 * (high - low)
+        seen = record.voltage_range
+        if low - slack <= seen[0] and seen[1] <= high + slack:
+            return ()
         outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
         if not outside:
             return ()
-        seen = record.voltage_range
         return (
             f'{record.name}: {outside / record.n:.1%} of the samples lie outside the identified '
             f'range {low:g} .. {high:g} V (they reach {seen[0]:g} .. {seen[1]:g} V); '
@@ -325,9 +329,22 @@ class Stream:
 
     def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
         self.model = model
-        self._chain = model.chain(memory)
+        self._chain = fused(model.chain(memory))
         self._count = 0
+        # a chain that is one kernel needs no block to pass along, and knows the scaling itself
+        match self._chain.operators:
+            case (FusedOperator() as alone,):
+                s = model.scaling
+                self._alone: FusedOperator | None = alone.scaled(s.v0, s.V, s.y0, s.Y)
+                self._chain = Chain((self._alone,))
+            case _:
+                self._alone = None
         self._started = False
+
+    @property
+    def sees_more(self) -> bool:
+        """Whether anything but the voltage can matter: time, further channels."""
+        return self._alone is None
 
     def reset(self, v0: float) -> float:
         """Come to rest at a voltage [V] and return the displacement there [m]."""
@@ -352,15 +369,18 @@ class Stream:
         channels : mapping of str to ndarray, optional
             Further measured signals.
         """
-        u = self.model.scaling.u(v)
-        if u.size == 0:
+        x = np.asarray(v, dtype=np.float64)
+        if x.size == 0:
             return np.empty(0)
         if not self._started:
-            self.reset(float(np.asarray(v, dtype=np.float64)[0]))
+            self.reset(float(x[0]))
+        if self._alone is not None:
+            return self._alone.run(x)
         if t is None:
-            time = (self._count + np.arange(u.size)) / self.model.sample_rate
+            time = (self._count + np.arange(x.size)) / self.model.sample_rate
         else:
             time = np.asarray(t, dtype=np.float64)
-        self._count += u.size
+        self._count += x.size
+        u = self.model.scaling.u(x)
         block = self._chain.process(Block(t=time, v=u, x=u, channels=channels or {}))
         return self.model.scaling.y(block.x)

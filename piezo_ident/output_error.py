@@ -31,6 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.dynamics import Dynamics, filter_arx
+from piezo_ident.lagged import lag_products, stretches_of
 
 __all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
 
@@ -83,11 +84,11 @@ class OutputErrorFit:
     improved: bool
 
 
-def _shifts(x: NDArray[np.float64], count: int, first: int) -> NDArray[np.float64]:
-    # rows are x delayed by first, first + 1, ...; before the record the stage was at rest
-    padded = np.concatenate([np.full(first + count, x[0]), x])
-    begin = [first + count - (first + i) for i in range(count)]
-    return np.stack([padded[b : b + x.size] for b in begin])
+def _past(x: NDArray[np.float64], use: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
+    # before the record the stage was at rest; a constant has no part in what is eliminated with
+    # the offsets, and without it the sums lose no digits
+    level = float(x[use].mean())
+    return np.concatenate([np.full(count, x[0] - level), x - level])
 
 
 class _Problem:
@@ -96,6 +97,8 @@ class _Problem:
     def __init__(self, stretches: Sequence[Stretch], na: int, nb: int) -> None:
         self.stretches, self.na, self.nb = stretches, na, nb
         self.n = int(sum(s.use.sum() for s in stretches))
+        self.used = [stretches_of(s.use) for s in stretches]
+        self.ones = np.ones(max(s.use.size for s in stretches))
 
     def loss(self, model: Dynamics) -> tuple[float, NDArray[np.float64]]:
         total, offsets = 0.0, []
@@ -106,17 +109,32 @@ class _Problem:
         return total / self.n, np.array(offsets)
 
     def normal(self, model: Dynamics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        p = self.na + self.nb
+        na, p = self.na, self.na + self.nb
         H, g = np.zeros((p, p)), np.zeros(p)
         one = np.ones(1)
-        for s in self.stretches:
+        for s, stretches in zip(self.stretches, self.used, strict=True):
             y_sim = filter_arx(model.a, model.b, s.w)
             w_f, y_f = filter_arx(model.a, one, s.w), filter_arx(model.a, one, y_sim)
-            J = np.concatenate([-_shifts(y_f, self.na, 1), _shifts(w_f, self.nb, 0)])[:, s.use]
-            J -= J.mean(axis=1, keepdims=True)
-            e = (s.y - y_sim)[s.use]
-            H += J @ J.T
-            g += J @ (e - e.mean())
+            e = s.y - y_sim
+            e -= e[s.use].mean()
+            # what is y(k-1), y(k-2), ... and w(k), w(k-1), ... to the products
+            groups = [(-_past(y_f, s.use, p), p - 1, slice(0, na), na)] if na else []
+            groups.append((_past(w_f, s.use, p), p, slice(na, p), p - na))
+            sums, n = np.zeros(p), 0
+            for start, stop in stretches:
+                n += stop - start
+                here = stop - start
+                for x, x_at, rows, n_x in groups:
+                    at = start + x_at
+                    g[rows] += lag_products(x, e, at, start, here, n_x, 1)[:, 0]
+                    sums[rows] += lag_products(x, self.ones, at, 0, here, n_x, 1)[:, 0]
+                    for z, z_at, columns, n_z in groups:
+                        if columns.start >= rows.start:
+                            H[rows, columns] += lag_products(
+                                x, z, at, start + z_at, here, n_x, n_z
+                            )
+            H -= np.outer(sums, sums) / n
+        H[na:, :na] = H[:na, na:].T
         return H, g
 
 

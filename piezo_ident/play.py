@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from piezo_ident.core_loops import sum_of_plays
 from piezo_ident.kernel import kernel
 
 __all__ = ['initial_memory', 'play', 'play_columns', 'weighted_plays']
@@ -51,30 +52,6 @@ def _columns(
                 f = x - width
             out[i, k] = f
         memory[i] = f
-
-
-@kernel
-def _weighted(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
-    p1: float,
-    p2: float,
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    n_r = r.size
-    for k in range(v.size):
-        x = v[k]
-        w = 0.0
-        for i in range(n_r):
-            f = memory[i]
-            f = x if f > x else f
-            low = x - r[i]
-            f = low if f < low else f
-            memory[i] = f
-            w += q[i] * f
-        out[k] = w + (p1 * x * x + p2) * x
 
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
@@ -163,5 +140,5 @@ def weighted_plays(
     x = np.ascontiguousarray(v)
     end = memory.copy()
     out = np.empty(x.size)
-    _weighted(x, thresholds, weights, p1, p2, end, out)
+    sum_of_plays(x, thresholds, weights, p1, p2, end, out)
     return out, end

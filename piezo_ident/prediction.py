@@ -101,7 +101,7 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
     Raises
     ------
     ModelError
-        When a piece has another sampling rate than the model.
+        When a piece has another sampling rate than the model, or the prediction overflows.
     """
     for piece in record:
         try:
@@ -132,6 +132,8 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
         late.append(mask)
     y = np.concatenate([piece.y for piece in record])
     y_hat = np.concatenate(prediction.pieces)
+    if not np.all(np.isfinite(y_hat)):
+        raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
     mask = np.concatenate(late)
     return RecordPrediction(
         prediction=prediction,

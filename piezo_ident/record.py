@@ -165,8 +165,12 @@ class Piece:
         ``k / sample_rate`` in one division where the piece starts on a tick of the sample clock,
         so that two streams of the same clock join on equal numbers.
         """
+        return self.time(0, self.n)
+
+    def time(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
         first = round(self.start_time * self.sample_rate)
-        ticks = np.arange(self.n, dtype=np.float64)
+        ticks = np.arange(start, min(stop, self.n), dtype=np.float64)
         if first / self.sample_rate == self.start_time:
             return (first + ticks) / self.sample_rate
         return self.start_time + ticks / self.sample_rate
@@ -195,7 +199,7 @@ class Piece:
             v=self.v[start:stop],
             y=self.y[start:stop],
             sample_rate=self.sample_rate,
-            start_time=float(self.t[start]) if start else self.start_time,
+            start_time=float(self.time(start, start + 1)[0]) if start else self.start_time,
             segments=segments,
             channels={k: x[start:stop] for k, x in self.channels.items()},
         )

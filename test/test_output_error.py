@@ -117,3 +117,9 @@ def test_tick_may_stop_the_work():
 
     with pytest.raises(Stop):
         output_error([stretch()], Dynamics([-1.4, 0.7], [0.1, 0.3]), tick=tick)
+
+
+def test_a_model_without_poles_is_fitted_too():
+    fit = output_error([stretch(G=Dynamics([], [0.6, 0.3]))], Dynamics([], [0.2, 0.1]))
+    assert fit.dynamics.a.size == 0
+    assert_allclose(fit.dynamics.b, [0.6, 0.3], atol=1e-9)

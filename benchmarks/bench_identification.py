@@ -1,0 +1,177 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Identification of 17 s at 20 kHz, as a whole and step by step.
+
+    .venv-bench/bin/python benchmarks/bench_identification.py [--quick]
+
+The record is the simulated stage of the paper under the shipped programme with a slower triangle.
+All is warm: compiled kernels are loaded before the clock starts.
+"""
+
+from __future__ import annotations
+
+import os
+
+# tall, narrow factorisations only get slower on more threads
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from collections.abc import Callable
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+from piezo_ident.arx import arx_factor, excited_band, prefilter, scan_orders
+from piezo_ident.dynamics import Delay
+from piezo_ident.hysteresis_fit import even_thresholds, factorise, fit_hysteresis
+from piezo_ident.identification import identify
+from piezo_ident.program import parse_program
+from piezo_ident.record import Record
+from piezo_ident.results import Settings, silent
+from piezo_ident.runs import prepare, Run
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
+from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
+
+RUNS = 5
+#: what the three steps may take [s]
+LIMIT = 1.5
+#: slope of the triangle that makes the programme 17 s long [V/s]
+SLOPE = 4.9
+MAX_ORDER = 15
+
+Work = Callable[[int], object]
+
+
+def record_of_17_s() -> Record:
+    """Return what the simulated stage answers to the programme."""
+    stage = load_stage(find_config('paper', 'stage'))
+    path = Path(find_config('identification', 'program'))
+    text = path.read_text(encoding='utf-8').replace('slope: 6}', f'slope: {SLOPE}}}')
+    sequence = parse_program(text, path.name).build(stage.model.sample_rate)
+    return simulate(stage, sequence, np.random.default_rng(0))
+
+
+def whole(record: Record, runs: int) -> tuple[str, str]:
+    """Return the table of all three steps."""
+    ways = {
+        f'ten operators, orders up to ({MAX_ORDER}, {MAX_ORDER}), swarm': Settings(),
+        'the same, least squares in place of the swarm': Settings(solver='least_squares'),
+        'number and places of the thresholds chosen too': Settings(refine=True),
+    }
+
+    def timed(settings: Settings) -> tuple[float, float]:
+        start = time.process_time()
+        error = identify(record, settings).error('selection')
+        return time.process_time() - start, error
+
+    works: dict[str, Work] = {name: lambda _, s=s: timed(s) for name, s in ways.items()}
+    turns = take_turns(works, runs, warm=works)
+    rows = [
+        [
+            name,
+            seconds(turn.median),
+            f'{min(turn.times):.3g} .. {seconds(max(turn.times))}',
+            seconds(float(np.median([spent for spent, _ in turn.results]))),
+            ratio(turn.median / LIMIT),
+            ratio(record.duration / turn.median),
+            f'{turn.results[0][1]:.3g} %',
+        ]
+        for name, turn in turns.items()
+    ]
+    heads = (
+        'way',
+        'median',
+        'from .. to',
+        'time of the processor',
+        f'share of {LIMIT} s',
+        'times faster than the record',
+        'error on samples kept from every fit',
+    )
+    return f'Three steps of {record.duration:.1f} s at {record.pieces[0].sample_rate:g} Hz', (
+        markdown(heads, rows)
+    )
+
+
+def by_steps(record: Record, runs: int) -> tuple[str, str]:
+    """Return the table of the steps, each alone."""
+    settings = Settings()
+    data = prepare([record])
+    delay = Delay(first_step(data.runs, settings, silent).samples)
+    _, G = second_step(data.runs, delay, settings, silent)
+    excerpts = triangle_excerpts(data.runs)
+    n = int(sum(e.use.sum() for e in excerpts))
+    r = even_thresholds(max(float(np.ptp(e.u[e.use])) for e in excerpts), settings.thresholds)
+    R = factorise(excerpts, r, G, delay)
+    u, y, n_fit = noise_of(data.runs[0])
+
+    def search(_: int) -> tuple[int, int]:
+        factor = arx_factor(u[:n_fit], y[:n_fit], MAX_ORDER, MAX_ORDER + delay.samples)
+        table = scan_orders(factor, delay.samples, MAX_ORDER, u[n_fit:], y[n_fit:])
+        return table.best('held_out')
+
+    def swarm(turn: int) -> float:
+        fit = fit_hysteresis(R, r, n, solver='swarm', rng=np.random.default_rng(turn))
+        return float(fit.swarm_loss or np.nan) / fit.optimum_loss - 1.0
+
+    works: dict[str, Work] = {
+        'normalisation, masks, checks': lambda _: prepare([record]),
+        'step 1: delay': lambda _: first_step(data.runs, settings, silent).samples,
+        'step 2: dynamics': lambda _: second_step(data.runs, delay, settings, silent)[0].order,
+        f'of it, one search of all {MAX_ORDER}^2 orders': search,
+        'step 3: reduction of the triangle': lambda _: factorise(excerpts, r, G, delay),
+        'step 3: swarm and least squares': swarm,
+    }
+    turns: dict[str, Turn] = take_turns(works, runs, warm=works)
+    found = {
+        'step 1: delay': '{} samples',
+        'step 2: dynamics': 'order {}',
+        f'of it, one search of all {MAX_ORDER}^2 orders': 'least held-out error at {}',
+        'step 3: swarm and least squares': 'swarm {:.1e} above the optimum before polishing',
+    }
+    rows = [
+        [name, seconds(turn.median), found.get(name, '').format(turn.results[0])]
+        for name, turn in turns.items()
+    ]
+    return 'Step by step', markdown(('', 'median', 'found'), rows)
+
+
+def noise_of(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return input and output of the noise, filtered to its band, and how many are fitted."""
+    (segment,) = run.piece.find('noise')
+    cut, rate = slice(segment.start, segment.stop), run.piece.sample_rate
+    band = excited_band(run.u[cut] - run.u[cut].mean(), rate)
+    u, y = (prefilter(x[cut], rate, band)[500:] for x in (run.u, run.x))
+    return u, y, int(0.8 * u.size)
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    """Return titles and texts."""
+    record, runs = record_of_17_s(), 2 if quick else RUNS
+    return [whole(record, runs), by_steps(record, runs)]
+
+
+def main() -> None:
+    """Print the tables."""
+    print(versions('numpy', 'scipy', 'numba'))
+    for title, text in sections('--quick' in sys.argv[1:]):
+        print(f'\n### {title}\n\n{text}')
+
+
+if __name__ == '__main__':
+    main()

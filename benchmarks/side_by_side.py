@@ -1,0 +1,128 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Works timed side by side in one run, and what is written about them.
+
+Whatever is compared runs in turns in one process, so that what else the machine does falls on all
+of it alike.  Figures are medians over the turns; only their ratios travel to other machines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+import time
+from typing import Any
+
+import numpy as np
+
+__all__ = ['Turn', 'markdown', 'ratio', 'seconds', 'take_turns', 'version_of', 'versions']
+
+
+@dataclass
+class Turn:
+    """
+    What came of one work over its turns.
+
+    Attributes
+    ----------
+    times : list of float
+        Wall time of each turn [s].
+    results : list
+        What each turn returned.
+    """
+
+    times: list[float] = field(default_factory=list)
+    results: list[Any] = field(default_factory=list)
+
+    @property
+    def median(self) -> float:
+        """Median time [s]."""
+        return float(np.median(self.times))
+
+    def over(self, other: Turn) -> float:
+        """Return the median of the ratios of the times turn by turn, this one's over another's."""
+        n = min(len(self.times), len(other.times))
+        return float(np.median(np.array(self.times[:n]) / np.array(other.times[:n])))
+
+
+def take_turns(
+    works: Mapping[str, Callable[[int], Any]],
+    runs: int,
+    *,
+    fewer: Mapping[str, int] | None = None,
+    warm: Iterable[str] = (),
+) -> dict[str, Turn]:
+    """
+    Run every work in turns.
+
+    Parameters
+    ----------
+    works : mapping of str to callable
+        Each is given the number of the turn.
+    runs : int
+    fewer : mapping of str to int, optional
+        Works that take fewer turns, the first ones.
+    warm : iterable of str, optional
+        Works that are run once before, untimed: what compiles on its first call.
+    """
+    for name in warm:
+        works[name](0)
+    turns = {name: Turn() for name in works}
+    for k in range(runs):
+        for name, work in works.items():
+            if k >= (fewer or {}).get(name, runs):
+                continue
+            start = time.perf_counter()
+            result = work(k)
+            turns[name].times.append(time.perf_counter() - start)
+            turns[name].results.append(result)
+    return turns
+
+
+def seconds(t: float) -> str:
+    """Return a time with its unit, three digits."""
+    for unit, size in (('s', 1.0), ('ms', 1e-3), ('µs', 1e-6)):
+        if t >= size:
+            return f'{t / size:.3g} {unit}' if t / size < 1000 else f'{t / size:.0f} {unit}'
+    return f'{1e9 * t:.3g} ns'
+
+
+def ratio(x: float) -> str:
+    """Return a ratio with a sensible number of digits."""
+    return f'{x:.0f}' if x >= 100 else f'{x:.3g}'
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table."""
+    lines = ['| ' + ' | '.join(heads) + ' |', '|' + '---|' * len(heads)]
+    lines += ['| ' + ' | '.join(str(cell) for cell in row) + ' |' for row in rows]
+    return '\n'.join(lines)
+
+
+def version_of(name: str) -> str | None:
+    """Return the version of an installed distribution, None when it is not there."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def versions(*names: str) -> str:
+    """Return the names with the versions of those that are installed."""
+    found = [(name, version_of(name)) for name in names]
+    return ', '.join(f'{name} {number}' for name, number in found if number)

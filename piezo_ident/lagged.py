@@ -1,0 +1,107 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Sums of products of lagged signals, without the matrix of their lags.
+
+All of them follow from those in which one of the two signals has no lag:
+
+    S(i, j) = sum_{k=s}^{e-1} x(k-i) z(k-j)
+    S(i+1, j+1) = S(i, j) + x(s-1-i) z(s-1-j) - x(e-1-i) z(e-1-j)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.kernel import kernel
+
+__all__ = ['lag_products', 'stretches_of']
+
+#: samples whose products are summed while they are in the cache
+STRETCH = 1024
+
+
+@kernel
+def _products(
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    x_at: int,
+    z_at: int,
+    n: int,
+    out: NDArray[np.float64],
+) -> None:
+    out[:] = 0.0
+    for start in range(0, n, STRETCH):
+        size = min(STRETCH, n - start)
+        a = x[x_at + start : x_at + start + size]
+        for j in range(out.size):
+            b = z[z_at + start - j : z_at + start - j + size]
+            total = 0.0
+            for k in range(size):
+                total += a[k] * b[k]
+            out[j] += total
+
+
+@kernel
+def lag_products(
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    x_at: int,
+    z_at: int,
+    n: int,
+    n_x: int,
+    n_z: int,
+) -> NDArray[np.float64]:
+    """
+    Return ``S(i, j)`` for the lags ``0 .. n_x - 1`` of x and ``0 .. n_z - 1`` of z.
+
+    Parameters
+    ----------
+    x, z : ndarray, shape (any,)
+    x_at, z_at : int
+        Where the n samples begin in each; at least as many samples as there are lags come before.
+    n : int
+    n_x, n_z : int
+        At least 1.
+
+    Returns
+    -------
+    ndarray, shape (n_x, n_z)
+    """
+    S = np.empty((n_x, n_z))
+    row, column = np.empty(n_z), np.empty(n_x)
+    _products(x, z, x_at, z_at, n, row)
+    _products(z, x, z_at, x_at, n, column)
+    S[0, :] = row
+    S[:, 0] = column
+    for i in range(n_x - 1):
+        for j in range(n_z - 1):
+            first = x[x_at - 1 - i] * z[z_at - 1 - j]
+            last = x[x_at + n - 1 - i] * z[z_at + n - 1 - j]
+            S[i + 1, j + 1] = S[i, j] + (first - last)
+    return S
+
+
+def stretches_of(use: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """
+    Return (start, stop) of every stretch of true values.
+
+    >>> stretches_of(np.array([True, True, False, True]))
+    [(0, 2), (3, 4)]
+    """
+    padded = np.concatenate([[False], use, [False]])
+    edges = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
