@@ -221,6 +221,9 @@ def _labelled(
     delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
     dynamics, G = steps.dynamics or second_step(runs, delay, settings, progress)
+    if delay_result.agree is False and steps.delay is None and steps.dynamics is None:
+        delay_result, dynamics, G = _either(runs, delay_result, dynamics, G, settings, progress)
+        delay = Delay(delay_result.samples)
     held = triangle_excerpts(runs, held=True)
     result = _third_step(fit, held, G, delay, settings, progress)
     model = _model(rate, scaling, result, G, delay)
@@ -230,7 +233,7 @@ def _labelled(
             'the triangle turns too often to hold a part of it out; the thresholds were not '
             'refined, use a slower triangle'
         )
-    if delay_result.source == 'scan':
+    if delay_result.source == 'scan' and delay_result.agree is None:
         said.append('no step rises above the noise; the delay was read from the ARX loss alone')
     lowest = min(float(e.u[e.use].min()) for e in fit)
     highest = max(float(e.u[e.use].max()) for e in fit)
@@ -247,6 +250,23 @@ def _labelled(
         masks.append((run.mask('triangle', 'noise', 'settle', 'step') & ~kept, kept))
     rows = errors_of(model, runs, masks)
     return model, delay_result, dynamics, result, rows, said, [], {}
+
+
+def _either(
+    runs: list[Run],
+    delay: DelayResult,
+    dynamics: DynamicsResult,
+    G: Dynamics,
+    settings: Settings,
+    progress: Progress,
+) -> tuple[DelayResult, DynamicsResult, Dynamics]:
+    """Return delay and G with the delay of the steps or of the scan, whichever errs less."""
+    other = replace(delay, samples=delay.scan or 0, source='scan')
+    result, other_G = second_step(runs, Delay(other.samples), settings, progress)
+    # slow noise is averaged out of few steps badly; a free run does not care who was right
+    if min(result.methods.values()) < min(dynamics.methods.values()):
+        return other, result, other_G
+    return delay, dynamics, G
 
 
 def _unlabelled(
@@ -441,7 +461,7 @@ def _check(
     if delay.agree is False and delay.step is not None:
         said.append(
             f'steps say a delay of {delay.step.samples} samples, the ARX loss says {delay.scan}; '
-            'the steps were followed'
+            f'{"the steps were" if delay.source == "steps" else "the loss was"} followed'
         )
     measured, modelled = dynamics.slope_measured, dynamics.slope_model
     if np.isfinite(measured) and abs(measured / modelled - 1.0) > SLOPE_TOLERANCE:

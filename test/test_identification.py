@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_array_equal
+from piezo_ident import three_steps
 from piezo_ident.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.identification import identify
 from piezo_ident.model import EffectSetting, Scaling
@@ -116,6 +117,20 @@ def test_hysteresis_alone_misses_as_in_the_paper(paper):
     errors = sine_errors(PAPER.model, paper[1].model.without_dynamics())
     expected = [0.09, 0.85, 4.3, 6.8, 8.5, 10.2]
     assert errors == pytest.approx(expected, rel=0.06)
+
+
+def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
+    def first_step(*arguments):
+        found = three_steps.first_step(*arguments)
+        return replace(found, samples=7, step=replace(found.step, samples=7))
+
+    monkeypatch.setattr('piezo_ident.identification.first_step', first_step)
+    result = identify(short(noise=2e-5), QUICK)
+    assert (result.delay.step.samples, result.delay.scan) == (7, 3)
+    assert (result.delay.samples, result.delay.source) == (3, 'scan')
+    said = 'steps say a delay of 7 samples, the ARX loss says 3; the loss was followed'
+    assert said in result.warnings
+    assert max(sine_errors(PAPER.model, result.model)) < 0.1
 
 
 def test_swarm_and_optimum_are_both_told(paper):
