@@ -9,8 +9,9 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
+.PHONY: attack netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: study table-one clean distclean
+.PHONY: crash fuzz numbers study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -23,19 +24,26 @@ lint: .venv/.test
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-pytest: .venv/.test
-	.venv/bin/pytest --ignore=test/nodes $(PYTEST_ARGS)
+# a file of tests stays in one process; node tests mostly wait, and come when the rest is done
+PARALLEL := -n 2 --dist loadfile
 
-# node processes over DDS; they mind what else the machine is doing
-test-graph: .venv/.graph
+pytest: .venv/.test
+	.venv/bin/pytest $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS)
+	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS)
+
+# node processes over DDS alone
+test-graph: .venv/.test
 	.venv/bin/pytest test/nodes $(PYTEST_ARGS)
 
 # the same tests on the versions that Jazzy stands on
 test-jazzy: .venv-jazzy/.test
 	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
 
-bench: .venv/.demo
-	.venv/bin/python benchmarks/bench_prediction.py
+# side by side with the peers, in an environment of their own: about twenty minutes; QUICK=1
+# for a short version, which goes to build/
+bench: .venv-bench/.bench
+	.venv-bench/bin/python benchmarks/run_all.py \
+		$(if $(QUICK),--quick --out build/benchmarks.md,--out docs/benchmarks.md)
 
 # the running graph in real time, 20 kHz for so many seconds, and faster
 BENCH_SECONDS ?= 300
@@ -50,9 +58,43 @@ study-identification: .venv/.demo
 study: .venv/.demo
 	.venv/bin/python benchmarks/study_diagnosis.py docs/diagnosis_study.md
 
+# what docs/reliability.md says, run again; then the page is made of what came out
+RUN_STUDY = .venv/bin/python benchmarks/reliability
+attack: .venv/.test
+	$(RUN_STUDY)/safety.py --count 100000
+	$(RUN_STUDY)/attack.py
+	$(RUN_STUDY)/build.py
+
+# two hosts as network namespaces; says why when there can be none (root, ip and nft are needed)
+netns: .venv/.test
+	$(RUN_STUDY)/netns.py
+	$(RUN_STUDY)/build.py
+
+# the whole graph in real time for two hours
+SECONDS ?= 7200
+soak: .venv/.test
+	$(RUN_STUDY)/soak.py --seconds $(SECONDS)
+	$(RUN_STUDY)/build.py
+
 # Table I of the paper with a third row: about a minute
 table-one: .venv/.demo
 	.venv/bin/python benchmarks/table_one.py docs/table_one.md
+
+# hostile files, more than a million inputs: about a quarter of an hour
+fuzz: .venv/.fuzz
+	.venv/bin/python benchmarks/reliability/fuzz.py
+	$(RUN_STUDY)/build.py
+
+# every command killed while it works, on full and on read-only disks: some minutes, best as root
+crash: .venv/.test
+	.venv/bin/python benchmarks/reliability/crash.py
+	$(RUN_STUDY)/build.py
+
+# numbers that cannot be trusted; then the same data on other versions of everything
+numbers: .venv/.test
+	.venv/bin/python benchmarks/reliability/untrusted.py
+	.venv/bin/python benchmarks/reliability/versions.py
+	$(RUN_STUDY)/build.py
 
 # what a ROS workspace would do, without ROS; and every node starts from there
 colcon: .venv/.colcon
@@ -64,24 +106,29 @@ colcon: .venv/.colcon
 
 # one environment, more of it as it is asked for
 .venv/.demo: EXTRAS := [ros]
-.venv/.test: EXTRAS := [test]
-.venv/.graph: EXTRAS := [ros,test]
+.venv/.test: EXTRAS := [ros,test]
 .venv/.colcon: EXTRAS := [colcon,ros]
+.venv/.fuzz: EXTRAS := [ros,test,fuzz]
 .venv-jazzy/.test: EXTRAS := [test]
+.venv-bench/.bench: EXTRAS := [bench]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
 
 .venv-jazzy/.test: constraints-jazzy.txt
 
-.venv/.made .venv-jazzy/.made:
+.venv/.made .venv-jazzy/.made .venv-bench/.made:
 	$(PYTHON) -m venv --clear $(@D)
 	touch $@
 
-.venv/.demo .venv/.test .venv/.graph .venv/.colcon: .venv/.made $(DECLARED)
+.venv/.demo .venv/.test .venv/.fuzz .venv/.colcon: .venv/.made $(DECLARED)
 	.venv/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
 	touch $@
 
 .venv-jazzy/.test: .venv-jazzy/.made $(DECLARED)
 	.venv-jazzy/bin/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) -e ".$(EXTRAS)"
+	touch $@
+
+.venv-bench/.bench: .venv-bench/.made $(DECLARED)
+	.venv-bench/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
 	touch $@
 
 clean:
@@ -90,4 +137,4 @@ clean:
 	find . -name .venv\* -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv .venv-jazzy
+	rm -rf .venv .venv-jazzy .venv-bench

@@ -20,6 +20,14 @@ from setuptools import find_packages, setup
 
 package_name = 'piezo_ident'
 
+# many records over several machines
+cluster = [
+    'dask>=2024.5',
+    'distributed>=2024.5',
+]
+# their table for other programs
+parquet = ['pyarrow>=15']
+
 lint = [
     'mypy>=2.4,<3',
     'ruff>=0.17,<0.18',
@@ -34,7 +42,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
-        (f'share/{package_name}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{package_name}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{package_name}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
@@ -55,14 +64,33 @@ setup(
             'ros-jazzy-common-interfaces>=5.3,<6',
             'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
         ],
+        'cluster': cluster,
+        'parquet': parquet,
         'test': [
+            *cluster,
             *lint,
+            *parquet,
             'hypothesis>=6,<7',
             'jsonschema>=4,<5',
             'mcap>=1.1,<2',
             'mcap-ros2-support>=0.5,<1',
             'pytest>=7.4,<10',
             'pytest-timeout>=2.2,<3',
+            'pytest-xdist>=3.5,<4',
+        ],
+        # what the benchmarks set beside the package; all live with one numpy, 2.0 to 2.3
+        'bench': [
+            *cluster,
+            *parquet,
+            'control>=0.10,<0.11',
+            'pyswarms>=1.3,<2',
+            'pysindy>=2.1,<3',
+            'sippy_unipi>=1.0.1,<2',
+            'sysidentpy>=0.9,<0.10',
+        ],
+        # has no wheels for other machines, nor for Python 3.10
+        'fuzz': [
+            'atheris>=3,<4; python_version >= "3.11" and platform_machine == "x86_64"',
         ],
         'colcon': [
             'colcon-common-extensions>=0.3,<0.4',
@@ -83,6 +111,7 @@ setup(
             'model = piezo_ident.nodes.model:main',
             'recorder = piezo_ident.nodes.recorder:main',
             'player = piezo_ident.nodes.player:main',
+            'composed = piezo_ident.nodes.composed:main',
         ],
     },
 )

@@ -138,7 +138,8 @@ def _follow(
         x = v[k]
         if not np.isfinite(x):
             counts[0] += 1
-            x = state[1]
+            # the limits may have been moved since
+            x = min(max(state[1], low), high)
         else:
             if x < low or x > high:
                 counts[1] += 1
@@ -176,7 +177,7 @@ class Guard:
     ----------
     settings : GuardSettings
         May be replaced at any time; an applied voltage outside new limits moves back into them at
-        the slew.
+        the slew, also in a gap and before a ramp to rest.
     applied : float, optional
         The voltage applied so far [V]; rest when absent.
 
@@ -196,6 +197,8 @@ class Guard:
         self._settings = settings
         # start and length in samples of the ramp to rest, and how much of it is done
         self._ramp: tuple[float, int, int] | None = None
+        # whether nothing has been commanded since the last silence
+        self._idled = False
 
     @property
     def settings(self) -> GuardSettings:
@@ -235,11 +238,11 @@ class Guard:
         """
         v = np.ascontiguousarray(command, dtype=np.float64)
         state, settings = self._state, self._settings
-        if self._ramp is not None or restarted:
+        if self._idled or restarted:
             state[_COMMAND] = state[_APPLIED]
             state[_DONE] = state[_LENGTH] = 0.0
             state[_PENDING] = 1.0
-            self._ramp = None
+            self._ramp, self._idled = None, False
         if not v.size or self._is_in_order(v):
             return Applied(v)
         counts = np.zeros(len(REASONS), dtype=np.int64)
@@ -277,7 +280,26 @@ class Guard:
 
     def hold(self, n: int) -> NDArray[np.float64]:
         """Return what is applied while `n` samples of a stream are missing: the last voltage."""
-        return np.full(n, self.applied)
+        back = self._back_inside(n)
+        return np.concatenate([back, np.full(n - back.size, self.applied)])
+
+    def _back_inside(self, n: int) -> NDArray[np.float64]:
+        """Return up to `n` samples of the way back into limits that were moved."""
+        settings, start = self._settings, self.applied
+        limit = min(max(start, settings.low), settings.high)
+        if limit == start or not n:
+            return np.empty(0)
+        most = min(n, math.ceil(abs(limit - start) / settings.step) + 1)
+        steps = np.full(most + 1, math.copysign(settings.step, limit - start))
+        steps[0] = start
+        # one after the other, so that it does not matter how the time is cut
+        way = np.add.accumulate(steps)[1:]
+        there = np.flatnonzero(way <= limit if limit < start else way >= limit)
+        if there.size:
+            way = way[: there[0] + 1]
+            way[-1] = limit
+        self._state[_APPLIED] = way[-1]
+        return np.asarray(way)
 
     def idle(self, n: int, longest: float = math.inf) -> NDArray[np.float64]:
         """
@@ -297,6 +319,11 @@ class Guard:
             [V]
         """
         settings, rest = self._settings, self._settings.rest
+        self._idled = True
+        back = self._back_inside(n)
+        n -= back.size
+        if not n:
+            return back
         if self._ramp is None:
             distance = 2.0 * abs(rest - self.applied)
             length = math.ceil(distance / settings.ramp_step)
@@ -311,6 +338,5 @@ class Guard:
         # rest itself, not what rounding leaves of it
         voltage = np.where(k >= length, rest, start + (rest - start) * shape)
         self._ramp = (start, length, done + n)
-        if n:
-            self._state[_APPLIED] = voltage[-1]
-        return voltage
+        self._state[_APPLIED] = voltage[-1]
+        return np.concatenate([back, voltage]) if back.size else voltage

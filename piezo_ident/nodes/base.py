@@ -23,9 +23,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import os
+from pathlib import Path
 import signal
 import sys
 import threading
+import traceback
 from typing import Any
 
 # before numpy is loaded: tall, narrow factorisations only get slower on more threads
@@ -42,6 +44,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -50,11 +53,13 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-__all__ = ['LabNode', 'run']
+__all__ = ['LabNode', 'run', 'run_together']
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
 SWITCH = 2e-4
+#: callbacks in a row that fail before a node gives up
+MOST_FAILURES = 1000
 
 
 class LabNode(Node):
@@ -73,6 +78,10 @@ class LabNode(Node):
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
         self.values: dict[str, Any] = {}
+        #: all values as they would be with what is just being set
+        self.wanted: dict[str, Any] = {}
+        # a timer of the ROS clock would stand still when somebody sets use_sim_time
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._status = self.create_publisher(DiagnosticStatus, '~/status', LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', PREVIEW)
         for declaration in NODES[self.executable]:
@@ -81,6 +90,10 @@ class LabNode(Node):
         self.add_post_set_parameters_callback(self._take_over)
         self.create_timer(1.0, self._publish_diagnostics)
         self.report_status('idle', 0.0, 'ready')
+
+    def create_timer(self, *args: Any, **kwargs: Any) -> Any:
+        """Create a timer that goes by the clock of the machine, whatever ROS time does."""
+        return super().create_timer(*args, **{'clock': self._steady, **kwargs})
 
     # parameters
 
@@ -105,6 +118,7 @@ class LabNode(Node):
         value = list(default) if isinstance(default, tuple) else default
         parameter = self.declare_parameter(declaration.name, value, descriptor)
         self._declared[declaration.name] = declaration
+        self.wanted = {**self.values, declaration.name: parameter.value}
         problem = self._problem(declaration.name, parameter.value)
         if problem:
             raise PiezoIdentError(f'{self.get_name()}: {problem}')
@@ -122,6 +136,8 @@ class LabNode(Node):
         return self.refuse(name, value)
 
     def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        # two that come at once may each fit what is there, and not each other
+        self.wanted = {**self.values, **{p.name: p.value for p in parameters}}
         for parameter in parameters:
             problem = self._problem(parameter.name, parameter.value)
             if problem:
@@ -135,7 +151,7 @@ class LabNode(Node):
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Return why a value of a parameter cannot be taken, None when it can."""
+        """Return why a value of a parameter cannot be taken, None when it can; see `wanted`."""
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -220,6 +236,16 @@ class LabNode(Node):
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
 
 
+def _report(node: LabNode, error: Exception) -> None:
+    """Say on the log what a callback tripped over."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    place = f'{where.name}, {Path(where.filename).name} line {where.lineno}'
+    node.get_logger().error(
+        f'{type(error).__name__}: {str(error)[:200]} (in {place}); the node goes on',
+        throttle_duration_sec=1.0,
+    )
+
+
 def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     """
     Run a node until SIGINT or SIGTERM, and let it close before the context goes.
@@ -228,6 +254,25 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     -------
     int
         Exit code: 0 after a clean end, 2 when the node could not start.
+    """
+    return run_together([make], argv)
+
+
+def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | None = None) -> int:
+    """
+    Run nodes in one process, on one executor, until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    makes : sequence of callable
+        Make one node each; closed in the reverse order.
+    argv : sequence of str, optional
+        Arguments for ROS.
+
+    Returns
+    -------
+    int
+        As `run`.
     """
     stop = threading.Event()
     # a thread beside the executor, one that reads YAML say, must not hold a block up for long
@@ -242,19 +287,30 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    node: LabNode | None = None
+    nodes: list[LabNode] = []
     try:
-        node = make()
-        executor.add_node(node)
+        for make in makes:
+            nodes.append(make())
+            executor.add_node(nodes[-1])
+        failures = 0
         while rclpy.ok() and not stop.is_set():
-            executor.spin_once(timeout_sec=0.2)
-    except ExternalShutdownException:
-        pass
+            try:
+                executor.spin_once(timeout_sec=0.2)
+                failures = 0
+            except ExternalShutdownException:
+                break
+            # what somebody sends must not end the node that holds the drive
+            except Exception as error:
+                failures += 1
+                if failures > MOST_FAILURES:
+                    # nothing works any more: better to end, at rest
+                    raise
+                _report(nodes[0], error)
     except (PiezoIdentError, ParameterException) as error:
         sys.stderr.write(f'piezo_ident: error: {error}\n')
         return 2
     finally:
-        if node is not None:
+        for node in reversed(nodes):
             node.close()
             node.await_listeners()
             executor.remove_node(node)

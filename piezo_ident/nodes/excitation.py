@@ -144,10 +144,9 @@ class ExcitationNode(LabNode):
             return None
         if name != 'program' and self._is_playing():
             return f'{name} cannot be changed while a programme is played; call ~/stop first'
-        wanted = {**self.values, name: value}
         try:
-            self._guard_settings(wanted)
-            self._build(wanted['program'], wanted)
+            self._guard_settings(self.wanted)
+            self._build(self.wanted['program'], self.wanted)
         except PiezoIdentError as error:
             return str(error)
         return None

@@ -30,13 +30,14 @@ its own clock (of drift and hum) goes on.
 | a sample that is no number | the last command stays in force for it | WARN |
 | outside the limits, faster than the slew | at the limit; followed at the slew | WARN |
 | a block that came before | ignored: no displacement, the stage does not move | WARN |
-| a gap up to `silence` | the stage holds its voltage for as many ticks, reported on \
+| a gap up to `silence`, and 10 s | the stage holds its voltage for as many ticks, reported on \
 `applied_voltage` as `hold:gap`; no displacement is published for them; the stream is then \
 followed at the slew | WARN |
 | a longer gap | a new stream | WARN |
 | swapped blocks | the early one makes a gap, the late one is refused: its time has passed | WARN |
 | another block size | nothing: blocks are cut as they come | |
 | t jumps back | a new stream, joined by a ramp | |
+| limits or rest that are moved in silence | ramp to rest, back into the limits at the slew | |
 | no block for `silence` | ramp to rest in real time, on `applied_voltage` as `ramp:silence`, t \
 going on; what comes next is a new stream | WARN, unless it was at rest |
 | a second publisher | the stream that was there first is followed, the other's blocks are \
@@ -79,6 +80,8 @@ LAST_RAMP = 0.7
 FAULT_SHOWN = 3.0
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
+#: longest gap through which a voltage is held [s]
+LONGEST_GAP = 10.0
 
 _WHY = {
     'not_finite': 'samples are no numbers: the last command stays in force',
@@ -104,7 +107,7 @@ class StageNode(LabNode):
         self._guard = Guard(self._settings())
         self._warm_up()
         self._run = self._stage.run(np.random.default_rng(seed))
-        self._follower = Follower(self.sample_rate, self.values['silence'])
+        self._follower = Follower(self.sample_rate, self._longest_gap())
         # tick of the next sample applied, whatever it comes from
         self._tick = 0
         self._segment = ''
@@ -150,7 +153,7 @@ class StageNode(LabNode):
         if name not in ('voltage_low', 'voltage_high', 'rest') or 'silence' not in self.values:
             return None
         try:
-            self._settings({**self.values, name: value})
+            self._settings(self.wanted)
         except PiezoIdentError as error:
             return str(error)
         return None
@@ -158,8 +161,13 @@ class StageNode(LabNode):
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take new limits and times over at the next sample."""
         self._guard.settings = self._settings()
-        self._follower.longest_gap = self.values['silence']
+        self._follower.longest_gap = self._longest_gap()
         self._watch.timer_period_ns = int(self._watch_period() * 1e9)
+        if self._follower.head is None and not self._guard.is_at_rest:
+            self._begin_ramp()
+
+    def _longest_gap(self) -> float:
+        return min(self.values['silence'], LONGEST_GAP)
 
     def _watch_period(self) -> float:
         return min(0.05, max(0.005, self.values['silence'] / 4))
@@ -236,10 +244,13 @@ class StageNode(LabNode):
                 self._state = 'idle'
             else:
                 self._blame('silence', f'no voltage for {silent:.2f} s: ramping to rest')
-                self._state, self._segment = 'ramping', 'ramp:silence'
-                self._ramped, self._ramp_begin = 0, time.monotonic()
-                self._ramp_timer.reset()
+                self._begin_ramp()
         self._say()
+
+    def _begin_ramp(self) -> None:
+        self._state, self._segment = 'ramping', 'ramp:silence'
+        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._ramp_timer.reset()
 
     def _on_ramp(self) -> None:
         now = round((time.monotonic() - self._ramp_begin) * self.sample_rate)

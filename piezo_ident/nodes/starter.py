@@ -21,7 +21,7 @@ when it is killed outright, the kernel sends them SIGTERM.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import ctypes
 import os
 from pathlib import Path
@@ -38,6 +38,8 @@ import yaml
 __all__ = ['Nodes', 'rclpy_is_there']
 
 _PR_SET_PDEATHSIG = 1
+#: nobody on another machine finds the graph, or gets at its drive, unless the user asks for that
+HERE_ONLY = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 #: how long a node may take to end after each signal [s]
 PATIENCE = 3.0
 
@@ -69,12 +71,13 @@ class Nodes:
     log : path
         Folder for what each node writes.
     environment : mapping of str to str, optional
-        On top of this process's own.
+        On top of this process's own, which discovery alone does not come from: it is kept to this
+        machine where neither says otherwise.
     """
 
     def __init__(self, log: Path, environment: Mapping[str, str] | None = None) -> None:
         self.log = log
-        self.environment = {**os.environ, **(environment or {})}
+        self.environment = {**HERE_ONLY, **os.environ, **(environment or {})}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(
@@ -84,6 +87,7 @@ class Nodes:
         namespace: str = '',
         parameters: Mapping[str, Any] | None = None,
         remaps: Mapping[str, str] | None = None,
+        arguments: Sequence[str] = (),
     ) -> subprocess.Popen[bytes]:
         """
         Start a node.
@@ -95,6 +99,8 @@ class Nodes:
         namespace : str, optional
         parameters : mapping, optional
         remaps : mapping of str to str, optional
+        arguments : sequence of str, optional
+            What stands before ``--ros-args``: the names for ``composed``.
 
         Raises
         ------
@@ -105,7 +111,7 @@ class Nodes:
         if name in self.processes:
             raise PiezoIdentError(f'{name} is running already')
         self.log.mkdir(parents=True, exist_ok=True)
-        command = [*_command(executable), '--ros-args']
+        command = [*_command(executable), *arguments, '--ros-args']
         if namespace:
             command += ['-r', f'__ns:=/{namespace.strip("/")}']
         for source, target in (remaps or {}).items():

@@ -61,7 +61,7 @@ def test_stage_model_and_identifier_in_one_process():
                 ),
                 'all three to speak',
             )
-            g.start('excitation', {'subscribers': 3}, 'lab')
+            g.start('excitation', {'subscribers': 3, 'block_size': 1000}, 'lab')
             ok, reason = g.call('lab/identifier/run')
             assert ok, reason
             g.wait(lambda: g.status('lab/identifier')['state'] in ('done', 'failed'), 'the run')

@@ -1,0 +1,467 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How time and memory grow with the record, the thresholds, the orders and the candidates.
+
+    .venv-bench/bin/python benchmarks/bench_growth.py [--quick]
+    .venv-bench/bin/python benchmarks/bench_growth.py --measure identify 3600 FOLDER
+
+Each length is measured in a process of its own, which warms up on a short record and tells its
+peak resident memory.  The exponent is the slope of log time over log size at the large end: 1 is a
+straight line.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from collections.abc import Callable, Sequence
+import json
+from pathlib import Path
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+from piezo_ident.arx import arx_factor, scan_orders
+from piezo_ident.bag_io import read_bag, typestore, write_bag
+from piezo_ident.bag_recovery import opened_bag
+from piezo_ident.diagnosis import diagnose, DiagnosisSettings
+from piezo_ident.effects import catalogue
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.hysteresis_fit import Excerpt, factorise, fit_hysteresis
+from piezo_ident.identification import identify
+from piezo_ident.model import StageModel
+from piezo_ident.model_io import load_model, save_model
+from piezo_ident.program import load_program, parse_program
+from piezo_ident.record import Piece, Record, Segment
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.wire_format import decode
+from side_by_side import markdown, seconds, take_turns, versions
+
+RATE = 20_000.0
+#: the effect that the diagnosed stage has, and its size [% of stroke]
+EFFECT, SIZE = 'creep', 0.3
+#: points at the large end through which the exponent is drawn
+LARGE_END = 3
+#: bytes that a second of voltage and displacement takes in a bag, and how much must stay free
+BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
+#: seconds of the identification record of which the longer ones are multiples
+PROGRAM = """
+limits: [0, 10]
+sample_rate: 20000
+seed: 1
+slew: 20
+segments:
+  - {{signal: idle, duration: 0.3}}
+  - {{signal: step, bias: 5, size: 1, hold: 0.06, count: {steps}}}
+  - {{signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 20}}
+  - {{signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: {noise}}}
+  - {{signal: triangle, slope: {slope}}}
+  - {{signal: idle, duration: 0.3}}
+"""
+
+Measure = tuple[float, float]
+
+
+def paper() -> StageModel:
+    """Return the paper's stage."""
+    return load_stage(find_config('paper', 'stage')).model
+
+
+def sine(n: int, model: StageModel) -> Piece:
+    """Return a record of a 50 Hz sine without its answer."""
+    v = 5.0 + 5.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE)
+    return Piece(v, np.zeros(n), model.sample_rate)
+
+
+# -- what a child measures: (size, folder) -> seconds, number of samples -----------------------
+
+
+def predict(size: float, folder: Path) -> Measure:
+    """Predict a record that is in memory."""
+    model = paper()
+    model.predict_piece(sine(1000, model))
+    piece = sine(round(size * RATE), model)
+    runs = 5 if piece.n < 5e6 else 2
+    turn = take_turns({'': lambda k: model.predict_piece(piece)}, runs)['']
+    return turn.median, piece.n
+
+
+def stream(size: float, folder: Path) -> Measure:
+    """Predict second by second and forget what is done."""
+    model = paper()
+    v = sine(int(RATE), model).v
+    model.stream().process(v)
+    running = model.stream()
+    start = time.perf_counter()
+    for _ in range(round(size)):
+        running.process(v)
+    return time.perf_counter() - start, round(size) * v.size
+
+
+def writing(size: float, folder: Path) -> Measure:
+    """Write a record as a bag."""
+    model = paper()
+
+    def record(n: int) -> Record:
+        piece = sine(n, model)
+        return Record((Piece(piece.v, model.predict_piece(piece), RATE),), 'long')
+
+    # what the next measures warm up on as well
+    write_bag(record(20_000), folder / 'short', overwrite=True)
+    long = record(round(size * RATE))
+    start = time.perf_counter()
+    write_bag(long, folder / f'bag_{size:g}', overwrite=True)
+    return time.perf_counter() - start, long.n
+
+
+def reading(size: float, folder: Path) -> Measure:
+    """Read a bag into a record."""
+    read_bag(folder / 'short')
+    start = time.perf_counter()
+    record = read_bag(folder / f'bag_{size:g}')
+    return time.perf_counter() - start, record.n
+
+
+def following(size: float, folder: Path) -> Measure:
+    """Read a bag message by message, predict, and forget."""
+    _follow(folder / 'short')
+    start = time.perf_counter()
+    n = _follow(folder / f'bag_{size:g}')
+    return time.perf_counter() - start, n
+
+
+def _follow(path: Path) -> int:
+    running, n = paper().stream(), 0
+    with opened_bag(path) as bag:
+        wanted = [c for c in bag.connections if c.topic.endswith('voltage')]
+        for connection, _, raw in bag.messages(wanted):
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+            samples = decode(message.data, message.layout.dim, message.layout.data_offset)
+            running.process(samples.values, samples.t)
+            n += samples.values.size
+    return n
+
+
+def labelled(times: float) -> Record:
+    """Return the identification record with noise, steps and triangle so many times as long."""
+    text = PROGRAM.format(steps=2 * round(8 * times), noise=5 * times, slope=6 / times)
+    stage = load_stage(find_config('paper', 'stage'))
+    return simulate(stage, parse_program(text).build(RATE), np.random.default_rng(0))
+
+
+def identifying(size: float, folder: Path) -> Measure:
+    """Identify by the three steps; the record of 15.5 s has everything as it is shipped."""
+    identify(labelled(0.5))
+    record = labelled(size / 15.5)
+    start = time.perf_counter()
+    identify(record)
+    return time.perf_counter() - start, record.n
+
+
+def to_diagnose(size: float, seed: int = 1) -> Record:
+    """Return the answer of a stage with an effect to the diagnosis programme, over and over."""
+    from truths import make_stage, programme
+
+    _, v, labels = programme('diagnosis', seed)
+    n = round(size * RATE)
+    count = -(-n // v.size)
+    segments = [
+        (
+            label if not k else f'{label}{"" if ":" in label else ":"}r{k}',
+            a + k * v.size,
+            b + k * v.size,
+        )
+        for k in range(count)
+        for label, a, b in labels
+    ]
+    v = np.tile(v, count)[:n]
+    stage = make_stage(EFFECT, SIZE, seed, noise='white')
+    y = stage.respond(np.arange(n) / RATE, v, changed=True, channels=None)
+    kept = tuple(Segment(label, a, min(b, n)) for label, a, b in segments if a < n)
+    return Record((Piece(v, y, RATE, segments=kept),), 'diagnosis')
+
+
+def base_model(folder: Path, seed: int = 1) -> StageModel:
+    """Return the model of the stage that is diagnosed, identified before the effect."""
+    from truths import make_stage
+
+    path = folder / 'base.yaml'
+    if not path.exists():
+        stage = make_stage(EFFECT, SIZE, seed, noise='white')
+        sequence = load_program(find_config('identification', 'program')).build(RATE)
+        t = np.arange(sequence.n) / RATE
+        y = stage.respond(t, sequence.v, changed=False, channels=None)
+        piece = Piece(sequence.v, y, RATE, segments=tuple(sequence.segments))
+        save_model(identify(Record((piece,), 'identification')).model, path)
+    return load_model(path)
+
+
+def diagnosing(size: float, folder: Path) -> Measure:
+    """Diagnose with the whole catalogue."""
+    model = base_model(folder)
+    diagnose(model, to_diagnose(17.0), DiagnosisSettings(effects=(EFFECT,)))
+    record = to_diagnose(size)
+    start = time.perf_counter()
+    diagnose(model, record, DiagnosisSettings())
+    return time.perf_counter() - start, record.n
+
+
+def nothing(size: float, folder: Path) -> Measure:
+    """Import all, and predict a little: the memory that is there before any record."""
+    paper().stream().process(np.zeros(10))
+    return 0.0, 0
+
+
+MEASURES: dict[str, Callable[[float, Path], Measure]] = {
+    'nothing': nothing,
+    'predict': predict,
+    'stream': stream,
+    'write': writing,
+    'read': reading,
+    'follow': following,
+    'identify': identifying,
+    'diagnose': diagnosing,
+}
+
+
+def peak_memory() -> float:
+    """Return the peak resident memory of this process [MiB]."""
+    try:
+        # ru_maxrss would count what the parent had before this program was loaded
+        status = Path('/proc/self/status').read_text(encoding='utf-8')
+        return int(status.partition('VmHWM:')[2].split()[0]) / 1024.0
+    except (OSError, ValueError, IndexError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def measured(kind: str, size: float, folder: Path) -> tuple[float, float, float]:
+    """Return time [s], samples and peak memory [MiB] of a measure in a process of its own."""
+    command = [sys.executable, str(Path(__file__).resolve()), '--measure', kind, f'{size:g}']
+    done = subprocess.run([*command, str(folder)], capture_output=True, text=True)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or ['no reason given']
+        raise RuntimeError(f'{kind} of {size:g} s failed: {said[-1]}')
+    took, n, peak = json.loads(done.stdout.splitlines()[-1])
+    return took, n, peak
+
+
+# -- tables --------------------------------------------------------------------------------------
+
+
+def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
+    """Return the slope of log time over log size at the large end."""
+    if len(sizes) < 2:
+        return float('nan')
+    x, y = (np.log(np.asarray(z[-LARGE_END:], dtype=float)) for z in (sizes, times))
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def length(size: float) -> str:
+    """Return a time in words."""
+    if size < 120:
+        return f'{size:g} s'
+    return f'{size / 60:g} min' if size < 3600 else f'{size / 3600:g} h'
+
+
+def along_the_record(
+    kind: str, sizes: Sequence[float], folder: Path
+) -> tuple[list[list[str]], str]:
+    """Return the rows of one measure over the record length, and what they say."""
+    found = [measured(kind, size, folder) for size in sizes]
+    times, peaks = [f[0] for f in found], [f[2] for f in found]
+    rows = [
+        [length(size), f'{n:,.0f}', seconds(t), seconds(t / n), f'{peak:.0f} MiB']
+        for size, (t, n, peak) in zip(sizes, found, strict=True)
+    ]
+    if len(sizes) < 2:
+        return rows, ''
+    more, samples = peaks[-1] - peaks[0], (found[-1][1] - found[0][1]) / 1e6
+    return rows, (
+        f'Exponent {exponent(sizes, times):.2f}; peak memory grows by {more / samples:.2f} MiB '
+        'per million samples.'
+    )
+
+
+HEADS = ('record', 'samples', 'time', 'a sample', 'peak memory')
+
+
+def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
+    """Return the sections over the record length."""
+    hour = 3600.0
+    plans: dict[str, tuple[str, Sequence[float]]] = {
+        'stream': (
+            'Prediction second by second: constant memory',
+            (10, 60) if quick else (10, 60, 600, hour),
+        ),
+        'predict': (
+            'Prediction of a record in memory',
+            (10, 60) if quick else (10, 30, 60, 120, 300, 600),
+        ),
+        'write': ('Writing a bag', (10, 30) if quick else (10, 60, 600, hour)),
+        'read': ('Reading a bag into a record', (10, 30) if quick else (10, 60, 600)),
+        'follow': (
+            'Reading a bag message by message, predicting meanwhile: constant memory',
+            (10, 30) if quick else (10, 60, 600, hour),
+        ),
+        'identify': (
+            'Identification, the three steps',
+            (15.5,) if quick else (15.5, 31, 62, 124),
+        ),
+        'diagnose': (
+            f'Diagnosis, {len(catalogue())} candidates',
+            (17,) if quick else (15, 30, 60, 120),
+        ),
+    }
+    base = measured('nothing', 0.0, folder)[2]
+    text, said = [], []
+    for kind, (title, sizes) in plans.items():
+        if kind in ('write', 'follow') and hour in sizes:
+            # the hour as a bag takes some gigabytes for a moment
+            if shutil.disk_usage(folder).free < hour * BAG_BYTES + SPARE:
+                sizes = tuple(size for size in sizes if size < hour)
+                said.append(f'Too little room on the disk for a bag of 1 h ({title.lower()}).')
+        rows, line = along_the_record(kind, sizes, folder)
+        text += [f'**{title}.** {line}'.strip(), '', markdown(HEADS, rows), '']
+        if kind == 'follow':
+            for path in folder.glob('bag_*'):
+                shutil.rmtree(path)
+    intro = (
+        f'At {RATE / 1000:g} kHz, each length in a process of its own. The exponent is the slope '
+        'of log time over log length through the '
+        f'{LARGE_END} longest. A process that does next to nothing peaks at {base:.0f} MiB.'
+    )
+    return [('Growth with the record', '\n'.join([intro, '', *text, *said]))]
+
+
+def table_of(what: str, sizes: Sequence[int], columns: dict[str, list[float]]) -> str:
+    """Return a table of times over a size, with its exponents as the last row."""
+    rows = [
+        [f'{size}', *(seconds(times[i]) for times in columns.values())]
+        for i, size in enumerate(sizes)
+    ]
+    rows.append(['exponent', *(f'{exponent(sizes, times):.2f}' for times in columns.values())])
+    return markdown((what, *columns), rows)
+
+
+def timed(work: Callable[[], object], runs: int) -> float:
+    """Return the median time of a work after a first run."""
+    return take_turns({'': lambda k: work()}, runs, warm=[''])[''].median
+
+
+def of_thresholds(quick: bool) -> str:
+    """Return the table over the number of thresholds."""
+    sizes = (5, 20) if quick else (5, 10, 20, 50, 100, 200)
+    model = paper()
+    n = 100_000 if quick else 400_000
+    record = labelled(0.5 if quick else 1.0)
+    piece = record.pieces[0]
+    (triangle,) = piece.find('triangle')
+    u, x = model.scaling.u(piece.v), model.scaling.x(piece.y)
+    use = np.zeros(piece.n, dtype=bool)
+    use[triangle.start : triangle.stop] = True
+    excerpt = Excerpt(u, x, use)
+    columns: dict[str, list[float]] = {
+        f'prediction, {n:,} samples': [],
+        f'weights from {triangle.stop - triangle.start:,} samples': [],
+    }
+    predictions, weights = columns.values()
+    long = sine(n, model)
+    for m in sizes:
+        r = np.arange(1, m + 1) / (m + 1)
+        h = Hysteresis(r, np.full(m, 1.0 / m), 0.0, 0.5)
+        wide = StageModel(model.sample_rate, model.scaling, h, model.dynamics, model.delay)
+        predictions.append(timed(lambda w=wide: w.predict_piece(long), 3))
+
+        def fit(r: np.ndarray = r) -> object:
+            R = factorise([excerpt], r, model.dynamics, model.delay)
+            return fit_hysteresis(R, r, int(use.sum()))
+
+        weights.append(timed(fit, 1 if m > 50 else 3))
+    return table_of('thresholds', sizes, columns)
+
+
+def of_orders(quick: bool) -> str:
+    """Return the table over the largest order."""
+    sizes = (2, 5) if quick else (2, 5, 10, 15, 20, 30)
+    model, record = paper(), labelled(0.5 if quick else 1.0)
+    piece = record.pieces[0]
+    (noise,) = piece.find('noise')
+    cut = slice(noise.start, noise.stop)
+    u, y = model.scaling.u(piece.v[cut]), model.scaling.x(piece.y[cut])
+    u, y = u - u.mean(), y - y.mean()
+    n, d = int(0.8 * u.size), model.delay.samples
+    name = f'factor of {n:,} samples'
+    columns: dict[str, list[float]] = {name: [], 'all orders from it, with free runs': []}
+    factors, scans = columns.values()
+    for most in sizes:
+        factors.append(timed(lambda m=most: arx_factor(u[:n], y[:n], m, m + d), 3))
+        factor = arx_factor(u[:n], y[:n], most, most + d)
+        scans.append(
+            timed(lambda f=factor, m=most: scan_orders(f, d, m, u[n:], y[n:]), 1 if quick else 3)
+        )
+    return table_of('largest na and nb', sizes, columns)
+
+
+def of_candidates(quick: bool, folder: Path) -> str:
+    """Return the table over the number of candidates."""
+    sizes = (1, 2) if quick else (1, 2, 4, 8, len(catalogue()))
+    model, record = base_model(folder), to_diagnose(17.0)
+    names = [EFFECT, *(name for name in catalogue() if name != EFFECT)]
+    times = [
+        timed(lambda k=k: diagnose(model, record, DiagnosisSettings(effects=tuple(names[:k]))), 1)
+        for k in sizes
+    ]
+    return table_of('candidates', sizes, {'diagnosis of 17 s': times})
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    """Return titles and texts."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        base_model(folder)
+        found = of_length(quick, folder)
+        parts = [
+            'Sizes of the model and of the search, at one length of the record. Up to order m '
+            'there are m² orders, and the free run of each takes its time by its size.',
+            of_thresholds(quick),
+            of_orders(quick),
+            f'The stage has {EFFECT}; the first candidate is that one.',
+            of_candidates(quick, folder),
+            versions('numpy', 'scipy', 'numba', 'rosbags') + '.',
+        ]
+    return [*found, ('Growth with thresholds, orders and candidates', '\n\n'.join(parts))]
+
+
+def main(argv: Sequence[str]) -> None:
+    """Measure one thing as JSON, or print the sections."""
+    if argv[:1] == ['--measure']:
+        kind, size, folder = argv[1:4]
+        took, n = MEASURES[kind](float(size), Path(folder))
+        print(json.dumps([took, n, peak_memory()]))
+        return
+    for title, text in sections('--quick' in argv):
+        print(f'## {title}\n\n{text}\n')
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])

@@ -1,0 +1,245 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Runs every benchmark and writes docs/benchmarks.md.
+
+    .venv-bench/bin/python benchmarks/run_all.py --out docs/benchmarks.md [--quick] [--only NAME]
+
+A benchmark is a file ``bench_*.py`` beside this one with a function
+
+    def sections(quick: bool = False) -> list[tuple[str, str]]
+
+that returns titles and texts in Markdown.  Each runs in a process of its own, so that none
+disturbs another and one that lacks a library fails alone: it becomes a section that says why, and
+the exit code is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import importlib.util
+import json
+import os
+from pathlib import Path
+import platform
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+HERE = Path(__file__).resolve().parent
+#: benchmarks in the order of the page; others follow by name
+ORDER = (
+    'prediction',
+    'identification',
+    'profile',
+    'peers_arx',
+    'peers_swarm',
+    'peers_control',
+    'peers_hysteresis',
+    'growth',
+    'many',
+)
+#: whose versions are told, where they are installed
+LIBRARIES = (
+    'numpy',
+    'scipy',
+    'numba',
+    'llvmlite',
+    'rosbags',
+    'sippy_unipi',
+    'sysidentpy',
+    'pysindy',
+    'pyswarms',
+    'control',
+    'dask',
+    'distributed',
+    'pyarrow',
+)
+#: longest that one benchmark may take [s]
+LIMIT = 1800.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one benchmark gave: its sections, or why it has none; and how long it took [s]."""
+
+    name: str
+    sections: tuple[tuple[str, str], ...]
+    reason: str
+    seconds: float
+
+
+def has_sections(path: Path) -> bool:
+    """Return whether a file defines a function `sections`, without running it."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    return any(isinstance(node, ast.FunctionDef) and node.name == 'sections' for node in tree.body)
+
+
+def benchmarks(folder: Path = HERE) -> list[Path]:
+    """Return the files that are benchmarks, in the order of the page."""
+    found = [path for path in sorted(folder.glob('bench_*.py')) if has_sections(path)]
+    place = {f'bench_{name}': i for i, name in enumerate(ORDER)}
+    return sorted(found, key=lambda path: (place.get(path.stem, len(ORDER)), path.stem))
+
+
+def work(path: Path, quick: bool, out: Path) -> None:
+    """Run one benchmark in this process, and write what it returns as JSON."""
+    sys.path.insert(0, str(path.parent))
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f'{path} cannot be loaded')
+    module = importlib.util.module_from_spec(spec)
+    # a benchmark that starts processes of its own has to be found by its name there
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    pairs = [(str(title), str(text)) for title, text in module.sections(quick=quick)]
+    out.write_text(json.dumps(pairs), encoding='utf-8')
+
+
+def run(path: Path, quick: bool, limit: float = LIMIT) -> Outcome:
+    """Run one benchmark in a process of its own."""
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        out, log = Path(folder, 'sections.json'), Path(folder, 'log')
+        command = [sys.executable, str(Path(__file__).resolve()), '--work', str(path)]
+        command += ['--out', str(out), *(['--quick'] if quick else [])]
+        # one thread of BLAS for ours and for the peers
+        environment = os.environ | {'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}
+        reason = ''
+        with log.open('wb') as target:
+            process = subprocess.Popen(
+                command,
+                stdout=target,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
+            try:
+                code = process.wait(limit)
+            except subprocess.TimeoutExpired:
+                code, reason = 1, f'it took more than {limit:g} s'
+            finally:
+                if process.poll() is None:
+                    # with all that it has started
+                    os.killpg(process.pid, signal.SIGKILL)
+                    process.wait()
+        if code:
+            said = log.read_text(encoding='utf-8', errors='replace').strip().splitlines()
+            reason = reason or (said[-1] if said else f'it ended with exit code {code}')
+            return Outcome(path.stem, (), reason, time.perf_counter() - began)
+        pairs = json.loads(out.read_text(encoding='utf-8'))
+    sections = tuple((title, text) for title, text in pairs)
+    return Outcome(path.stem, sections, '', time.perf_counter() - began)
+
+
+def machine() -> str:
+    """Return what is being measured on."""
+    from side_by_side import versions
+
+    name, memory = platform.processor() or platform.machine(), ''
+    try:
+        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+        name = next(
+            (s.partition(':')[2].strip() for s in lines if s.startswith('model name')), name
+        )
+        kilobytes = Path('/proc/meminfo').read_text(encoding='utf-8').split()[1]
+        memory = f', {int(kilobytes) / 2**20:.0f} GiB of memory'
+    except (OSError, ValueError, IndexError):
+        pass
+    return (
+        f'{os.cpu_count()} cores of {name}{memory}, {platform.system()} {platform.release()}; '
+        f'Python {platform.python_version()}, {versions("piezo_ident", *LIBRARIES)}.'
+    )
+
+
+def page(outcomes: Iterable[Outcome], command: str, load: float | None) -> str:
+    """Return docs/benchmarks.md."""
+    outcomes = list(outcomes)
+    before = '' if load is None else f' Load average before: {load:.2f}.'
+    text = [
+        '# Benchmarks',
+        '',
+        'Every number on this page was written by the command below; nothing is edited by hand.',
+        '',
+        f'    {command}',
+        '',
+        f'Machine: {machine()}{before}',
+        '',
+        'What is compared ran in turns in one process, with one thread of BLAS; times are medians',
+        'over the turns, ratios medians of the ratios turn by turn. Only ratios mean something on',
+        'another machine. Errors are those of free runs over data that were not fitted.',
+    ]
+    for outcome in outcomes:
+        if outcome.reason:
+            text += ['', f'## `{outcome.name}` failed', '', f'No result: {outcome.reason}']
+        for title, body in outcome.sections:
+            text += ['', f'## {title}', '', body.strip()]
+    text += ['', '## Time taken', '', '| benchmark | s |', '|---|---|']
+    text += [f'| `{outcome.name}` | {outcome.seconds:.0f} |' for outcome in outcomes]
+    text += [f'| all | {sum(outcome.seconds for outcome in outcomes):.0f} |', '']
+    return '\n'.join(text)
+
+
+def write(text: str, path: Path) -> None:
+    """Replace a file at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f'.{path.name}.tmp')
+    temporary.write_text(text, encoding='utf-8')
+    temporary.replace(path)
+
+
+def main(argv: Sequence[str] | None = None, folder: Path = HERE) -> int:
+    """Run what is asked for, and return the exit code."""
+    parser = argparse.ArgumentParser(description='Runs the benchmarks and writes one page.')
+    parser.add_argument('--out', type=Path, required=True, help='page to write')
+    parser.add_argument('--quick', action='store_true', help='short versions of all')
+    parser.add_argument(
+        '--only', nargs='+', metavar='NAME', help='some of them: growth, many, ...'
+    )
+    parser.add_argument('--work', type=Path, help=argparse.SUPPRESS)
+    given = list(sys.argv[1:] if argv is None else argv)
+    args = parser.parse_args(given)
+    if args.work:
+        work(args.work, args.quick, args.out)
+        return 0
+    load = os.getloadavg()[0] if hasattr(os, 'getloadavg') else None
+    names = {path.stem.removeprefix('bench_'): path for path in benchmarks(folder)}
+    unknown = sorted(set(args.only or ()) - set(names))
+    if unknown:
+        parser.error(f'no benchmark {", ".join(unknown)}; there are {", ".join(names)}')
+    outcomes = []
+    for name, path in names.items():
+        if args.only and name not in args.only:
+            continue
+        print(f'{name} ...', flush=True)
+        outcomes.append(run(path, args.quick))
+        said = outcomes[-1].reason and f': failed: {outcomes[-1].reason}'
+        print(f'{name} {outcomes[-1].seconds:.0f} s{said}', flush=True)
+    command = shlex.join(['python', 'benchmarks/run_all.py', *given])
+    write(page(outcomes, command, load), args.out)
+    return 1 if any(outcome.reason for outcome in outcomes) else 0
+
+
+if __name__ == '__main__':
+    # ended from outside it ends what it has started
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    sys.path.insert(0, str(HERE))
+    sys.exit(main())

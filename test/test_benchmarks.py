@@ -1,0 +1,220 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The benchmarks' contract and the page that is made of them; no time is judged here."""
+
+import ast
+import importlib
+from pathlib import Path
+import sys
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / 'benchmarks'
+#: writes a page of its own
+APART = {'bench_live'}
+
+
+@pytest.fixture(scope='module')
+def load():
+    """Return a function that imports a file of the benchmarks."""
+    sys.path.insert(0, str(FOLDER))
+    yield importlib.import_module
+    sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture(scope='module')
+def run_all(load):
+    return load('run_all')
+
+
+GOOD = """
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    print('progress goes anywhere')
+    return [('Quick' if quick else 'Long', '| a |\\n|---|\\n| 1 |'), ('Second', 'text')]
+"""
+LACKING = """
+import no_such_library_anywhere
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    return []
+"""
+ENDLESS = """
+import time
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    time.sleep(600)
+    return []
+"""
+NONE = 'def main():\n    pass\n'
+
+
+def write(folder, **modules):
+    for name, text in modules.items():
+        (folder / f'bench_{name}.py').write_text(text)
+    return folder
+
+
+def test_every_benchmark_keeps_the_contract(run_all):
+    found = {path.stem for path in run_all.benchmarks()}
+    assert {'bench_growth', 'bench_peers_arx', 'bench_peers_hysteresis'} <= found
+    assert not found & APART
+    for path in run_all.benchmarks():
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        (function,) = (
+            node
+            for node in tree.body
+            if isinstance(node, ast.FunctionDef) and node.name == 'sections'
+        )
+        assert [a.arg for a in function.args.args] == ['quick'], path.name
+        assert [ast.unparse(d) for d in function.args.defaults] == ['False'], path.name
+        assert ast.unparse(function.returns) == 'list[tuple[str, str]]', path.name
+        guards = [node for node in tree.body if isinstance(node, ast.If)]
+        assert any('__main__' in ast.unparse(node.test) for node in guards), path.name
+
+
+def test_the_order_of_the_page_names_no_benchmark_twice(run_all):
+    assert len(set(run_all.ORDER)) == len(run_all.ORDER)
+
+
+def test_page_of_one_benchmark_that_works_and_one_that_does_not(run_all, tmp_path, capsys):
+    folder = write(tmp_path, zebra=GOOD, ape=LACKING, cow=NONE)
+    out = tmp_path / 'docs' / 'page.md'
+    code = run_all.main(['--out', str(out), '--quick'], folder)
+    text = out.read_text(encoding='utf-8')
+    assert code == 1
+    assert '## Quick\n\n| a |\n|---|\n| 1 |\n\n## Second' in text
+    assert '## Long' not in text
+    assert '## `bench_ape` failed' in text
+    assert "No module named 'no_such_library_anywhere'" in text
+    assert 'cow' not in text
+    # the machine, the versions, the command and what else was going on
+    assert f'numpy {np.__version__}' in text
+    assert f'--out {out} --quick' in text
+    assert 'Load average before' in text
+    assert not list(out.parent.glob('.*'))
+    capsys.readouterr()
+    assert run_all.main(['--out', str(out), '--only', 'zebra'], folder) == 0
+    text = out.read_text(encoding='utf-8')
+    assert '## Long' in text
+    assert 'ape' not in text
+
+
+def test_unknown_benchmark_is_refused(run_all, tmp_path, capsys):
+    folder = write(tmp_path, zebra=GOOD)
+    with pytest.raises(SystemExit, match='2'):
+        run_all.main(['--out', str(tmp_path / 'page.md'), '--only', 'zebu'], folder)
+    assert 'no benchmark zebu; there are zebra' in capsys.readouterr().err
+
+
+def test_a_benchmark_that_does_not_end_is_ended(run_all, tmp_path):
+    write(tmp_path, slow=ENDLESS)
+    outcome = run_all.run(tmp_path / 'bench_slow.py', quick=True, limit=0.5)
+    assert outcome.sections == ()
+    assert outcome.reason == 'it took more than 0.5 s'
+    assert outcome.seconds < 60.0
+
+
+def test_turns_are_taken_in_order_and_some_take_fewer(load):
+    side = load('side_by_side')
+    called = []
+
+    def work(name):
+        return lambda k: called.append((name, k)) or (name, k)
+
+    turns = side.take_turns({'a': work('a'), 'b': work('b')}, 3, fewer={'b': 2}, warm=['a'])
+    assert called == [('a', 0), ('a', 0), ('b', 0), ('a', 1), ('b', 1), ('a', 2)]
+    assert turns['a'].results == [('a', 0), ('a', 1), ('a', 2)]
+    assert len(turns['b'].times) == 2
+    assert turns['a'].over(turns['a']) == 1.0
+
+
+def test_ratio_of_two_works_is_the_median_over_pairs(load):
+    side = load('side_by_side')
+    one, other = side.Turn([2.0, 30.0, 4.0]), side.Turn([1.0, 10.0])
+    assert one.over(other) == pytest.approx(2.5)
+    assert one.median == 4.0
+
+
+@pytest.mark.parametrize(
+    ('t', 'text'),
+    [
+        (2.345, '2.35 s'),
+        (0.0123, '12.3 ms'),
+        (4.5e-6, '4.5 µs'),
+        (1.234e-8, '12.3 ns'),
+        (1234.4, '1234 s'),
+    ],
+)
+def test_times_are_told_in_their_units(load, t, text):
+    assert load('side_by_side').seconds(t) == text
+
+
+def test_table_is_markdown(load):
+    table = load('side_by_side').markdown(('a', 'b'), [(1, 'x'), (2, 'y')])
+    assert table == '| a | b |\n|---|---|\n| 1 | x |\n| 2 | y |'
+
+
+def test_version_of_what_is_not_there_is_left_out(load):
+    side = load('side_by_side')
+    assert side.versions('no-such-library-anywhere', 'numpy') == f'numpy {np.__version__}'
+
+
+def test_exponent_is_the_slope_at_the_large_end(load):
+    growth = load('bench_growth')
+    sizes = [1.0, 10.0, 100.0, 1000.0]
+    # a fixed cost bends the small end alone
+    assert growth.exponent(sizes, [5.0, 1e2, 1e4, 1e6]) == pytest.approx(2.0)
+    assert np.isnan(growth.exponent([1.0], [1.0]))
+
+
+def test_growth_measures_in_a_process_of_its_own(load, tmp_path):
+    growth = load('bench_growth')
+    took, n, peak = growth.measured('stream', 2.0, tmp_path)
+    assert took > 0.0
+    assert n == 40_000
+    assert 10.0 < peak < 4000.0
+    with pytest.raises(RuntimeError, match=r'read of 2 s failed: .*short'):
+        growth.measured('read', 2.0, tmp_path)
+
+
+def test_measured_record_that_is_not_there_is_said(load, monkeypatch, tmp_path):
+    module = load('bench_peers_hysteresis')
+    monkeypatch.setattr(module, 'DATA', tmp_path)
+    text = module.measured(quick=True)
+    assert text.startswith('Not run: piezo_1hz.csv is not in')
+
+
+def test_order_search_is_judged_on_data_of_its_own(load):
+    arx = load('bench_peers_arx')
+    data = arx.data_of(0)
+    assert data.u.size == 16_000
+    assert data.u_test.size == data.y_test.size == 4_000
+    found = arx.ours(data, 4)
+    assert np.isfinite(data.error(found))
+    assert data.error((np.ones(1), np.array([-1.1]))) == float('inf')
+
+
+def test_swarm_problem_is_that_of_the_identification(load):
+    swarm = load('bench_peers_swarm')
+    task = swarm.problem()
+    assert task.A.shape[1] == task.box.shape[0] == 11
+    cost = swarm.Cost(task)
+    middle = task.box.mean(axis=1)
+    assert cost(middle[None])[0] == pytest.approx(task.loss(middle))
+    assert task.loss(middle) > task.optimum
