@@ -28,6 +28,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
+from piezo_ident.bag_check import rate_of
 from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag
 from piezo_ident.capture import APPLIED, record_of_streams
 from piezo_ident.errors import DataError
@@ -54,7 +55,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
-import yaml
 
 __all__ = [
     'MESSAGE_TYPE',
@@ -141,7 +141,7 @@ def read_bag(
         name=str(path),
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
-        sample_rate=_sample_rate(path),
+        sample_rate=rate_of(path) if path.is_dir() else rate_of(path.parent, path.name),
         faults=faults,
     ).renamed(path.name)
 
@@ -251,20 +251,6 @@ def _collect(bag: Bag, topics: Mapping[str, str], path: Path) -> dict[str, Strea
         by_topic[topic].append(samples, stamp)
         index[topic] += 1
     return streams
-
-
-def _sample_rate(path: Path) -> float | None:
-    """Return the rate in the bag's custom data, if there is a sensible one."""
-    folder = path if path.is_dir() else path.parent
-    try:
-        meta = yaml.safe_load((folder / 'metadata.yaml').read_text('utf-8'))
-        info = meta['rosbag2_bagfile_information']
-        if path != folder and path.name not in info['relative_file_paths']:
-            return None
-        rate = float(info['custom_data']['sample_rate'])
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
-        return None  # the stamps tell it as well
-    return rate if 0 < rate < float('inf') else None
 
 
 def write_bag(

@@ -30,10 +30,20 @@ import re
 import shutil
 import sqlite3
 import tempfile
-from typing import NamedTuple
-from urllib.parse import quote
+from typing import Any, NamedTuple
 
-from piezo_ident.errors import DataError
+from piezo_ident.bag_check import (
+    check_index,
+    check_inside,
+    check_journal,
+    check_storage,
+    check_tables,
+    connected,
+    metadata,
+    unpacked_message,
+)
+from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.limits import regular_file
 from piezo_ident.mcap_scan import Channel, MAGIC, McapScan, Message
 from piezo_ident.record import Fault
 from rosbags.interfaces import (
@@ -44,10 +54,11 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import parse_qos
-import yaml
 
 __all__ = ['Bag', 'Stored', 'damage_as_data_error', 'is_unfinished', 'opened_bag']
 
+#: bytes that a row of a database takes at least, and topics of a recording at most
+_ROW, _TOPICS = 6, 10_000
 _SIDECARS = ('-journal', '-wal')
 _FORMATS = {
     'ros2msg': MessageDefinitionFormat.MSG,
@@ -132,15 +143,31 @@ def damage_as_data_error(path: Path) -> Iterator[None]:
 
 
 def _finished(path: Path, stack: ExitStack) -> Bag:
+    if path.is_dir():
+        metadata(path)
+    chunks = {file.name: check_storage(file) for file in _storage_files(path)}
     reader = stack.enter_context(Reader(path))
+    inside: Any = reader.storage
+    for storage in getattr(inside, 'storages', [inside]):
+        if storage.path.name in chunks and hasattr(storage, 'chunks'):
+            check_index(chunks[storage.path.name], storage.chunks, storage.path)
+    is_packed = inside.metadata.compression_mode == 'message'
+    if is_packed:
+        # unpacked here, where there is a limit
+        inside.metadata = inside.metadata._replace(compression_mode=None)
 
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
         with damage_as_data_error(path):
-            yield from map(Stored._make, reader.messages(connections=list(connections)))
+            for connection, stamp, raw in reader.messages(connections=list(connections)):
+                yield Stored(connection, stamp, unpacked_message(raw) if is_packed else raw)
 
     empty = reader.message_count == 0
     start = 0 if empty else reader.start_time
     end = 0 if empty else reader.end_time - 1
+    # rosbags takes over from the metadata whatever stands there
+    texts = [text for c in reader.connections for text in (c.topic, c.msgtype)]
+    if not all(isinstance(x, str) for x in texts) or {type(start), type(end)} != {int}:
+        raise DataError(f'{path}: damaged or unfinished bag (metadata of wrong types); mend it')
     return Bag(path, reader.connections, messages, start, end)
 
 
@@ -162,26 +189,28 @@ def is_unfinished(path: Path) -> bool:
 def _listed(path: Path) -> list[Path]:
     """Return the files that the metadata of a folder names, none when it names none."""
     try:
-        meta = yaml.safe_load((path / 'metadata.yaml').read_text('utf-8'))
-        names = meta['rosbag2_bagfile_information']['relative_file_paths']
-        files = [path / Path(name).name for name in names]
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        files = [path / Path(name).name for name in metadata(path)['relative_file_paths']]
+    except (ConfigError, TypeError, KeyError):
         return []
-    return [f for f in files if f.is_file()]
+    return [f for f in files if f.exists()]
 
 
 def _storage_files(path: Path) -> list[Path]:
     """Return the files of a folder that belong to one recording, in order."""
     if not path.is_dir():
+        regular_file(path)
         return [path]
     if (path / 'metadata.yaml').is_file():
-        return _listed(path)
+        listed = _listed(path)
+        check_inside(path, listed)
+        return listed
     found = [f for f in sorted(path.iterdir()) if f.suffix in ('.mcap', '.db3')]
     if not found:
         raise DataError(
             f'{path}: no bag, metadata.yaml is missing; name a bag folder, or restore it with '
             "'ros2 bag reindex'"
         )
+    check_inside(path, found)
     # a split recording numbers its files; other files side by side are recordings of their own
     recordings = {(re.sub(r'_\d+$', '', f.stem), f.suffix) for f in found}
     if len(recordings) > 1:
@@ -219,21 +248,27 @@ class _SqliteScan:
 
     def __iter__(self) -> Iterator[Channel | Message]:
         self.whole = True
-        uri = f'file:{quote(str(self._database.absolute()))}?mode=ro&immutable=1'
         yielded = False
+        # a damaged tree may lead back to itself, and give more than the file holds
+        left = self._database.stat().st_size
         try:
-            with closing(sqlite3.connect(uri, uri=True)) as database:
+            with closing(connected(self._database)) as database:
+                check_tables(database, self.path)
                 yield from _sqlite_channels(database)
                 rows = database.execute('SELECT topic_id, timestamp, data FROM messages')
                 for channel_id, stamp, data in rows:
                     if not (isinstance(stamp, int) and isinstance(data, bytes)):
                         raise sqlite3.DatabaseError('a message is no bytes')
+                    left -= len(data) + _ROW
+                    if left < 0:
+                        raise sqlite3.DatabaseError('more messages than the file has room for')
                     yielded = True
                     yield Message(channel_id, stamp, data)
         except sqlite3.Error as error:
             if not yielded:
+                reason = ' '.join(str(error).split())[:200]
                 raise DataError(
-                    f'{self.path}: damaged or unfinished bag ({error}); record it again'
+                    f'{self.path}: damaged or unfinished bag ({reason}); record it again'
                 ) from None
             self.whole = False
 
@@ -247,14 +282,15 @@ def _sqlite_channels(database: sqlite3.Connection) -> list[Channel]:
         definitions = {
             name: (text, kind)
             for name, text, kind in database.execute(
-                'SELECT topic_type, encoded_message_definition, encoding FROM message_definitions'
+                'SELECT topic_type, encoded_message_definition, encoding FROM message_definitions '
+                f'LIMIT {_TOPICS}'
             )
         }
     qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns('topics') else "''"
     return [
         Channel(key, topic, kind, *definitions.get(kind, ('', '')), encoding, profiles)
         for key, topic, kind, encoding, profiles in database.execute(
-            f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id'
+            f'SELECT id, name, type, serialization_format, {qos} FROM topics LIMIT {_TOPICS}'
         )
     ]
 
@@ -271,6 +307,9 @@ def _applied(file: Path, stack: ExitStack) -> Path:
             f'{file}: a copy is needed to recover it, and {folder.parent} has no room for '
             f'{2 * need / 1e6:.0f} MB; make room, or set TMPDIR to a place with room'
         )
+    for sidecar in parts[1:]:
+        regular_file(sidecar)
+        check_journal(sidecar)
     for part in parts:
         shutil.copyfile(part, folder / part.name)
     copy = folder / file.name

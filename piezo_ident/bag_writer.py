@@ -35,7 +35,7 @@ from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
-__all__ = ['STORAGES', 'BagWriter', 'LossCount', 'knows_type']
+__all__ = ['STORAGES', 'BagWriter', 'LossCount', 'PartWriter', 'knows_type']
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 #: what `flush` uses inside of rosbags: storage -> attribute -> what that must have
@@ -244,6 +244,111 @@ class BagWriter:
             f'{self.path}: cannot be written any more ({reason}); make room, and convert it: what '
             'was written can be recovered'
         )
+
+
+class PartWriter:
+    """
+    Bags one after the other: when one is large enough, it is closed and the next one begun.
+
+    The parts have the name of the first with a number behind it; each is a whole bag with all
+    topics, and its custom data say which ``part`` of which ``recording`` it is.  All calls must
+    come from one thread.
+
+    Parameters
+    ----------
+    path, storage, custom_data
+        As for `BagWriter`.
+    max_size : int, optional
+        Bytes on disk from which the next part is begun, looked at when the bag is flushed; 0 for
+        one bag without end.
+
+    Attributes
+    ----------
+    parts : list of Path
+        The folders so far; the last one is being written.
+
+    Raises
+    ------
+    DataError
+        When a bag cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        storage: str = 'mcap',
+        custom_data: Mapping[str, str] | None = None,
+        max_size: int = 0,
+    ) -> None:
+        self.max_size = max_size
+        self._make = (Path(path), storage, dict(custom_data or {}))
+        self._topics: dict[str, tuple[str, Sequence[Qos]]] = {}
+        self._messages = self._size = 0
+        self.parts: list[Path] = []
+        self._bag = self._next()
+
+    def _next(self) -> BagWriter:
+        path, storage, custom = self._make
+        if self.max_size:
+            name = self.parts[0].name if self.parts else ''
+            custom = {**custom, 'part': str(len(self.parts)), 'recording': name}
+        bag = BagWriter(path, storage, custom)
+        self.parts.append(bag.path)
+        for topic, (message_type, qos) in self._topics.items():
+            bag.add_topic(topic, message_type, qos)
+        return bag
+
+    @property
+    def path(self) -> Path:
+        """The folder that is being written."""
+        return self._bag.path
+
+    @property
+    def messages(self) -> int:
+        """How many were written, all parts together."""
+        return self._messages + self._bag.messages
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk, all parts together."""
+        return self._size + self._bag.size
+
+    def __contains__(self, topic: str) -> bool:
+        """Return whether a topic was added."""
+        return topic in self._topics
+
+    def add_topic(self, topic: str, message_type: str, qos: Sequence[Qos] = (SAMPLE_QOS,)) -> None:
+        """Add a topic, once; see `BagWriter.add_topic`."""
+        self._bag.add_topic(topic, message_type, qos)
+        self._topics[topic] = (message_type, tuple(qos))
+
+    def write(self, topic: str, stamp: int, raw: bytes) -> None:
+        """Write a message as it is; see `BagWriter.write`."""
+        self._bag.write(topic, stamp, raw)
+
+    def flush(self) -> None:
+        """
+        Hand all that was written to the system, and begin the next part when it is time.
+
+        Raises
+        ------
+        DataError
+            When a bag cannot be written any more, or the next one not be made.
+        """
+        self._bag.flush()
+        if self.max_size and self._bag.size >= self.max_size and self._bag.messages:
+            self._bag.close()
+            messages, size = self.messages, self.size
+            self._bag = self._next()
+            self._messages, self._size = messages, size
+
+    def close(self) -> None:
+        """Finish the last bag; see `BagWriter.close`."""
+        self._bag.close()
+
+    def abort(self) -> None:
+        """Let go of the file as it is."""
+        self._bag.abort()
 
 
 class LossCount:

@@ -48,6 +48,8 @@ MAX_MISSING = 0.05
 NEEDED = ('step', 'noise', 'triangle')
 #: time that jumps back by more samples than this is a restart, not a late block
 JUMP_BACK = 1000
+#: samples and blocks of a topic that are kept, and labels that are counted, whatever the times say
+MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
 
 
 def record_of_streams(
@@ -196,6 +198,7 @@ class _Watch:
     seconds: list[float] = field(default_factory=list)  # of each block that is kept
     runs: list[int] = field(default_factory=list)  # blocks at which the clock restarted
     total: float = 0.0
+    samples: int = 0  # since the last time that room was made
     dropped: int = 0  # blocks that are no longer kept
 
     def add(self, t: NDArray[np.float64]) -> None:
@@ -221,6 +224,7 @@ class _Watch:
             self.last = last
         self.seconds.append(seconds)
         self.total += seconds
+        self.samples += n
 
     def drop(self, blocks: int) -> None:
         """Forget the oldest blocks."""
@@ -317,8 +321,14 @@ class Capture:
         if key == 'voltage':
             self.segment = samples.segment
             label = samples.segment or 'unlabelled'
+            if len(self._segments) >= MOST_LABELS and label not in self._segments:
+                label = 'others'
             self._segments[label] = self._segments.get(label, 0) + samples.t.size
-        if watch.total > self.limit:
+        if (
+            watch.total > self.limit
+            or watch.samples > MOST_SAMPLES
+            or len(watch.seconds) > MOST_BLOCKS
+        ):
             self._make_room(key)
 
     def unreadable(self, key: str, reason: str) -> None:
@@ -328,7 +338,9 @@ class Capture:
     def _make_room(self, key: str) -> None:
         watch = self._watches[key]
         blocks = next(iter(watch.runs), 0)
-        if not blocks:
+        if not blocks and watch.total <= self.limit:
+            blocks = max(1, len(watch.seconds) // 10)
+        elif not blocks:
             room = 0.0
             while room < 0.1 * self.limit and blocks < len(watch.seconds) - 1:
                 room += watch.seconds[blocks]
@@ -336,6 +348,7 @@ class Capture:
         before = watch.total
         watch.drop(blocks)
         self._streams[key].drop(blocks)
+        watch.samples = self._streams[key].n
         if key == 'voltage':
             self._forgotten += before - watch.total
 

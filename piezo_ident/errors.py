@@ -14,9 +14,21 @@
 
 """The package's own exceptions: each message says what is wrong, where, and what to do."""
 
+#: what a message quotes may come from a file, and be of any length
+_LONGEST = 4000
+
 
 class PiezoIdentError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """
+    Base of every error that this package raises on purpose.
+
+    Its message is one line without control characters, which could steer a terminal, whatever
+    names of a file it quotes.
+    """
+
+    def __init__(self, message: str = '') -> None:
+        shown = (c if c.isprintable() else ' ' if c.isspace() else '?' for c in message)
+        super().__init__(''.join(shown)[:_LONGEST])
 
 
 class DataError(PiezoIdentError):

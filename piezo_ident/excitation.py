@@ -40,6 +40,7 @@ __all__ = [
     'noise',
     'odd_lines',
     'ramp',
+    'sample_count',
     'settling_sweep',
     'sine',
     'staircase',
@@ -55,11 +56,19 @@ PAPER_SLOPE = 6.0
 MAX_SAMPLES = 50_000_000
 
 
-def _length(seconds: float, sample_rate: float) -> int:
+def sample_count(seconds: float, sample_rate: float) -> int:
+    """
+    Return how many samples a signal has.
+
+    Raises
+    ------
+    ConfigError
+        When it has less than one, or more than a signal may have.
+    """
     n = seconds * sample_rate
     if n < 0.5:
         raise ConfigError(f'{seconds:g} s is shorter than one sample; make it longer')
-    if n > MAX_SAMPLES:
+    if not n <= MAX_SAMPLES:
         raise ConfigError(f'{seconds:g} s are more than {MAX_SAMPLES} samples; make it shorter')
     return round(n)
 
@@ -79,7 +88,7 @@ def crest_factor(x: NDArray[np.float64]) -> float:
 
 def constant(level: float, duration: float, sample_rate: float) -> NDArray[np.float64]:
     """Return a level held for a duration [s]."""
-    return np.full(_length(duration, sample_rate), float(level))
+    return np.full(sample_count(duration, sample_rate), float(level))
 
 
 def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[np.float64]:
@@ -97,8 +106,9 @@ def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[
     sample_rate : float
         [Hz]
     """
-    n = max(1, int(np.ceil(2.0 * abs(stop - start) / slew * sample_rate)))
-    _length(n / sample_rate, sample_rate)
+    seconds = max(1.0 / sample_rate, 2.0 * abs(stop - start) / slew)
+    sample_count(seconds, sample_rate)
+    n = max(1, int(np.ceil(seconds * sample_rate)))
     tau = np.arange(n) / n
     return start + (stop - start) * (tau - np.sin(2 * np.pi * tau) / (2 * np.pi))
 
@@ -116,8 +126,8 @@ def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDA
     sample_rate : float
         [Hz]
     """
-    n = [_length(t, sample_rate) for t in hold]
-    _length(sum(n) / sample_rate, sample_rate)
+    n = [sample_count(t, sample_rate) for t in hold]
+    sample_count(sum(n) / sample_rate, sample_rate)
     return np.repeat(np.asarray(levels, dtype=np.float64), n)
 
 
@@ -129,6 +139,8 @@ def steps(
 
     The train begins on the lower level and is held for `hold` seconds on each.
     """
+    # before as many levels are listed
+    sample_count(hold * (count + 1), sample_rate)
     low, high = bias - size / 2, bias + size / 2
     levels = [low if k % 2 == 0 else high for k in range(count + 1)]
     return staircase(levels, [hold] * len(levels), sample_rate)
@@ -152,7 +164,7 @@ def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np
     """
     v = np.asarray(levels, dtype=np.float64)
     seconds = np.abs(np.diff(v)) / slope
-    _length(float(seconds.sum()), sample_rate)
+    sample_count(float(seconds.sum()), sample_rate)
     n = np.maximum(1, np.rint(seconds * sample_rate).astype(np.int64))
     at = np.concatenate([[0], np.cumsum(n)])
     return np.interp(np.arange(at[-1]), at, v)
@@ -181,6 +193,7 @@ def decaying_triangle(
     bias: float, amplitude: float, cycles: int, slope: float, sample_rate: float
 ) -> NDArray[np.float64]:
     """Return triangles about a bias whose amplitude shrinks linearly to nothing."""
+    sample_count(2 * cycles / sample_rate, sample_rate)
     levels = [bias]
     for k in range(cycles):
         size = amplitude * (1.0 - k / cycles)
@@ -198,7 +211,7 @@ def settling_sweep(
     noise a little smaller than the sweep then moves neither towards new extremes.
     """
     _below_nyquist(frequency, sample_rate)
-    n = _length(cycles / frequency, sample_rate)
+    n = sample_count(cycles / frequency, sample_rate)
     tau = np.arange(n) / n
     envelope = np.minimum(1.0, (1.0 - tau) * cycles / max(1.0, cycles - 1.0))
     return bias + amplitude * envelope * np.sin(2 * np.pi * cycles * tau)
@@ -218,7 +231,7 @@ def sine(
     The length is rounded to a sample where the periods do not fall on one.
     """
     _below_nyquist(frequency, sample_rate)
-    n = _length(periods / frequency, sample_rate)
+    n = sample_count(periods / frequency, sample_rate)
     angle = 2 * np.pi * frequency * (np.arange(n) / sample_rate)
     return bias + amplitude * np.sin(angle + phase)
 
@@ -257,7 +270,7 @@ def noise(
         Time in which the noise rises from the bias and falls back to it [s].
     """
     _below_nyquist(cutoff, sample_rate)
-    n = _length(duration, sample_rate)
+    n = sample_count(duration, sample_rate)
     m = next_fast_len(max(n, 2), real=True)
     over = rfftfreq(m, 1.0 / sample_rate) / cutoff
     shape = 0.5 + 0.5 * np.cos(np.pi * np.clip((over - 1.0) / 0.2, 0.0, 1.0))
@@ -323,8 +336,8 @@ def multisine(
     rng : numpy.random.Generator
         Draws the phases.
     """
-    n = _length(period, sample_rate)
-    _length(n * periods / sample_rate, sample_rate)
+    n = sample_count(period, sample_rate)
+    sample_count(n * periods / sample_rate, sample_rate)
     if lines.size == 0:
         raise ConfigError('no odd line lies between the two frequencies; widen the band')
     _below_nyquist(float(lines[-1]) * sample_rate / n, sample_rate)

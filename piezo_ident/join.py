@@ -241,6 +241,8 @@ def _left_over(name: str, table: NDArray[np.float64], used: NDArray[np.int64]) -
         ('unmatched', left & ~twin, 'dropped, no sample of another stream has their time'),
     ):
         if rows.any():
-            where = f'in {name}, from {np.nanmin(t[rows]):.6g} to {np.nanmax(t[rows]):.6g} s'
+            known = t[rows & ~np.isnan(t)]
+            span = f'from {known.min():.6g} to {known.max():.6g} s' if known.size else 'at no time'
+            where = f'in {name}, {span}'
             faults.append(Fault(fault, where, int(np.count_nonzero(rows)), action))
     return faults

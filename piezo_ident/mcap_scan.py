@@ -30,6 +30,7 @@ import struct
 from typing import Any, BinaryIO, NamedTuple
 
 from piezo_ident.errors import DataError
+from piezo_ident.limits import unpacked
 from rosbags.rosbag2 import storage_mcap
 
 __all__ = ['MAGIC', 'Channel', 'McapScan', 'Message']
@@ -112,10 +113,48 @@ class McapScan:
                 for opcode, body in self._top_level(file, size):
                     yield from _entries(opcode, body, schemas)
             except (_Damage, struct.error, UnicodeDecodeError) as error:
-                raise DataError(
-                    f'{self.path}: damaged or unfinished bag, a record before byte {file.tell()} '
-                    f'makes no sense ({error}); record it again'
-                ) from None
+                raise self._damaged(file, error) from None
+
+    def chunks(self) -> set[tuple[int, str, int, int]]:
+        """
+        Return place, compression, packed size and size of each chunk of a finished file.
+
+        Each was unpacked once, so that whoever relies on these numbers takes no more memory.
+
+        Raises
+        ------
+        DataError
+            When the file is not what it says.
+        """
+        found = set()
+        with self.path.open('rb') as file:
+            size = file.seek(0, 2)
+            left, at = unpacked(size), file.seek(len(MAGIC))
+            try:
+                while at < size - len(MAGIC):
+                    opcode, length = _HEAD.unpack(file.read(_HEAD.size))
+                    end = at + _HEAD.size + length
+                    if end > size:
+                        raise _Damage(f'a record of {length} bytes')
+                    if opcode == _CHUNK:
+                        body = memoryview(file.read(_allowed(length, 'a chunk')))
+                        head = _chunk_head(body)
+                        left -= head.size
+                        if left < 0:
+                            raise _Damage('chunks of more than a file of this size holds')
+                        if len(_contents(body, head, whole=True)) != head.size:
+                            raise _Damage('a chunk whose size is wrong')
+                        found.add((at, head.compression, head.packed_size, head.size))
+                    at = file.seek(end)
+            except (_Damage, struct.error, UnicodeDecodeError) as error:
+                raise self._damaged(file, error) from None
+        return found
+
+    def _damaged(self, file: BinaryIO, error: Exception) -> DataError:
+        return DataError(
+            f'{self.path}: damaged or unfinished bag, a record before byte {file.tell()} '
+            f'makes no sense ({error}); record it again'
+        )
 
     def _top_level(self, file: BinaryIO, size: int) -> Iterator[tuple[int, memoryview]]:
         """Yield the records that count, those of chunks too."""
@@ -155,18 +194,13 @@ def _allowed(length: int, what: str) -> int:
 def _chunk(body: memoryview, whole: bool) -> Generator[tuple[int, memoryview], None, int]:
     """Yield the records of a chunk as far as they go, and return how many bytes they took."""
     try:
-        _, _, raw_size, checksum = _CHUNK_HEAD.unpack_from(body)
-        compression, at = _text(body, _CHUNK_HEAD.size)
-        (packed_size,) = _U64.unpack_from(body, at)
+        head = _chunk_head(body)
     except (struct.error, _Damage):
         if whole:
             raise
         return 0  # not even the head of the last chunk is there
-    packed = body[at + 8 : at + 8 + packed_size]
-    if whole and len(packed) != packed_size:
-        raise _Damage(f'a chunk that announces {packed_size} bytes')
-    raw = _unpacked(packed, compression, _allowed(raw_size, 'a chunk'), whole)
-    if whole and (len(raw) != raw_size or (checksum and crc32(raw) != checksum)):
+    raw = _contents(body, head, whole=whole)
+    if whole and (len(raw) != head.size or (head.checksum and crc32(raw) != head.checksum)):
         raise _Damage('a chunk whose checksum or size is wrong')
     start = 0
     while start + _HEAD.size <= len(raw):
@@ -179,7 +213,31 @@ def _chunk(body: memoryview, whole: bool) -> Generator[tuple[int, memoryview], N
     if whole and start != len(raw):
         raise _Damage('a chunk that ends within a record')
     # bytes of a compressed chunk cannot be told apart
-    return _HEAD.size + (len(body) if whole else at + 8 + start if not compression else 0)
+    return _HEAD.size + (len(body) if whole else head.at + start if not head.compression else 0)
+
+
+class _ChunkHead(NamedTuple):
+    """Size and checksum of what is in a chunk, how it is packed, how large, and where."""
+
+    size: int
+    checksum: int
+    compression: str
+    packed_size: int
+    at: int
+
+
+def _chunk_head(body: memoryview) -> _ChunkHead:
+    _, _, size, checksum = _CHUNK_HEAD.unpack_from(body)
+    compression, at = _text(body, _CHUNK_HEAD.size)
+    (packed_size,) = _U64.unpack_from(body, at)
+    return _ChunkHead(size, checksum, compression, packed_size, at + 8)
+
+
+def _contents(body: memoryview, head: _ChunkHead, *, whole: bool) -> memoryview:
+    packed = body[head.at : head.at + head.packed_size]
+    if whole and len(packed) != head.packed_size:
+        raise _Damage(f'a chunk that announces {head.packed_size} bytes')
+    return _unpacked(packed, head.compression, _allowed(head.size, 'a chunk'), whole)
 
 
 def _unpacked(packed: memoryview, compression: str, size: int, whole: bool) -> memoryview:

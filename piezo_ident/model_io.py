@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 import difflib
-import errno
 import os
 from pathlib import Path
 import reprlib
@@ -28,26 +27,26 @@ from typing import Any
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.dynamics import Delay, Dynamics
-from piezo_ident.errors import ConfigError, DataError, ModelError
+from piezo_ident.errors import DataError, ModelError
 from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.limits import EFFECTS, ORDER
 from piezo_ident.model import EffectSetting, Scaling, StageModel
+from piezo_ident.yaml_io import endless, load_yaml, parse_yaml
 import yaml
 
 __all__ = [
     'SCHEMA_VERSION',
-    'broken_link',
     'load_model',
     'load_yaml',
     'model_from_dict',
     'model_to_dict',
+    'parse_yaml',
     'plain',
     'save_model',
     'write_text',
 ]
 
 SCHEMA_VERSION = 1
-#: more entries, or deeper nesting, under one key of a model file are refused
-MOST_NODES, DEEPEST = 100_000, 20
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
@@ -86,79 +85,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def broken_link(path: str | os.PathLike[str]) -> str | None:
-    """
-    Return what is wrong with a symbolic link that leads nowhere, and the cure.
-
-    Returns
-    -------
-    str or None
-        None when it is no link, or leads somewhere.
-    """
-    if not os.path.islink(path):
-        return None
-    try:
-        os.stat(path)
-    except FileNotFoundError:
-        return f'is a link to {os.readlink(path)}, which does not exist; mend the link'
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            return 'is a link that leads back to itself; mend the link'
-    return None
-
-
-def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """
-    Read a YAML mapping with the safe loader.
-
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read, is not YAML, or is not a mapping.
-    """
-    broken = broken_link(path)
-    if broken:
-        raise ConfigError(f'{path}: {broken}')
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-    except FileNotFoundError:
-        raise ConfigError(f'{path}: no such file; check the name') from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f'{path}: cannot be read as text ({_reason(error)})') from None
-    return parse_yaml(text, str(path))
-
-
-def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """
-    Parse a YAML mapping with the safe loader.
-
-    Raises
-    ------
-    ConfigError
-        When the text is not YAML, or not a mapping.
-    """
-    try:
-        data = yaml.safe_load(text)
-    except (
-        # the loader lets through what its own constructors trip over
-        yaml.YAMLError,
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f' at line {mark.line + 1}' if mark is not None else ''
-        raise ConfigError(f'{name}: not valid YAML{where}; correct it or write it again') from None
-    if not isinstance(data, dict):
-        raise ConfigError(
-            f'{name}: expected a YAML mapping, got {type(data).__name__}; is it the right file?'
-        )
-    return data
-
-
 def _reason(error: Exception) -> str:
     return getattr(error, 'strerror', None) or type(error).__name__
 
@@ -189,21 +115,6 @@ def _numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, An
         return np.array([float(x) for x in value], dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ModelError(f'{name}: {key} must be a list of numbers') from None
-
-
-def _refuse_endless(data: Mapping[str, Any], name: str) -> None:
-    # an alias may stand for a tree of any size in a few bytes, or for the list that holds it
-    for key, value in data.items():
-        left, todo = MOST_NODES, [(value, 0)]
-        while todo:
-            node, depth = todo.pop()
-            inner = list(node.values()) if isinstance(node, Mapping) else node
-            if not isinstance(inner, (list, tuple)):
-                continue
-            left -= len(inner)
-            if left < 0 or depth > DEEPEST:
-                raise ModelError(f'{name}: {key} is nested too deeply, or too large')
-            todo += [(x, depth + 1) for x in inner]
 
 
 def _unknown(data: Mapping[str, Any], known: Collection[str]) -> list[str]:
@@ -242,7 +153,9 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     ModelError
         When the schema is later than this package knows, or a part is missing or wrong.
     """
-    _refuse_endless(data, name)
+    found = endless(data)
+    if found is not None:
+        raise ModelError(f'{name}: {found} is nested too deeply, or too large')
     version = data.get('schema_version', SCHEMA_VERSION)
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         raise ModelError(
@@ -272,6 +185,8 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     effects = data.get('effects') or []
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise ModelError(f'{name}: effects must be a list of mappings')
+    if len(effects) > EFFECTS:
+        raise ModelError(f'{name}: {len(effects)} effects; give at most {EFFECTS}')
     for effect in effects:
         _refuse_unknown(_unknown(effect, _EFFECT), _EFFECT, ' in effects', name)
     identification = data.get('identification') or {}
@@ -280,6 +195,9 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     samples = _number(delay, 'samples', name)
     if not samples.is_integer():
         raise ModelError(f'{name}: delay.samples must be a whole number, got {samples}')
+    a, b = _numbers(g, 'a', name), _numbers(g, 'b', name)
+    if max(a.size, b.size) > ORDER:
+        raise ModelError(f'{name}: dynamics of order {max(a.size, b.size)}; at most {ORDER}')
     try:
         return StageModel(
             sample_rate=_number(data, 'sample_rate', name),
@@ -296,7 +214,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
                 p1=_number(h, 'p1', name),
                 p2=_number(h, 'p2', name),
             ),
-            dynamics=Dynamics(a=_numbers(g, 'a', name), b=_numbers(g, 'b', name)),
+            dynamics=Dynamics(a=a, b=b),
             delay=Delay(int(samples), _number(delay, 'fraction', name, 0.0)),
             effects=tuple(
                 EffectSetting(
@@ -386,7 +304,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """
     target = Path(path)
     try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f'.{target.name}.')
+        handle, temporary = tempfile.mkstemp(
+            dir=target.parent, prefix=f'.{target.name}.', suffix='.tmp'
+        )
         try:
             with os.fdopen(handle, 'w', encoding='utf-8') as file:
                 file.write(text)

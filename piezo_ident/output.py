@@ -12,14 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Outputs appear whole or not at all: written under a temporary name beside, then renamed."""
+"""
+Outputs appear whole or not at all: written under a temporary name beside, then renamed.
+
+What a process that was killed leaves behind is called ``.<name>.<random>.tmp`` and can be deleted.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import ctypes
+import os
 from pathlib import Path
 import shutil
+import sqlite3
 import tempfile
 
 from piezo_ident.errors import DataError
@@ -60,9 +67,10 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
         work = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent))
         try:
             yield work / path.name
-            if path.is_dir():
-                path.rename(work / 'replaced')
-            (work / path.name).replace(path)
+            if not (path.is_dir() and _exchanged(work / path.name, path)):
+                if path.is_dir():
+                    path.rename(work / 'replaced')
+                (work / path.name).replace(path)
         except BaseException:
             old = work / 'replaced'
             if old.exists() and not path.exists():
@@ -71,9 +79,20 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
             raise
         finally:
             shutil.rmtree(work, ignore_errors=True)
-    except OSError as error:
-        reason = error.strerror or str(error)
+    # a full disk is an error of its own to SQLite
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
         raise DataError(
             f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
             'the right to write'
         ) from None
+
+
+def _exchanged(new: Path, old: Path) -> bool:
+    """Swap two folders in one step, so that no moment is without one; False where that fails."""
+    here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+    try:
+        swap = ctypes.CDLL(None).renameat2
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(swap(here, os.fsencode(new), here, os.fsencode(old), exchange) == 0)

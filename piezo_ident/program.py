@@ -31,6 +31,7 @@ from itertools import chain
 import math
 import os
 import re
+import reprlib
 from types import MappingProxyType
 from typing import Any
 
@@ -198,7 +199,8 @@ class Program:
         labelled = []
         for part in parts:
             least, most = float(part.v.min()), float(part.v.max())
-            if least < low - slack or most > high + slack:
+            # a sample that is no number passes no comparison
+            if not (low - slack <= least and most <= high + slack):
                 raise ConfigError(
                     f'{where}: reaches {least:g} .. {most:g} V, outside the limits '
                     f'{low:g} .. {high:g} V; lower its amplitude or move its bias'
@@ -248,7 +250,7 @@ class Program:
 
 
 def _where(name: str, number: int, signal: object) -> str:
-    return f'{name}: segment {number} ({signal})'
+    return f'{name}: segment {number} ({reprlib.repr(signal).strip(chr(39))})'
 
 
 def load_program(path: str | os.PathLike[str]) -> Program:
@@ -302,7 +304,9 @@ def _program(data: Mapping[str, Any], name: str) -> Program:
             raise ConfigError(f'{name}: {error}') from None
     limits = values['limits']
     if len(limits) != 2 or limits[0] >= limits[1]:
-        raise ConfigError(f'{name}: limits must be [lowest, highest] voltage, got {limits}')
+        raise ConfigError(
+            f'{name}: limits must be [lowest, highest] voltage, got {reprlib.repr(limits)}'
+        )
     if not limits[0] <= values['rest'] <= limits[1]:
         raise ConfigError(f'{name}: rest = {values["rest"]:g} V lies outside the limits {limits}')
     if values['seed'] < 0 or values['seed'] != int(values['seed']):
@@ -334,14 +338,16 @@ def _entry(item: Any, number: int, name: str) -> Entry:
         raise ConfigError(f'{where}: {error}') from None
     label = item.get('name')
     if label is not None and not (isinstance(label, str) and _NAME.fullmatch(label)):
-        raise ConfigError(f'{where}: name {label!r} must be a word of letters, digits and . + - _')
+        raise ConfigError(
+            f'{where}: name {reprlib.repr(label)} must be a word of letters, digits and . + - _'
+        )
     return Entry(kind, MappingProxyType(values), label)
 
 
 def _known(data: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
-    strange = [str(key) for key in data if key not in keys]
+    strange = [str(key)[:40] for key in data if key not in keys]
     if strange:
-        raise ConfigError(f'{where}: unknown {", ".join(strange)}; it knows {", ".join(keys)}')
+        raise ConfigError(f'{where}: unknown {", ".join(strange[:8])}; it knows {", ".join(keys)}')
 
 
 def _read(data: Mapping[str, Any], key: str, option: Option) -> Any:

@@ -23,11 +23,12 @@ import re
 import numpy as np
 from piezo_ident.bag_io import read_bag, write_bag
 from piezo_ident.errors import DataError
-from piezo_ident.model_io import broken_link
+from piezo_ident.limits import regular_file
 from piezo_ident.output import temporary_output
 from piezo_ident.record import Fault, Record
 from piezo_ident.sampling import assemble
 from piezo_ident.table_io import READERS, Table, WRITERS
+from piezo_ident.yaml_io import broken_link
 
 __all__ = ['read_record', 'write_record']
 
@@ -87,6 +88,7 @@ def read_record(
         )
     if not path.exists():
         raise DataError(f'{path}: does not exist; check the name')
+    regular_file(path)
     if suffix not in READERS:
         raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_FORMATS}')
     try:

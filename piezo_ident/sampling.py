@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.errors import DataError
+from piezo_ident.limits import PIECES
 from piezo_ident.ordering import at_times, in_order, Rows
 from piezo_ident.record import Fault, Piece, Record, Segment
 
@@ -43,6 +44,10 @@ UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm':
 
 #: strokes of piezo stages [m]; anything else is the wrong unit
 STROKE = (1e-9, 10e-3)
+#: spans of a voltage [V]; the squares of others leave what a float64 can hold
+VOLTAGE = (1e-12, 1e12)
+#: share of a motion that a float64 may lose to an offset
+LOST = 1e-6
 #: share of samples without a number that can be cut out
 MAX_NOT_FINITE = 0.01
 #: later times [s] and higher rates [Hz] are counted in another unit than seconds
@@ -204,8 +209,10 @@ def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float]
                 f'{limits[1]:g} V, worst {v[worst]:g} V at {table.t[worst]:.6g} s; '
                 'check the limits or the unit of v'
             )
-    stroke = float(y.max() - y.min())
-    idle = v.max() == v.min()  # a stage at rest has no stroke, whatever the unit
+    stroke, span = float(y.max() - y.min()), float(v.max() - v.min())
+    idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
+    if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
+        raise DataError(f'{name}: v spans {span:.3g} V, which is no voltage; write v in volts')
     if stroke == 0.0 and not idle:
         raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
     if stroke > STROKE[1] or (stroke < STROKE[0] and not idle):
@@ -213,6 +220,13 @@ def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float]
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
             '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
         )
+    for key, x, moved in (('v', v, span), ('y', y, stroke)):
+        offset = float(np.abs(x).max())
+        if moved and offset * np.finfo(np.float64).eps > LOST * moved:
+            raise DataError(
+                f'{name}: {key} lies at {offset:.3g} and moves by {moved:.3g}: its digits are '
+                'used up by the offset; subtract it where the numbers are made'
+            )
 
 
 def _pieces(
@@ -231,6 +245,10 @@ def _pieces(
         raise DataError(
             f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); '
             'write t with more decimals, or resample on a uniform grid'
+        )
+    if len(parts) > PIECES:
+        raise DataError(
+            f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
         )
     short = [p for p in parts if p[1] - p[0] < MIN_PIECE]
     parts = [p for p in parts if p[1] - p[0] >= MIN_PIECE]

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
+import reprlib
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Option:
         """
         if self.choices:
             if value not in self.choices:
-                raise ConfigError(f'{value!r} is none of {", ".join(self.choices)}')
+                raise ConfigError(f'{reprlib.repr(value)} is none of {", ".join(self.choices)}')
             return value
         if self.many:
             values = value if isinstance(value, list) else [value]
@@ -86,7 +87,7 @@ class Option:
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not math.isfinite(number):
-            raise ConfigError(f'{value!r} is not a number; give it in {self.unit}')
+            raise ConfigError(f'{reprlib.repr(value)} is not a number; give it in {self.unit}')
         if self.whole and (number < 1 or number != int(number)):
             raise ConfigError(f'{number:g} must be a whole number of at least 1')
         if self.positive and number <= 0:
@@ -206,6 +207,9 @@ def _decaying_triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 
 
 def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    # before as many corners are listed; each leg has a sample
+    excitation.sample_count(2 * len(o['biases']) * o['cycles'] / s.sample_rate, s.sample_rate)
+
     def loops(bias: float) -> NDArray[np.float64]:
         levels = [bias, *[bias + o['amplitude'], bias - o['amplitude']] * o['cycles'], bias]
         return excitation.corners(levels, o['slope'], s.sample_rate)
@@ -218,6 +222,8 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     if (o['periods'] is None) == (o['duration'] is None):
         raise ConfigError('give either periods or duration')
     # rounded first: 1.4 s of 10 Hz are 14 periods, not 15
+    if o['duration']:
+        excitation.sample_count(o['duration'], s.sample_rate)
     periods = o['periods'] or math.ceil(round(o['duration'] * f, 6))
     v = excitation.sine(o['bias'], o['amplitude'], f, periods, s.sample_rate, o['phase'])
     return _periodic(v, f'{f:g}Hz')
@@ -225,13 +231,15 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 
 def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     period, count = o['period'], o['realisations']
+    # all of it, before any is made
+    excitation.sample_count(period * o['periods'] * count, s.sample_rate)
+    for end in ('lowest', 'highest'):
+        if o[end] > s.sample_rate / 2:
+            raise ConfigError(
+                f'{end} = {o[end]:g} Hz is above half the sampling rate ({s.sample_rate / 2:g} Hz)'
+            )
     lowest = max(1, math.ceil(round(o['lowest'] * period, 6)))
     highest = math.floor(round(o['highest'] * period, 6))
-    if highest > s.sample_rate * period / 2:
-        raise ConfigError(
-            f'highest = {o["highest"]:g} Hz is above half the sampling rate '
-            f'({s.sample_rate / 2:g} Hz)'
-        )
     parts = []
     for number in range(1, count + 1):
         lines = excitation.odd_lines(lowest, highest, s.rng)

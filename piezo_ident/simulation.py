@@ -26,6 +26,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 import os
+import reprlib
 from typing import Any
 
 import numpy as np
@@ -291,14 +292,16 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
     if not isinstance(sensor, Mapping):
         raise ConfigError(f'{name}: sensor must be a mapping, see config/stage_paper.yaml')
     known = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
-    strange = [str(key) for key in sensor if key not in known]
+    strange = [str(key)[:40] for key in sensor if key not in known][:8]
     if strange:
         raise ConfigError(
             f'{name}: unknown {", ".join(strange)} in sensor; it knows {", ".join(known)}'
         )
     seed = data.get('seed', 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigError(f'{name}: seed must be a whole number, not negative, got {seed!r}')
+        raise ConfigError(
+            f'{name}: seed must be a whole number, not negative, got {reprlib.repr(seed)}'
+        )
     model = model_from_dict({k: v for k, v in data.items() if k not in ('sensor', 'seed')}, name)
     try:
         return SimulatedStage(
@@ -331,8 +334,8 @@ def _number(value: Any, key: str) -> float:
     # YAML 1.1 reads 2e-5 as text; people write it all the same
     try:
         number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ConfigError(f'{key} must be a number, got {value!r}')
+        raise ConfigError(f'{key} must be a number, got {reprlib.repr(value)}')
     return number

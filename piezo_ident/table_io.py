@@ -23,6 +23,7 @@ begins.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import csv
@@ -37,6 +38,8 @@ import zipfile
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.errors import DataError
+from piezo_ident.limits import COLUMNS, unpacked
+from piezo_ident.mat_read import read_variables
 from piezo_ident.sampling import label_runs
 import scipy.io
 
@@ -67,6 +70,13 @@ def _wanted(name: str) -> bool:
 
 def _check_names(names: Iterable[str], path: Path) -> None:
     found = list(names)
+    if sum(map(_wanted, found)) > COLUMNS:
+        raise DataError(f'{path}: more than {COLUMNS} columns; leave out some')
+    twice = sorted(c for c, n in Counter(found).items() if c and n > 1)
+    if twice:
+        raise DataError(
+            f'{path}: column {", ".join(twice)[:200]} stands there twice; keep one of them'
+        )
     missing = [c for c in _REQUIRED if c not in found]
     if missing:
         raise DataError(
@@ -172,9 +182,6 @@ def _header(reader: Any, path: Path) -> list[str]:
             f"{path}: no header line; put '{','.join([*_REQUIRED, *names])}'{more} on top of the "
             'numbers'
         )
-    twice = sorted({c for c in header if c and header.count(c) > 1})
-    if twice:
-        raise DataError(f'{path}: column {", ".join(twice)} stands there twice; keep one of them')
     _check_names(header, path)
     return header
 
@@ -252,9 +259,10 @@ def read_npz(path: Path) -> Table:
 def _check_npz(path: Path) -> None:
     """Refuse what only pretends to be arrays, before memory is spent on what it announces."""
     with zipfile.ZipFile(path) as archive:
-        for info in archive.infolist():
-            if not _used(info.filename.removesuffix('.npy')):
-                continue
+        used = [i for i in archive.infolist() if _used(i.filename.removesuffix('.npy'))]
+        if sum(info.file_size for info in used) > unpacked(path.stat().st_size):
+            raise ValueError('it unpacks to more than a file of its size holds')
+        for info in used:
             with archive.open(info) as member:
                 version = np.lib.format.read_magic(member)
                 header = {
@@ -333,12 +341,8 @@ def read_mat(path: Path) -> Table:
             head = file.read(1024)
         if b'\x89HDF\r\n\x1a\n' in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
             raise DataError(f'{path}: MATLAB 7.3 file (HDF5); save it with save -v7')
-        if head[126:128] not in (b'IM', b'MI'):
-            raise ValueError('not a MATLAB 5 file')
-        listed = [name for name, _, _ in scipy.io.whosmat(path)]
-        return _from_arrays(
-            scipy.io.loadmat(path, variable_names=[k for k in listed if _used(k)]), listed, path
-        )
+        names, arrays = read_variables(path.read_bytes(), _used)
+        return _from_arrays(arrays, names, path)
 
 
 def write_mat(file: BinaryIO, table: Table) -> None:

@@ -147,7 +147,7 @@ def decode(data: ArrayLike, dims: Sequence[DimensionLike], data_offset: int = 0)
         labels = [d.label for d in dims]
         raise DataError(f"layout {labels} is not ['sample:<segment>', 't,<quantity>']")
     n, width = dims[0].size, dims[1].size
-    if width != 2 or dims[1].stride != 2 or dims[0].stride != 2 * n:
+    if n < 0 or width != 2 or dims[1].stride != 2 or dims[0].stride != 2 * n:
         raise DataError(
             f'layout {n} x {width} with strides {dims[0].stride}, {dims[1].stride} is not N x 2 '
             'with strides 2N, 2'

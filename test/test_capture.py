@@ -280,3 +280,21 @@ def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
 def test_runs_that_follow_each_other_miss_nothing(record):
     snapshot = capture_of([*blocks_of(record), *blocks_of(record)]).snapshot()
     refuse_incomplete(snapshot.record(), snapshot.sent())
+
+
+def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
+    monkeypatch.setattr('piezo_ident.capture.MOST_BLOCKS', 100)
+    monkeypatch.setattr('piezo_ident.capture.MOST_SAMPLES', 1000)
+    monkeypatch.setattr('piezo_ident.capture.MOST_LABELS', 20)
+    lone, dense = Capture(), Capture()
+    for k in range(500):
+        # single samples have no period, so that no time adds up
+        lone.add('voltage', Samples(np.array([k / RATE]), np.zeros(1), f'sine:{k}'), k)
+        t = 1e-9 * np.arange(100 * k, 100 * (k + 1))
+        dense.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
+    assert 80 <= lone.n <= 101
+    assert 800 <= dense.n <= 1100
+    assert len(lone.segments) == 21 and 'others' in lone.segments
+    # the newest part is what is left
+    assert lone.last_time('voltage') == 499 / RATE
+    assert lone.snapshot().streams['voltage'].rows[-1, 0] == 499 / RATE

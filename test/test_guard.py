@@ -209,3 +209,23 @@ def test_a_ramp_does_not_depend_on_the_cutting(a, b):
     whole, pieces = Guard(USUAL, 7.3), Guard(USUAL, 7.3)
     got = np.concatenate([pieces.idle(a), pieces.idle(b)])
     assert got.tobytes() == whole.idle(a + b).tobytes()
+
+
+@pytest.mark.parametrize('how', ['hold', 'idle', 'process'])
+def test_limits_that_are_moved_away_are_followed_at_the_slew(how):
+    guard = Guard(USUAL, applied=9.0)
+    guard.process([9.0])
+    guard.settings = GuardSettings(1.0, 6.5, slew=1000.0, ramp_slew=20.0, rest=1.0, sample_rate=FS)
+    # no number leaves the last command in force, which is outside by now
+    v = guard.process([math.nan] * 4).voltage if how == 'process' else getattr(guard, how)(4)
+    assert v[:3].tolist() == [8.0, 7.0, 6.5]
+    assert v[3] == pytest.approx(6.5, abs=0.01)
+
+
+def test_silence_is_remembered_when_limits_are_moved_in_it():
+    guard = Guard(USUAL, applied=8.0)
+    guard.idle(10)
+    guard.settings = GuardSettings(0.0, 9.0, slew=1000.0, ramp_slew=20.0, rest=0.0, sample_rate=FS)
+    before = guard.applied
+    # what comes next is a new stream all the same, and joined by a ramp
+    assert guard.process([before - 0.9]).altered == {'joining': 1}

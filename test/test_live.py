@@ -339,3 +339,14 @@ def test_live_error_is_the_rms_of_the_window():
     assert live.seconds == pytest.approx(1.0, abs=0.02)
     live.add(np.array([0.0]), np.array([7.0]))
     assert live.rms == 7.0
+
+
+def test_a_clock_faster_than_any_card_is_left_out_and_blocks_are_bounded(monkeypatch):
+    monkeypatch.setattr('piezo_ident.live.MOST_BLOCKS', 50)
+    predictor = Predictor()
+    t = 1e-9 * np.arange(100)
+    assert predictor.process(Samples(t, np.zeros(100))) is None
+    assert 'not uniform' in predictor.problem
+    for k in range(200):
+        predictor.process(Samples(np.array([k / 20_000.0]), np.zeros(1)))
+    assert len(predictor._recent) == 50

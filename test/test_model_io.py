@@ -312,7 +312,7 @@ def test_anchors_that_multiply_do_not_explode(tmp_path, where):
 def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
     path = tmp_path / 'model.yaml'
     path.write_text(BOMB, encoding='utf-8')
-    with pytest.raises(ModelError):
+    with pytest.raises(ConfigError, match='too large'):
         load_model(path)
     path.write_text(
         model_to_yaml(replace(PAPER, identification={}, effects=())).replace(
@@ -320,7 +320,7 @@ def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
         ),
         encoding='utf-8',
     )
-    with pytest.raises(ModelError, match='identification'):
+    with pytest.raises(ConfigError, match='identification'):
         load_model(path)
 
 

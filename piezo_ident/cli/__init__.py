@@ -125,6 +125,28 @@ def _reading() -> _Parser:
     return options
 
 
+def _each() -> _Parser:
+    """Return the options of the verbs that take many records one by one."""
+    options = _Parser(add_help=False)
+    group = options.add_argument_group('many records')
+    group.add_argument(
+        '--each',
+        type=_path,
+        metavar='DIR',
+        help='take every record on its own; a model each, a table and pictures go there. What is '
+        'done is kept: the same command goes on where it was stopped',
+    )
+    group.add_argument('--jobs', type=_whole, metavar='N', help='processes (default: one a core)')
+    group.add_argument(
+        '--scheduler',
+        type=_name,
+        metavar='ADDRESS',
+        help='have it done by the workers of this dask scheduler, which read the same paths',
+    )
+    group.add_argument('--reports', action='store_true', help='write a report of every record too')
+    return options
+
+
 def _json() -> _Parser:
     option = _Parser(add_help=False)
     option.add_argument('--json', action='store_true', help='print the result as JSON, only that')
@@ -172,7 +194,7 @@ def _build_parser() -> _Parser:
     p.add_argument('--sample-rate', type=float, metavar='HZ', help="the stage's own when absent")
     _add_output(p)
 
-    p = verb('identify', 'Learn a model from records', _reading(), _json())
+    p = verb('identify', 'Learn a model from records', _reading(), _each(), _json())
     p.add_argument(
         'records', nargs='+', type=_path, metavar='RECORD', help='file, bag, or folder of records'
     )
@@ -214,8 +236,19 @@ def _build_parser() -> _Parser:
     )
     p.add_argument('--plot', type=_path, metavar='PNG', help='picture of measured and predicted')
 
-    p = verb('diagnose', 'Find the effect that a model lacks, and add it', _reading(), _json())
-    p.add_argument('model_file', type=_path, metavar='MODEL', help='model file')
+    p = verb(
+        'diagnose',
+        'Find the effect that a model lacks, and add it',
+        _reading(),
+        _each(),
+        _json(),
+    )
+    p.add_argument(
+        'model_file',
+        type=_path,
+        metavar='MODEL',
+        help='model file; with --each also a folder with one of the name of every record',
+    )
     p.add_argument(
         'records',
         nargs='+',

@@ -30,6 +30,7 @@ from piezo_ident.record_io import read_record
 
 __all__ = [
     'RECORD_FILES',
+    'check_limits',
     'check_record_output',
     'expand',
     'naming',
@@ -75,17 +76,29 @@ def expand(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
+    """
+    Return the voltage limits that are asked for.
+
+    Raises
+    ------
+    ConfigError
+        When the higher one comes first.
+    """
+    if args.voltage_limits is None:
+        return None
+    low, high = args.voltage_limits
+    if not low < high:
+        raise ConfigError(f'--voltage-limits {low:g} {high:g}: give the lower one first')
+    return low, high
+
+
 def read(path: Path, args: argparse.Namespace) -> Record:
     """Read one record as the options say."""
-    limits = args.voltage_limits
-    if limits is not None and not limits[0] < limits[1]:
-        raise ConfigError(
-            f'--voltage-limits {limits[0]:g} {limits[1]:g}: give the lower one first'
-        )
     return read_record(
         path,
         displacement_unit=args.displacement_unit,
-        voltage_limits=None if limits is None else (limits[0], limits[1]),
+        voltage_limits=check_limits(args),
         namespace=args.namespace,
         voltage_topic=args.voltage_topic,
         displacement_topic=args.displacement_topic,

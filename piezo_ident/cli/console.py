@@ -47,13 +47,13 @@ class Console:
     def say(self, text: str = '') -> None:
         """Write lines for people; nothing in JSON."""
         if not self.as_json:
-            sys.stdout.write(f'{text}\n')
+            sys.stdout.write(f'{_harmless(text)}\n')
             # whoever looks on through a pipe should see it when it is said
             sys.stdout.flush()
 
     def note(self, text: str) -> None:
         """Write a line that belongs to no result."""
-        sys.stderr.write(f'piezo_ident: {text}\n')
+        sys.stderr.write(f'piezo_ident: {_harmless(text)}\n')
 
     def result(self, data: Any) -> None:
         """Write the result for programs; nothing as text."""
@@ -95,6 +95,11 @@ class Console:
         finally:
             for bar in bars.values():
                 bar.close()
+
+
+def _harmless(text: str) -> str:
+    """Return lines without control characters: names in files must not steer a terminal."""
+    return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 
 
 def _finite(value: Any) -> Any:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from piezo_ident.cli.common import expand, naming, read_all
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import check_order, MODEL_FILES
@@ -44,7 +45,13 @@ __all__ = ['diagnose_command']
 
 def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident diagnose``."""
+    check_each(args)
     settings = _settings(args)
+    if args.each is not None:
+        if not args.model_file.is_dir():
+            check_order(args.model_file, args.records[0], 'diagnose')
+        diagnose_each(args, settings, console)
+        return
     check_order(args.model_file, args.records[0], 'diagnose')
     paths, further = expand(args.records), expand(args.validation)
     _check_outputs(args, [args.model_file, *paths, *further])

@@ -33,6 +33,7 @@ from piezo_ident.cli.common import (
     story,
 )
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.each_command import check_each, identify_each
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
 from piezo_ident.errors import ConfigError
@@ -55,6 +56,7 @@ PICTURES = ('.png', '.pdf', '.svg')
 
 def identify_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident identify``."""
+    check_each(args)
     settings = Settings(
         thresholds=10 if args.thresholds is None else args.thresholds,
         refine=args.thresholds is None,
@@ -65,6 +67,9 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         hold_out=args.hold_out,
         seed=args.seed,
     )
+    if args.each is not None:
+        identify_each(args, settings, console)
+        return
     paths, further = expand(args.records), expand(args.validation)
     if args.model is not None:
         check_suffix(args.model, MODEL_FILES, 'a model')

@@ -21,7 +21,7 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.errors import ConfigError, DataError
-from piezo_ident.model_io import broken_link
+from piezo_ident.yaml_io import broken_link
 
 __all__ = ['check_distinct', 'check_file', 'check_folder', 'check_link', 'check_suffix']
 

@@ -44,6 +44,7 @@ from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
 from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.errors import IdentificationError
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
 from piezo_ident.residual.faults import FaultSearch, find_faults
@@ -141,6 +142,8 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
 def _base(simulator: Simulator, given: State) -> Fitted:
     """Return the base model refitted on a fine grid of thresholds."""
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
+    if swing == 0.0:
+        raise IdentificationError('the voltage never moves; record the stage while it is driven')
     state, columns = fit_base(simulator, given, base_thresholds(swing))
     return fit_jointly(simulator, state, columns)
 

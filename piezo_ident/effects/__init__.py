@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import entry_points
+import reprlib
 from types import MappingProxyType
 
 from piezo_ident.effects.amplifier_lag import AmplifierLag
@@ -103,4 +104,6 @@ def find_effect(name: str) -> type[Effect]:
         return catalogue()[name]
     except KeyError:
         known = ', '.join(sorted(catalogue()))
-        raise ModelError(f'unknown effect {name!r}; the catalogue has {known}') from None
+        raise ModelError(
+            f'unknown effect {reprlib.repr(name)}; the catalogue has {known}'
+        ) from None

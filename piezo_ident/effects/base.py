@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+import reprlib
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -100,7 +101,7 @@ class Parameter:
         """
         if self.kind == 'text':
             if not isinstance(value, str) or not value:
-                raise ModelError(f'{where}: {self.name} must be a text, got {value!r}')
+                raise ModelError(f'{where}: {self.name} must be a text, got {reprlib.repr(value)}')
             return value
         try:
             number = np.asarray(value, dtype=np.float64)

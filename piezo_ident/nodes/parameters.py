@@ -204,6 +204,15 @@ RECORDER = (
         'topics to record',
         read_only=True,
     ),
+    Declaration(
+        'max_bag_size',
+        0,
+        'size from which the next part of the recording is begun, in a folder with a number; 0: '
+        'one bag without end',
+        'bytes',
+        0,
+        10**15,
+    ),
     Declaration('flush', 0.4, 'longest time that a message waits to be on disk', 's', 0.05, 0.5),
     _rate(),
     Declaration('autostart', False, 'start to record at once', read_only=True),

@@ -21,6 +21,9 @@ middleware received it, so neither the thread nor the disk moves it.
 
 Topics of the graph are subscribed to before they have a publisher; any other as soon as it has
 one, which tells its type.  A subscription asks for what all publishers of its topic offer.
+
+With `max_bag_size` a long recording is cut into parts, each a bag of its own; the subscriptions
+keep what comes while one is closed and the next one made.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ import time
 from typing import Any
 
 import piezo_ident
-from piezo_ident.bag_writer import BagWriter
+from piezo_ident.bag_writer import PartWriter
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.taps import Taps, topics_problem
@@ -169,7 +172,7 @@ class RecorderNode(LabNode):
 
     def _work(self, recording: Recording, taps: Taps) -> None:
         try:
-            writer = BagWriter(
+            writer = PartWriter(
                 recording.output,
                 self.values['storage'],
                 {
@@ -178,6 +181,7 @@ class RecorderNode(LabNode):
                     'package_version': piezo_ident.__version__,
                     'log_time': 'received',
                 },
+                self.values['max_bag_size'],
             )
         except PiezoIdentError as error:
             recording.failure = str(error)
@@ -202,10 +206,11 @@ class RecorderNode(LabNode):
                 writer.abort()
                 self._report('failed', failure, ERROR)
             else:
-                about = f'{writer.messages} messages in {writer.path}'
+                parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
+                about = f'{writer.messages} messages in {writer.path}{parts}'
                 self._report('done', about, progress=100.0)
 
-    def _record(self, recording: Recording, taps: Taps, writer: BagWriter) -> None:
+    def _record(self, recording: Recording, taps: Taps, writer: PartWriter) -> None:
         flushed = time.monotonic()
         last = told = False
         while not last:
@@ -222,7 +227,7 @@ class RecorderNode(LabNode):
             if due:
                 writer.flush()
                 flushed = now
-                recording.size = writer.size
+                recording.size, recording.path = writer.size, str(writer.path)
             if recording.ready.is_set() and (due or not told) and not last:
                 told = True
                 problems = taps.problems

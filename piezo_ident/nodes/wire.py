@@ -18,11 +18,15 @@ from __future__ import annotations
 
 from array import array
 
+from piezo_ident.errors import DataError
 from piezo_ident.wire_format import decode, encode, Samples
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 __all__ = ['LATCHED', 'PREVIEW', 'STREAM', 'from_message', 'to_message']
+
+#: most samples of a block, and characters of a label; a label is said again in answers and status
+MOST, LONGEST = 100_000, 200
 
 #: samples: reliable, the last hundred blocks
 STREAM = QoSProfile(
@@ -62,6 +66,13 @@ def from_message(message: Float64MultiArray) -> Samples:
     Raises
     ------
     DataError
-        When the layout is not that of a block, or does not fit the data.
+        When the layout is not that of a block, does not fit the data, or is larger than a block.
     """
+    dims, n = message.layout.dim, len(message.data)
+    if n > 2 * MOST:
+        raise DataError(f'{n} numbers in one message; a block has at most {MOST} samples')
+    if len(dims) > 2:
+        raise DataError(f"{len(dims)} dimensions are not ['sample:<segment>', 't,<quantity>']")
+    if any(len(d.label) > LONGEST for d in dims):
+        raise DataError(f'a label of more than {LONGEST} characters')
     return decode(message.data, message.layout.dim, message.layout.data_offset)

@@ -52,6 +52,7 @@ PREDICT = 'test_model_node::test_prediction_is_the_model_bit_for_bit_and_carries
 FILE = 'test_model_node::test_a_model_file_is_taken_at_start_and_later'
 AGAIN = 'test_model_node::test_it_says_when_to_identify_again'
 RECORD = 'test_recorder_node::test_record_stop_and_refusals'
+PARTS = 'test_recorder_node::test_a_long_recording_is_cut_into_parts_and_loses_nothing'
 FLUSH = 'test_recorder_node::test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said'
 ENDS = 'test_ends::test_in_the_middle_of_everything'
 REPLAY = 'test_player_node::test_replay'
@@ -168,6 +169,7 @@ COVERED = {
     'parameter model.window': AGAIN,
     'parameter model.preview_rate': FILE,
     'parameter recorder.output': RECORD,
+    'parameter recorder.max_bag_size': PARTS,
     'parameter recorder.storage': 'test_recorder_node::test_sigkill_loses_less_than_a_second',
     'parameter recorder.topics': 'test_recorder_node::test_other_topics_types_and_qos',
     'parameter recorder.flush': FLUSH,

@@ -177,6 +177,27 @@ def test_record_stop_and_refusals(tmp_path):
         assert abs(stamps[-1] * 1e-9 - time.time()) < 60
 
 
+def test_a_long_recording_is_cut_into_parts_and_loses_nothing(tmp_path):
+    with Graph() as g:
+        source = Source(g)
+        g.start('recorder', {'output': str(tmp_path / 'bag'), 'max_bag_size': 500_000})
+        assert start(g, tmp_path) == str(tmp_path / 'bag')
+        with source:
+            g.wait(lambda: (tmp_path / 'bag_3').exists(), 'the fourth part')
+        assert g.call('recorder/stop')[0]
+        g.wait(lambda: g.status('recorder')['state'] == 'done', 'closed bag')
+        status = g.status('recorder')
+    parts = sorted(tmp_path.glob('bag*'), key=lambda p: (len(p.name), p.name))
+    assert int(status['messages']) == 2 * len(source.sent) and status['lost'] == '0'
+    assert f'and {len(parts) - 1} before it' in status['message']
+    sizes = [next(p.glob('*.mcap')).stat().st_size for p in parts]
+    assert int(status['bytes']) == sum(sizes) and min(sizes[:-1]) >= 500_000
+    found = [contents(p) for p in parts]
+    for k, topic in enumerate(('/voltage', '/displacement')):
+        got = [m for part in found for m in arrays(part.get(topic, []))]
+        assert got == [pair[k] for pair in source.messages]
+
+
 def test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said(tmp_path):
     with Graph() as g:
         source = Source(g)

@@ -1,0 +1,307 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A folder of records identified on one process, on all cores, and on two workers of a cluster.
+
+    .venv-bench/bin/python benchmarks/bench_many.py [--quick]
+    .venv-bench/bin/python benchmarks/bench_many.py --picture docs/images/many_records.png
+
+The whole command is timed, start-up and pictures included, since that is what one waits for.  The
+records are short, so that 200 of them fit into a benchmark; one of them is damaged.  The scheduler
+and the workers of dask.distributed are processes of their own and are there before the clock
+starts.  With --picture nothing is timed; the picture of the parameters is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+
+# before NumPy is loaded here, and in all that is started from here
+for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
+    os.environ.setdefault(name, '1')
+
+import numpy as np
+from piezo_ident.dynamics import Delay, Dynamics
+from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.ledger import LEDGER
+from piezo_ident.model import Scaling, StageModel
+from piezo_ident.program import parse_program
+from piezo_ident.record_io import write_record
+from piezo_ident.simulation import Sensor, simulate, SimulatedStage
+from side_by_side import markdown, ratio, take_turns
+
+HOME = Path(__file__).resolve().parents[1]
+#: turns, and records, of which one is damaged
+RUNS, RECORDS = 5, 200
+QUICK_RUNS, QUICK_RECORDS = 1, 12
+WORKERS = 2
+RATE = 2000.0
+PROGRAM = """\
+limits: [0, 10]
+seed: 1
+segments:
+  - {signal: idle, duration: 0.3}
+  - {signal: step, bias: 5, size: 1, hold: 0.06, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 12, frequency: 20}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 600, duration: 3}
+  - {signal: triangle, slope: 10}
+  - {signal: sine, bias: 5, amplitude: 4, frequency: 20, duration: 1.5}
+"""
+OPTIONS = ('--max-order', '4', '--thresholds', '6', '--solver', 'least_squares')
+#: longest wait for a process of the cluster [s]
+PATIENCE = 120.0
+
+
+def stages(n: int) -> Iterator[SimulatedStage]:
+    """Yield stages of one line: they differ a little, and their gain falls as the line ages."""
+    rng = np.random.default_rng(5)
+    base = StageModel(
+        sample_rate=RATE,
+        scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
+        hysteresis=Hysteresis(
+            np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.2, 0.1]), p1=-0.2, p2=0.9
+        ),
+        dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
+        delay=Delay(2),
+    )
+    for i in range(n):
+        h, g, s = base.hysteresis, base.dynamics, base.scaling
+        # one of them has a loose preload
+        loose = 1.35 if i == n // 3 else 1.0
+        weights = loose * h.weights * (1.0 + 0.03 * rng.standard_normal(3))
+        a = g.a * np.array([1.0, 1.0 + 0.005 * rng.standard_normal()])
+        gain = 1.0 + 0.006 * rng.standard_normal() - 0.04 * i / n
+        model = replace(
+            base,
+            hysteresis=replace(h, weights=weights),
+            dynamics=replace(g, a=a),
+            scaling=replace(s, Y=s.Y * gain),
+        )
+        yield SimulatedStage(model, Sensor(noise_rms=5e-9))
+
+
+def make_records(folder: Path, n: int) -> None:
+    """Write n records, the damaged one included."""
+    folder.mkdir()
+    sequence = parse_program(PROGRAM).build(RATE)
+    for i, stage in enumerate(stages(n)):
+        path = folder / f'stage_{i + 1:03d}.npz'
+        write_record(simulate(stage, sequence, np.random.default_rng(i)), path)
+    broken = folder / f'stage_{2 * n // 3:03d}.npz'
+    broken.write_bytes(broken.read_bytes()[:20_000])
+
+
+def identify(records: Path, out: Path, *options: str) -> None:
+    """Run the command as a user would."""
+    shutil.rmtree(out, ignore_errors=True)
+    command = [sys.executable, '-m', 'piezo_ident', 'identify', str(records), '--each', str(out)]
+    done = subprocess.run(
+        [*command, *OPTIONS, *options], env=_environment(), capture_output=True, text=True
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip() or f'exit code {done.returncode}')
+
+
+def _environment() -> dict[str, str]:
+    # the same package as here, wherever a process starts
+    paths = [str(HOME), *filter(None, [os.environ.get('PYTHONPATH')])]
+    return {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
+
+
+#: runs a module as a program that ends with the process that started it, whatever ends that
+TIED = """
+import os, runpy, sys, threading
+threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(0)), daemon=True).start()
+sys.argv = sys.argv[1:]
+runpy.run_module(sys.argv[0], run_name='__main__')
+"""
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[str]:
+    """Yield the address of a scheduler with so many workers, each a process of its own."""
+    file, processes = folder / 'scheduler.json', list[subprocess.Popen[bytes]]()
+
+    def start(what: str, *options: str) -> None:
+        command = [sys.executable, '-c', TIED, f'distributed.cli.dask_{what}', *options]
+        command += ['--scheduler-file', str(file), '--no-dashboard']
+        with (folder / f'{what}_{len(processes)}.log').open('wb') as log:
+            processes.append(
+                subprocess.Popen(
+                    command,
+                    cwd=folder,
+                    env=_environment(),
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                )
+            )
+
+    try:
+        start('scheduler', '--host', '127.0.0.1', '--port', '0')
+        end = time.monotonic() + PATIENCE
+        while not (file.exists() and file.read_text(encoding='utf-8').endswith('}')):
+            if time.monotonic() > end or processes[0].poll() is not None:
+                raise RuntimeError('the dask scheduler did not start')
+            time.sleep(0.05)
+        for _ in range(workers):
+            start('worker', '--nthreads', '1', '--no-nanny')
+        address = json.loads(file.read_text(encoding='utf-8'))['address']
+        _wait_for_workers(address, workers)
+        yield address
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def _wait_for_workers(address: str, workers: int) -> None:
+    import distributed
+
+    with distributed.Client(address, timeout=PATIENCE, set_as_default=False) as client:
+        client.wait_for_workers(workers, timeout=PATIENCE)
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """Return what must not depend on where the work was done: the table and all models."""
+    files = [out / 'records.csv', *sorted((out / 'models').iterdir())]
+    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+
+
+def work_in(out: Path) -> float:
+    """Return the time spent in the records, all of them together [s]."""
+    lines = (out / LEDGER).read_text(encoding='utf-8').splitlines()
+    return float(sum(json.loads(line)['seconds'] for line in lines))
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    """
+    Return the section of this benchmark.
+
+    Parameters
+    ----------
+    quick : bool, optional
+        A few records, once.
+
+    Raises
+    ------
+    RuntimeError
+        When the tables differ: then nothing else is worth saying.
+    """
+    runs, n = (QUICK_RUNS, QUICK_RECORDS) if quick else (RUNS, RECORDS)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    many = max(2, cores or 1)
+    with tempfile.TemporaryDirectory(prefix='bench_many.') as name:
+        folder = Path(name)
+        records = folder / 'records'
+        make_records(records, n)
+        outs = {place: folder / place for place in ('one', 'cores', 'dask')}
+        with cluster(folder, WORKERS) as address:
+            options = {
+                'one': ('--jobs', '1'),
+                'cores': ('--jobs', str(many)),
+                'dask': ('--scheduler', address),
+            }
+            # kernels are compiled on their first call, and the workers import on theirs
+            few = folder / 'few'
+            few.mkdir()
+            for path in sorted(records.iterdir())[: 2 * WORKERS]:
+                shutil.copy(path, few)
+            for place, chosen in options.items():
+                identify(few, folder / f'warm_{place}', *chosen)
+            turns = take_turns(
+                {
+                    place: lambda k, place=place: identify(records, outs[place], *options[place])
+                    for place in outs
+                },
+                runs,
+            )
+        found = {place: contents(out) for place, out in outs.items()}
+        if not found['one'] == found['cores'] == found['dask']:
+            raise RuntimeError('the tables of the three places differ')
+        spent = work_in(outs['one'])
+        rows = (outs['one'] / 'records.csv').read_text(encoding='utf-8').splitlines()[1:]
+    failed = [row for row in rows if ',failed,' in row]
+    heads = ('where', 'whole command', 'records a second', 'speed-up')
+    names = {
+        'one': 'one process',
+        'cores': f'{many} processes',
+        'dask': f'{WORKERS} dask workers',
+    }
+    table = [
+        (
+            names[place],
+            f'{turns[place].median:.1f} s',
+            f'{n / turns[place].median:.1f}',
+            ratio(turns['one'].over(turns[place])),
+        )
+        for place in outs
+    ]
+    seconds = len(parse_program(PROGRAM).build(RATE).v) / RATE
+    text = [
+        f'{n} records of {seconds:.1f} s at {RATE / 1000:g} kHz in a folder, one of them damaged: '
+        f'`piezo_ident identify FOLDER --each OUT {" ".join(OPTIONS)}`, with `--jobs` or '
+        f'`--scheduler`. Medians over {runs} turn{"s" if runs > 1 else ""}, on {cores} cores.',
+        '',
+        markdown(heads, table),
+        '',
+        f'The three tables ({len(rows)} rows) and the {len(found["one"]) - 1} models are the same '
+        'byte for byte.',
+        f'{len(failed)} of {len(rows)} rows failed: `{_short(failed)}`.',
+        f'On one process {100 * spent / turns["one"].times[-1]:.0f} % of the time was spent in '
+        'the records; the rest is start-up, table and pictures.',
+    ]
+    return [('Many records', '\n'.join(text))]
+
+
+def _short(rows: Sequence[str]) -> str:
+    return '; '.join(row.rstrip(',') for row in rows[:3])
+
+
+def make_picture(path: Path) -> None:
+    """Write the picture of the parameters of all records."""
+    with tempfile.TemporaryDirectory(prefix='bench_many.') as name:
+        records, out = Path(name, 'records'), Path(name, 'out')
+        make_records(records, RECORDS)
+        identify(records, out)
+        shutil.copyfile(out / 'parameters.png', path)
+
+
+def main() -> None:
+    """Print the section, or make the picture."""
+    parser = argparse.ArgumentParser(description='Identifies a folder of records.')
+    parser.add_argument('--quick', action='store_true', help='a few records, once')
+    parser.add_argument('--picture', type=Path, metavar='PNG', help='make this picture only')
+    args = parser.parse_args()
+    if args.picture is not None:
+        make_picture(args.picture)
+        return
+    for title, text in sections(args.quick):
+        print(f'## {title}\n\n{text}\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,146 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One table of all that was tried: docs/reliability.md, from the rows that the studies write.
+
+    python benchmarks/reliability/build.py
+
+A study writes its own rows, a list of {what, how_often, result, command}, into
+``docs/reliability/rows/<name>.json`` with `rows.write_rows`; the text around the table is here.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from rows import ROWS
+
+__all__ = ['ORDER', 'main', 'page']
+
+PAGE = ROWS.parents[1] / 'reliability.md'
+KEYS = ('what', 'how_often', 'result', 'command')
+#: studies in the order of the table; any other comes behind
+ORDER = ('safety', 'attack', 'fuzz', 'netns', 'crash', 'soak', 'untrusted', 'numbers', 'versions')
+
+
+def _cell(value: Any) -> str:
+    return ' '.join(str(value).replace('|', '\\|').split())
+
+
+def _rows() -> list[dict[str, Any]]:
+    found = {path.stem: json.loads(path.read_text('utf-8')) for path in ROWS.glob('*.json')}
+    names = sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
+    return [row for name in names for row in found[name]]
+
+
+HEAD = """# What it stands
+
+*Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
+its own rows. Every row can be run again with its command, from the root of the sources.*
+
+`make test` and `make test-graph` keep a fast subset of each row; `make attack`, `make netns`,
+`make soak`, `make fuzz` and `make crash` run the whole.
+
+## The table
+
+"""
+
+TAIL = """
+## Files from strangers
+
+Every reader compares what a file announces with the file itself before it takes memory for it;
+the limits stand in `piezo_ident/limits.py`. What a file unpacks to must stay below 100 times its
+size (64 MiB for small ones). YAML is read by the safe loader, without merge keys, with at most
+50,000 entries; aliases count as what they stand for. No pickle is loaded from a file: npz archives
+with Python objects are refused, MATLAB files are read by the package itself, since SciPy's reader
+takes memory for what an array announces and ends the process on some damaged files. Bags are
+looked at before rosbags opens them: links out of the folder, indexes that lead elsewhere, views,
+triggers and computed columns are refused, and so is a journal that names another file, which
+SQLite would delete. Labels and names are escaped in reports and cleaned of control characters
+before they reach a terminal.
+
+An effect plug-in is code that somebody installed; it can do what any program can.
+
+## What a kill leaves behind
+
+An output is written under the name `.NAME.RANDOM.tmp` beside its place (`.report.RANDOM.tmp` in a
+report folder) and renamed when it is whole; a bag that replaces another changes places with it in
+one step. A process that is killed leaves such a name, which can be deleted, and what stood there
+before. A report is several files: they are put in place one by one, the page last, so that a kill
+in between leaves some of the old and some of the new, each whole. Recovering an unfinished sqlite3
+bag works on a copy in the folder for temporary files, `piezo_ident_bag_RANDOM`.
+
+## The safety property
+
+Whatever arrives on `voltage`, every voltage that is *applied* is a number within the limits and no
+further from the one before than the slew allows; where limits are moved, it goes back into them at
+the slew. Silence ends at rest by a ramp, a new stream is joined by one, a second publisher moves
+nothing.
+
+`benchmarks/reliability/safety.py` has it as code; `test/test_safety_property.py` tries some of it
+in every `make test`, and the runs of the graph in this table check it on `applied_voltage`.
+It holds while the process that drives the amplifier lives and its converter keeps its last value
+when it dies: against SIGKILL and power failure only a watchdog in the amplifier helps
+([driver.md](driver.md)).
+
+## Two hosts
+
+DDS finds its peers on other hosts by multicast. Where that is kept to the local machine
+(`ROS_AUTOMATIC_DISCOVERY_RANGE`, see [SECURITY.md](../SECURITY.md)), both hosts need
+
+    export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
+    export ROS_DOMAIN_ID=...                      # the same on both, and nobody else's
+    export FASTRTPS_DEFAULT_PROFILES_FILE=$PWD/config/fastdds_two_hosts.xml
+
+before any node starts. The file makes socket buffers of 4 MiB, so that a burst of blocks survives
+a busy receiver (raise `net.core.rmem_max` and `net.core.wmem_max` to as much), and has a lost
+packet asked for again within 10 ms instead of seconds. That matters: a topic keeps its last
+hundred blocks, half a second in real time, and what is asked for later is gone. A link that is
+down for longer, or a machine too busy to answer, therefore loses samples, every listener says how
+many, and no model is made of what is left where too much is missing. A call of a service may go
+unanswered on such a link too: ~/run then ends with that reason.
+
+## How long is long
+
+Two hours at 20 kHz are 1.4e8 samples. They stand for a week where nothing but time differs: memory
+that grows with messages shows in two hours as it does in a week (the slope is in the table), the
+sample clock is counted from its start and not summed up, so its rounding does not grow
+(t = k/fs stays exact to 2^53 ticks, 14,000 years), and a recording is cut into parts. They do not
+stand for a week where the world changes: the wall clock may be set, a disk fills, temperature and
+stage drift, Fast DDS and the kernel are not watched for leaks below the slope's resolution, and
+t loses digits in text (a CSV needs 11 of them after a day).
+"""
+
+
+def page() -> str:
+    """Return the page."""
+    lines = ['| what was tried | how often | what happened | command |', '|---|---|---|---|']
+    for row in _rows():
+        cells = [_cell(row[key]) for key in KEYS]
+        cells[-1] = f'`{cells[-1]}`'
+        lines.append('| ' + ' | '.join(cells) + ' |')
+    return HEAD + '\n'.join(lines) + '\n' + TAIL
+
+
+def main() -> int:
+    """Write the page."""
+    PAGE.write_text(page(), encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,463 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Killed while writing: what stands there afterwards is the old, the new, or nothing.
+
+    .venv/bin/python benchmarks/reliability/crash.py             100 kills, a few minutes
+    .venv/bin/python benchmarks/reliability/crash.py --kills 5   a look whether it runs
+
+Each command runs in a process of its own and gets SIGKILL: every second time at a random moment of
+its run, else as soon as a temporary name shows that it writes.  Then, as root, the same commands
+write to a disk without room and to a folder that cannot be written.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+import hashlib
+import json
+from pathlib import Path
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import numpy as np
+from piezo_ident.cli import main as piezo_ident
+from piezo_ident.errors import PiezoIdentError
+from piezo_ident.model_io import load_model, save_model
+from piezo_ident.plots import draw  # noqa: F401 - loaded once, not in every copy
+from piezo_ident.record import Piece, Record
+from piezo_ident.record_io import read_record, write_record
+from piezo_ident.report.folder import put_in_place
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage
+from reliability.rows import write_rows
+
+#: kills of a whole study
+KILLS = {'save': 16, 'report': 10, 'convert': 36, 'simulate': 10, 'predict': 10, 'identify': 10,
+         'diagnose': 8}  # fmt: skip
+#: what may stand there after a kill
+GOOD = frozenset({'old', 'new', 'old and new'})
+#: names of what a killed process may leave behind
+LEFTOVER = re.compile(r'\..+\.tmp')
+FORMATS = ('r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3', 'bag')
+RATE = 20_000.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    Work that writes.
+
+    Attributes
+    ----------
+    kind, name : str
+    run : callable
+        Does it, given the folder to write to, and returns the exit code.
+    outputs : tuple of str
+        Names of what it writes there.
+    """
+
+    kind: str
+    name: str
+    run: Callable[[Path], int]
+    outputs: tuple[str, ...]
+
+
+def _record(n: int, seed: int) -> Record:
+    rng = np.random.default_rng(seed)
+    v = 5.0 + 4.0 * np.sin(np.arange(n) / 700.0)
+    return Record((Piece(v, 7.5e-6 * v + 1e-9 * rng.standard_normal(n), RATE),))
+
+
+def _save(model: Path) -> Callable[[Path], int]:
+    def run(folder: Path) -> int:
+        loaded = load_model(model)
+        for _ in range(100):
+            save_model(loaded, folder / 'model.yaml')
+        return 0
+
+    return run
+
+
+def _report(model: Path) -> Callable[[Path], int]:
+    def run(folder: Path) -> int:
+        loaded = load_model(model)
+        shown = [('loops', 'loops', '', bytes(300_000))]
+        texts = {'report.html': '<p>' + 'x' * 300_000, 'identification.json': '{}\n'}
+        for _ in range(40):
+            put_in_place(folder, texts, loaded, shown, ())
+        return 0
+
+    return run
+
+
+def jobs(inputs: Path, *, slow: bool) -> list[Job]:
+    """
+    Return the work, and make what it reads.
+
+    Parameters
+    ----------
+    inputs : Path
+        Folder for the inputs.
+    slow : bool
+        Whether identifications and diagnoses are among it.
+    """
+    stage, record = inputs / 'model.yaml', inputs / 'record.npz'
+    save_model(load_stage(find_config('stage_paper', 'stage')).model, stage)
+    write_record(_record(60_000, 1), record, overwrite=True)
+
+    def command(*words: object) -> Callable[[Path], int]:
+        return lambda folder: piezo_ident([str(w).replace('OUT', str(folder)) for w in words])
+
+    programme = inputs / 'programme.yaml'
+    programme.write_text('{limits: [0, 10], segments: [{signal: hold, level: 5, duration: 2}]}')
+    found = [
+        Job('save', 'save', _save(stage), ('model.yaml',)),
+        Job('report', 'report', _report(stage), ('report.html', 'model.yaml', 'loops.png')),
+        *(
+            Job('convert', f'convert to {x}', command('convert', record, f'OUT/{x}',
+                '--overwrite'), (x,)) for x in FORMATS
+        ),
+        Job('simulate', 'simulate', command('simulate', '--program', programme, 'OUT/r.npz',
+            '--overwrite'), ('r.npz',)),
+        Job('predict', 'predict', command('predict', stage, record, '--out', 'OUT/p.csv',
+            '--plot', 'OUT/p.png'), ('p.csv', 'p.png')),
+    ]  # fmt: skip
+    if slow:
+        for name, wanted in (('identification', 'learn.npz'), ('validation', 'check.npz')):
+            assert not piezo_ident(
+                ['simulate', '--program', name, str(inputs / wanted), '--overwrite']
+            )
+        found += [
+            Job('identify', 'identify', command('identify', inputs / 'learn.npz', '--model',
+                'OUT/model.yaml', '--report', 'OUT/report'),
+                ('model.yaml', 'report/report.html', 'report/model.yaml')),
+            Job('diagnose', 'diagnose', command('diagnose', stage, inputs / 'check.npz', '--only',
+                'creep', '--model', 'OUT/refined.yaml', '--report', 'OUT/report'),
+                ('refined.yaml', 'report/report.html', 'report/diagnosis.json')),
+        ]  # fmt: skip
+    return found
+
+
+def digest(path: Path) -> str:
+    """Return what tells two outputs apart; a record by what it holds."""
+    if not path.exists():
+        return 'nothing'
+    if path.is_dir() or path.suffix in ('.mcap', '.db3', '.npz', '.mat'):
+        record = read_record(path)
+        return hashlib.sha1(b''.join(p.v.tobytes() + p.y.tobytes() for p in record)).hexdigest()
+    if path.suffix == '.png' and path.parent.name != 'report':
+        data = path.read_bytes()
+        return 'picture' if data.endswith(b'IEND\xaeB`\x82') else hashlib.sha1(data).hexdigest()
+    return hashlib.sha1(path.read_bytes()).hexdigest()
+
+
+@contextmanager
+def _started(job: Job, folder: Path) -> Iterator[int]:
+    """Run the work in a copy of this process, and end that in any case."""
+    sys.stdout.flush()
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')  # threads of libraries, none of which is at work
+        pid = os.fork()
+    if not pid:
+        code = 70
+        try:
+            null = os.open(os.devnull, os.O_RDWR)
+            code = _quietly(job, folder, null, null)
+        finally:
+            os._exit(code)
+    try:
+        yield pid
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+
+
+def _quietly(job: Job, folder: Path, null: int, errors: int) -> int:
+    os.dup2(null, 1)
+    os.dup2(errors, 2)
+    # whoever looks after a test may have put others in their places
+    sys.stdout, sys.stderr = os.fdopen(1, 'w'), os.fdopen(2, 'w')
+    code = job.run(folder)
+    sys.stderr.flush()
+    return code
+
+
+def _leftovers(folder: Path) -> list[str]:
+    return [n for _, d, f in os.walk(folder) for n in (*d, *f) if LEFTOVER.fullmatch(n)]
+
+
+def _strangers(folder: Path, known: set[str]) -> list[str]:
+    """Return names in a folder that are neither outputs nor leftovers."""
+    found = []
+    for path in folder.rglob('*'):
+        inside = path.relative_to(folder)
+        if not any(LEFTOVER.fullmatch(part) for part in inside.parts) and path.is_file():
+            found.append(str(inside))
+    return sorted(set(found) - known)
+
+
+@dataclass
+class Tried:
+    """One kind of work and what was found after its kills."""
+
+    job: Job
+    whole: set[str]
+    states: dict[str, set[str]]
+    seconds: float
+
+
+def rehearse(job: Job, folder: Path, old: Path) -> Tried:
+    """Run the work once to its end: what it writes then is the new."""
+    shutil.copytree(old, folder)
+    before = {name: digest(folder / name) for name in job.outputs}
+    start = time.perf_counter()
+    with _started(job, folder) as pid:
+        # not reaped yet: the end of the block does that
+        status = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT).si_status
+        seconds = time.perf_counter() - start
+    return (
+        Tried(job, set(), {}, seconds)
+        if status
+        else Tried(
+            job,
+            {str(p.relative_to(folder)) for p in folder.rglob('*') if p.is_file()},
+            {name: {before[name], digest(folder / name)} for name in job.outputs},
+            seconds,
+        )
+    )
+
+
+def kill(tried: Tried, folder: Path, old: Path, rng: random.Random, *, writing: bool) -> str:
+    """
+    Kill the work once.
+
+    Returns
+    -------
+    str
+        What stood there: 'old', 'new' or 'old and new'; anything else is a finding.
+    """
+    shutil.copytree(old, folder)
+    before = {name: digest(folder / name) for name in tried.job.outputs}
+    with _started(tried.job, folder) as pid:
+        end = time.perf_counter() + tried.seconds * (3.0 if writing else rng.random())
+        while time.perf_counter() < end and (not writing or not _leftovers(folder)):
+            if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                break
+        time.sleep(rng.random() * 0.05 if writing else 0.0)
+    seen = set()
+    for name, states in tried.states.items():
+        try:
+            now = digest(folder / name)
+        except (PiezoIdentError, OSError) as error:
+            return f'{name}: damaged ({error})'
+        if now not in states:
+            return f'{name}: neither the old nor the new'
+        seen.add('old' if now == before[name] else 'new')
+    strangers = _strangers(folder, tried.whole | {'old.txt'})
+    if strangers:
+        return f'unknown names {strangers}'
+    return ' and '.join(sorted(seen, reverse=True))
+
+
+def old_outputs(folder: Path, works: list[Job]) -> None:
+    """Write what the work will replace."""
+    folder.mkdir()
+    old = _record(500, 2)
+    for job in works:
+        for name in job.outputs:
+            path = folder / name
+            path.parent.mkdir(exist_ok=True)
+            if name in FORMATS:
+                write_record(old, path, overwrite=True)
+            else:
+                path.write_text('old\n')
+
+
+def kills(counts: dict[str, int], place: Path, works: list[Job]) -> Iterator[tuple[Job, str]]:
+    """Yield the work that was killed and what stood there afterwards."""
+    rng = random.Random(1)
+    for number, job in enumerate(works):
+        old = place / f'old{number}'
+        old_outputs(old, [job])
+        tried = rehearse(job, place / f'whole{number}', old)
+        if not tried.states:
+            yield job, 'does not run'
+            continue
+        same = sum(1 for other in works if other.kind == job.kind)
+        for i in range(-(-counts.get(job.kind, 0) // same)):
+            folder = place / f'kill{number}_{i}'
+            yield job, kill(tried, folder, old, rng, writing=i % 2 == 1)
+            shutil.rmtree(folder)
+
+
+# --- no room, no right ----------------------------------------------------------------------
+
+
+@contextmanager
+def mounted(folder: Path, options: str) -> Iterator[bool]:
+    """Mount a small disk in memory; False where that is not allowed."""
+    folder.mkdir(exist_ok=True)
+    done = subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', options, 'tmpfs', str(folder)], capture_output=True
+    )
+    try:
+        yield done.returncode == 0
+    finally:
+        if done.returncode == 0:
+            subprocess.run(['umount', '-l', str(folder)], check=False)
+
+
+def refused(job: Job, folder: Path) -> str:
+    """
+    Run work where it cannot write.
+
+    Returns
+    -------
+    str
+        Empty when it is refused as it should; else what is wrong.
+    """
+    names = sorted(os.listdir(folder))
+    before = {name: digest(folder / name) for name in job.outputs}
+    reader, writer = os.pipe()
+    pid = os.fork()
+    if not pid:
+        code = 70
+        try:
+            try:
+                code = _quietly(job, folder, os.open(os.devnull, os.O_RDWR), writer)
+            except PiezoIdentError as error:
+                os.write(2, f'{error}\n'.encode())
+                code = 2
+        finally:
+            os._exit(code)
+    os.close(writer)
+    with open(reader, errors='replace') as stream:
+        said = stream.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    wrong = []
+    if code != 2:
+        wrong.append(f'exit code {code}')
+    if said.count('\n') != 1 or 'cannot be written' not in said:
+        wrong.append(f'said {said[-300:]!r}')
+    if before != {name: digest(folder / name) for name in job.outputs}:
+        wrong.append('lost what was there')
+    if sorted(os.listdir(folder)) != names:
+        wrong.append(f'left {sorted(set(os.listdir(folder)) - set(names))}')
+    return ', '.join(wrong)
+
+
+def without_room(place: Path, works: list[Job], options: str) -> Iterator[tuple[Job, str]]:
+    """Yield work and what was wrong when its disk was full or read-only."""
+    for number, job in enumerate(works):
+        folder = place / f'full{number}'
+        with mounted(folder, 'size=4m') as is_there:
+            if not is_there:
+                return
+            out = folder / 'out'
+            old_outputs(out, [job])
+            if options == 'ro':
+                subprocess.run(['mount', '-o', 'remount,ro', str(folder)], check=True)
+            else:
+                _fill(folder / 'filler')
+            yield job, refused(job, out)
+
+
+def _fill(path: Path) -> None:
+    with suppress(OSError), path.open('wb', buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+
+
+# --- the study ------------------------------------------------------------------------------
+
+
+def rows_of(killed: list[tuple[Job, str]], starved: dict[str, list[tuple[Job, str]]]) -> list:
+    """Return the rows of the table."""
+    rows = []
+    good = GOOD
+    for kind in KILLS:
+        said = [x for job, x in killed if job.kind == kind]
+        counted = ', '.join(f'{n} {x}' for x, n in Counter(said).most_common())
+        bad = sum(x not in good for x in said)
+        rows.append(
+            {
+                'what': f'SIGKILL: {kind}',
+                'how_often': f'{len(said)} kills',
+                'result': f'{counted}; {bad} damaged',
+                'command': 'make crash',
+            }
+        )
+    for what, found in starved.items():
+        bad = [f'{job.name}: {x}' for job, x in found if x]
+        rows.append({
+            'what': what,
+            'how_often': f'{len(found)} commands and formats',
+            'result': '; '.join(bad)
+            or ('one line, exit code 2, nothing lost, nothing left' if found
+                else 'skipped: mounting is not allowed here'),
+            'command': 'make crash',
+        })  # fmt: skip
+    return rows
+
+
+def main() -> int:
+    """Run the study; 1 when something was lost."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--kills', type=int, help='of each kind, instead of 100 in all')
+    args = parser.parse_args()
+    counts = KILLS if args.kills is None else dict.fromkeys(KILLS, args.kills)
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        (place / 'inputs').mkdir()
+        works = jobs(place / 'inputs', slow=True)
+        killed = []
+        for job, said in kills(counts, place, works):
+            killed.append((job, said))
+            print(json.dumps([job.name, said]), flush=True)
+        starved = {}
+        for what, options in (('disk full', 'full'), ('read-only file system', 'ro')):
+            starved[what] = list(without_room(place, works, options))
+            for job, said in starved[what]:
+                print(json.dumps([what, job.name, said or 'refused']), flush=True)
+    rows = rows_of(killed, starved)
+    if args.kills is None:
+        write_rows('crash', rows)
+    for row in rows:
+        print(f'{row["what"]:28s} {row["how_often"]:26s} {row["result"]}')
+    print(f'{time.perf_counter() - start:.0f} s')
+    is_bad = any(x not in GOOD for _, x in killed)
+    return 1 if is_bad or any(x for found in starved.values() for _, x in found) else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

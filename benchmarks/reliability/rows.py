@@ -1,0 +1,54 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The rows of docs/reliability.md, a file for each study that measured them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+__all__ = ['ROWS', 'read_rows', 'write_rows']
+
+ROWS = Path(__file__).resolve().parents[2] / 'docs' / 'reliability' / 'rows'
+
+
+def read_rows(name: str) -> list[dict[str, Any]]:
+    """Return the rows of a study as it wrote them, none before its first run."""
+    file = ROWS / f'{name}.json'
+    return json.loads(file.read_text(encoding='utf-8')) if file.exists() else []
+
+
+def write_rows(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """
+    Write the rows of one study, those of an earlier run are replaced.
+
+    Parameters
+    ----------
+    name : str
+        Of the study.
+    rows : sequence of mapping
+        Each with what, how_often, result and command.
+    """
+    ROWS.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(list(rows), indent=1, ensure_ascii=False)
+    (ROWS / f'{name}.json').write_text(text + '\n', encoding='utf-8')
+
+
+def crowd() -> str:
+    """Return a remark for a row where other programs took the processors; empty when none did."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    return f', with {load:.0f} programs on {cores} processors' if load > 2 * cores else ''

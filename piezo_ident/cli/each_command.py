@@ -1,0 +1,363 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``--each``: every record on its own, many at once, with a table and pictures of them all."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+import logging
+import os
+from pathlib import Path
+import shutil
+import tempfile
+from typing import Any
+
+from piezo_ident.batch import Diagnose, failed, fingerprint, Identify, Outcome, Reading, Row
+from piezo_ident.batch_table import columns_of, unit_of, write_tables
+from piezo_ident.cli.common import check_limits, expand
+from piezo_ident.cli.console import Console
+from piezo_ident.cli.interrupts import interrupts
+from piezo_ident.cli.outputs import check_folder
+from piezo_ident.diagnosis.results import DiagnosisSettings
+from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.executors import cluster, cores, Places, run_all
+from piezo_ident.ledger import Ledger
+from piezo_ident.model_io import load_model, model_to_yaml, write_text
+from piezo_ident.results import Settings
+from piezo_ident.spread import in_order, QUANTITIES, Spread, spread_of
+
+__all__ = ['check_each', 'diagnose_each', 'identify_each']
+
+Job = Identify | Diagnose
+#: records whose reason, or whose standing out, is printed
+SAID = 10
+
+
+def check_each(args: argparse.Namespace) -> None:
+    """
+    Refuse options that go with --each only, or not with it.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if args.each is None:
+        for option in ('jobs', 'scheduler', 'reports'):
+            if getattr(args, option):
+                raise ConfigError(f'--{option} goes with --each DIR; add it, or leave this out')
+        return
+    for option, instead in (
+        ('model', f'the models go to {args.each / "models"}'),
+        ('report', 'say --reports for a report of every record'),
+        ('validation', 'each record is judged on its own segments'),
+    ):
+        if getattr(args, option):
+            raise ConfigError(f'--{option} does not go with --each: {instead}')
+    if args.scheduler is not None and args.jobs is not None:
+        raise ConfigError('--jobs is for this machine; with --scheduler its workers set how many')
+    if args.jobs == 0:
+        raise ConfigError('--jobs 0: give at least 1')
+
+
+def identify_each(args: argparse.Namespace, settings: Settings, console: Console) -> None:
+    """``piezo_ident identify RECORD... --each DIR``."""
+    if args.reports:
+        from piezo_ident.report.each import identification_files
+    reading = _reading(args)
+    jobs = [
+        Identify(name, path, reading, settings, identification_files if args.reports else None)
+        for name, path in _named(expand(args.records))
+    ]
+    _each(args, jobs, 'identified', console)
+
+
+def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console: Console) -> None:
+    """``piezo_ident diagnose MODEL RECORD... --each DIR``."""
+    if args.reports:
+        from piezo_ident.report.each import diagnosis_files
+    reading = _reading(args)
+    find = _models(args.model_file)
+    jobs = []
+    for name, path in _named(expand(args.records)):
+        model, text = find(name)
+        jobs.append(
+            Diagnose(
+                name,
+                path,
+                text,
+                model,
+                reading,
+                settings,
+                diagnosis_files if args.reports else None,
+            )
+        )
+    _each(args, jobs, 'diagnosed', console)
+
+
+def _reading(args: argparse.Namespace) -> Reading:
+    return Reading(
+        displacement_unit=args.displacement_unit,
+        voltage_limits=check_limits(args),
+        namespace=args.namespace,
+        voltage_topic=args.voltage_topic,
+        displacement_topic=args.displacement_topic,
+    )
+
+
+def _named(paths: Sequence[Path]) -> list[tuple[str, str]]:
+    """Return name and place of records; the workers may have another working directory."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        name = path.name if path.is_dir() else path.stem
+        if name in found:
+            raise ConfigError(
+                f'{found[name]} and {path} are both called {name}; rename one, or give them in '
+                'two calls with a folder each'
+            )
+        found[name] = path
+    return [(name, os.path.abspath(path)) for name, path in found.items()]
+
+
+def _models(path: Path) -> Callable[[str], tuple[str, str]]:
+    """Return what finds the model of a record, as its name and its text."""
+    if not path.is_dir():
+        # one for all; read here, so that what is wrong with it is said once
+        text = model_to_yaml(load_model(path))
+        return lambda name: (path.name, text)
+    # what identify --each wrote, or its folder of models
+    folder = path / 'models' if (path / 'models').is_dir() else path
+
+    def find(name: str) -> tuple[str, str]:
+        file = folder / f'{name}.yaml'
+        try:
+            return file.name, file.read_text(encoding='utf-8')
+        except (OSError, UnicodeDecodeError):
+            # the row says that it is missing
+            return file.name, ''
+
+    if not any(folder.glob('*.yaml')):
+        raise ConfigError(
+            f'{path}: holds no models; give a model file, or a folder with NAME.yaml'
+        )
+    return find
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """Where the results go."""
+
+    path: Path
+
+    def model(self, name: str) -> Path:
+        return self.path / 'models' / f'{name}.yaml'
+
+    def report(self, name: str) -> Path:
+        return self.path / 'reports' / name
+
+    def make(self) -> None:
+        try:
+            (self.path / 'models').mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(self.path, error) from None
+
+    def holds(self, job: Job) -> bool:
+        """Whether the files of a record that is done are still there."""
+        return self.model(job.name).is_file() and (
+            job.report is None or self.report(job.name).is_dir()
+        )
+
+    def keep(self, outcome: Outcome) -> None:
+        """Write the model and the report of a record; those of an earlier run go."""
+        name = outcome.row.record
+        if outcome.model:
+            write_text(self.model(name), outcome.model)
+        else:
+            self.model(name).unlink(missing_ok=True)
+        target = self.report(name)
+        try:
+            if target.exists():
+                shutil.rmtree(target)
+            if outcome.files:
+                target.parent.mkdir(exist_ok=True)
+                work = Path(tempfile.mkdtemp(prefix='.report.', dir=target.parent))
+                for file, content in outcome.files.items():
+                    (work / file).write_bytes(content)
+                work.chmod(0o755)
+                work.rename(target)
+        except OSError as error:
+            raise _unwritable(target, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> DataError:
+    return DataError(
+        f'{path}: cannot be written ({error.strerror or error}); choose a folder with room and '
+        'the right to write'
+    )
+
+
+def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Console) -> None:
+    folder = _Folder(args.each)
+    check_folder(folder.path)
+    _refuse_inputs(folder.path, [*args.records, *(Path(job.path) for job in jobs)])
+    ledger = Ledger(folder.path, args.verb)
+    keys = [_key(job) for job in jobs]
+    rows: dict[int, Row] = {}
+    for i, (job, key) in enumerate(zip(jobs, keys, strict=True)):
+        row = ledger.done(job.name, key)
+        if row is not None and folder.holds(job):
+            rows[i] = row
+    kept = len(rows)
+    folder.make()
+    todo = [i for i in range(len(jobs)) if i not in rows]
+    try:
+        with console.progress() as progress:
+
+            def tick() -> None:
+                progress('records', len(rows) / len(jobs))
+
+            if todo:
+                with _places(args, len(todo)) as places:
+                    for number, outcome in _run([jobs[i] for i in todo], places, tick):
+                        i = todo[number]
+                        with interrupts.waiting():
+                            folder.keep(outcome)
+                            ledger.add(keys[i], outcome)
+                        rows[i] = outcome.row
+    except KeyboardInterrupt:
+        console.note(
+            f'{len(rows)} of {len(jobs)} records are done and kept; the same command goes on '
+            'with the rest'
+        )
+        raise
+    found = [rows[i] for i in range(len(jobs))]
+    with interrupts.quitting():
+        from piezo_ident.plots.spread import write_spread
+    with interrupts.waiting():
+        files = [*write_tables(found, folder.path), *write_spread(found, folder.path)]
+    good = [row for row in found if row.good]
+    if not good:
+        raise DataError(
+            f'none of {len(found)} records could be {done}, see {files[0]}; the first: '
+            f'{found[0].record}: {found[0].reason}'
+        )
+    _say(found, kept, done, files, folder.path, console)
+    console.result(_data(found, files, folder.path))
+
+
+def _run(jobs: Sequence[Job], places: Places, tick: Callable[[], None]) -> Any:
+    def lost(number: int, error: BaseException) -> Outcome:
+        return failed(jobs[number].name, jobs[number].path, error)
+
+    return run_all(jobs, places, lost, tick)
+
+
+def _refuse_inputs(out: Path, inputs: Sequence[Path]) -> None:
+    # its table would be taken for a record the next time
+    if out.exists() and any(p.exists() and p.samefile(out) for p in inputs):
+        raise ConfigError(f'{out}: is where the records are; choose another folder for --each')
+
+
+def _key(job: Job) -> str:
+    try:
+        return f'{job.settled()} {fingerprint(job.path)}'
+    except OSError:
+        # reading it will say what is wrong
+        return ''
+
+
+def _places(args: argparse.Namespace, jobs: int) -> AbstractContextManager[Places]:
+    if args.scheduler is not None:
+        # what it logs when a scheduler goes is said in one line by us
+        logging.getLogger('distributed').setLevel(logging.CRITICAL)
+        return cluster(args.scheduler)
+    return cores(min(args.jobs or _core_count(), jobs))
+
+
+def _core_count() -> int:
+    # what a container or a batch system leaves us, where that can be asked for
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _say(
+    rows: Sequence[Row],
+    kept: int,
+    done: str,
+    files: Sequence[Path],
+    folder: Path,
+    console: Console,
+) -> None:
+    bad = [row for row in rows if not row.good]
+    earlier = f', {kept} of them earlier' if kept else ''
+    console.say(
+        f'{len(rows) - len(bad)} of {len(rows)} records {done}{earlier}; {len(bad)} failed'
+    )
+    for row in bad[:SAID]:
+        console.say(f'  {row.record}: {row.reason}')
+    if len(bad) > SAID:
+        console.say(f'  and {len(bad) - SAID} more, see {files[0]}')
+    verdicts = [str(row.values.get('verdict', '')) for row in rows if row.values.get('verdict')]
+    for verdict in dict.fromkeys(sorted(verdicts, key=lambda v: -verdicts.count(v))):
+        effects = [
+            str(row.values.get('effects'))
+            for row in rows
+            if row.values.get('verdict') == verdict and row.values.get('effects')
+        ]
+        counted = sorted(set(effects), key=lambda e: (-effects.count(e), e))
+        named = ', '.join(f'{e.replace(" ", " + ")} ({effects.count(e)})' for e in counted[:4])
+        console.say(f'  {verdict}: {verdicts.count(verdict)}{"   " if named else ""}{named}')
+    spreads = _spreads(rows)
+    if spreads:
+        console.say(
+            f'\n{"":30s}{"lowest":>11s}{"5 %":>11s}{"median":>11s}{"95 %":>11s}'
+            f'{"highest":>11s}   first to last'
+        )
+    for s in spreads:
+        cells = ''.join(f'{x:11.4g}' for x in (s.lowest, s.low, s.median, s.high, s.highest))
+        drift = 'no trend' if s.drift is None else f'{s.drift:+.3g}'
+        console.say(f'{f"{s.quantity.name} / {s.quantity.unit}":30s}{cells}   {drift}')
+    far = {name: None for s in spreads for name in s.far}
+    for name in list(far)[:SAID]:
+        what = ', '.join(s.quantity.name for s in spreads if name in s.far)
+        console.say(f'  {name} stands out: {what}')
+    if len(far) > SAID:
+        console.say(f'  and {len(far) - SAID} more')
+    console.say(f'\nmodels: {folder / "models"}')
+    console.say(f'table and pictures: {", ".join(map(str, files))}')
+
+
+def _spreads(rows: Sequence[Row]) -> list[Spread]:
+    ordered = in_order([row for row in rows if row.good])
+    return [s for q in QUANTITIES if (s := spread_of(ordered, q)) is not None]
+
+
+def _data(rows: Sequence[Row], files: Sequence[Path], folder: Path) -> dict[str, Any]:
+    return {
+        'records': len(rows),
+        'failed': sum(not row.good for row in rows),
+        'units': {name: unit_of(name) for name in columns_of(rows) if unit_of(name)},
+        'rows': [
+            {'record': row.record, 'reason': row.reason or None, **row.values} for row in rows
+        ],
+        'spread': [asdict(s) for s in _spreads(rows)],
+        'files': {
+            'models': str(folder / 'models'),
+            **{path.name: str(path) for path in files},
+        },
+    }

@@ -1,0 +1,143 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is done of many records, kept line by line so that a stopped run can go on.
+
+A line holds only as long as its record, its settings and this package are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+import json
+from pathlib import Path
+
+from piezo_ident.batch import Outcome, Row
+from piezo_ident.errors import ConfigError, DataError
+
+__all__ = ['LEDGER', 'Ledger']
+
+#: name of the file in the folder of results
+LEDGER = 'done.jsonl'
+
+
+@dataclass(frozen=True)
+class Entry:
+    """
+    A line of the file.
+
+    Attributes
+    ----------
+    verb : {'identify', 'diagnose'}
+    record : str
+    key : str
+        Of record and settings.
+    row : Row
+    seconds : float
+        That it took.
+    """
+
+    verb: str
+    record: str
+    key: str
+    row: Row
+    seconds: float
+
+
+class Ledger:
+    """
+    The file of what is done.
+
+    Parameters
+    ----------
+    folder : path
+        Of the results; need not exist yet.
+    verb : {'identify', 'diagnose'}
+        What is being done.
+
+    Raises
+    ------
+    ConfigError
+        When the folder holds the results of another verb, or a file of that name is no ledger.
+    """
+
+    def __init__(self, folder: Path, verb: str) -> None:
+        self.path, self._verb = folder / LEDGER, verb
+        self._whole = False
+        self._entries = {entry.record: entry for entry in self._read()}
+
+    def _read(self) -> list[Entry]:
+        try:
+            lines = self.path.read_text(encoding='utf-8').splitlines()
+        except FileNotFoundError:
+            return []
+        except (OSError, UnicodeDecodeError):
+            raise ConfigError(
+                f'{self.path}: cannot be read; choose another folder, or take the file away'
+            ) from None
+        entries = []
+        for number, line in enumerate(lines, 1):
+            try:
+                data = json.loads(line)
+                entry = Entry(**{**data, 'row': Row(**data['row'])})
+            except (ValueError, TypeError, KeyError):
+                # half a line of a run that was killed
+                if number < len(lines):
+                    raise ConfigError(
+                        f'{self.path}: line {number} is none of this package; choose another '
+                        'folder, or take the file away'
+                    ) from None
+                continue
+            if entry.verb != self._verb:
+                raise ConfigError(
+                    f'{self.path.parent}: holds what {entry.verb} --each found; choose another '
+                    'folder'
+                )
+            entries.append(entry)
+        return entries
+
+    def done(self, record: str, key: str) -> Row | None:
+        """Return the row of a record that was good under the same key, None otherwise."""
+        entry = self._entries.get(record)
+        return entry.row if entry is not None and entry.key == key and entry.row.good else None
+
+    def add(self, key: str, outcome: Outcome) -> None:
+        """
+        Keep a row.
+
+        Raises
+        ------
+        DataError
+            When it cannot be written.
+        """
+        row = outcome.row
+        entry = Entry(self._verb, row.record, key, row, round(outcome.seconds, 3))
+        try:
+            with self.path.open('ab') as file:
+                if not self._whole:
+                    file.truncate(self._size_of_whole_lines())
+                    self._whole = True
+                # file names need not be Unicode
+                file.write(f'{json.dumps(asdict(entry))}\n'.encode('utf-8', 'replace'))
+        except OSError as error:
+            raise DataError(
+                f'{self.path}: cannot be written ({error.strerror or error}); choose a folder '
+                'with room and the right to write'
+            ) from None
+        self._entries[row.record] = entry
+
+    def _size_of_whole_lines(self) -> int:
+        # the last one of a run that was killed may be half written
+        return self.path.read_bytes().rfind(b'\n') + 1

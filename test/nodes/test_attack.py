@@ -1,0 +1,157 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The graph under attack: nodes stay up, say what they refuse, and the voltage is safe."""
+
+from pathlib import Path
+import sys
+
+from course import level, paper
+from graph import Graph
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
+
+from attack import contradiction, odd_messages, start
+
+
+@pytest.fixture(scope='module')
+def attack():
+    with Graph() as g:
+        yield start(
+            g,
+            {
+                'stage': {'seed': 3},
+                'excitation': {'rest': 1.0},
+                'identifier': {},
+                'model': {},
+                'recorder': {'output': str(g.folder / 'bag')},
+                'player': {},
+            },
+        )
+
+
+def at_rest(g):
+    g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+
+
+def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
+    g = attack.g
+    # one that is followed, so that what comes is beside it
+    attack.send('voltage', level(0.0, 1)[0])
+    seen = {node: len(g.statuses(node)) for node in ('model', 'identifier')}
+    attack.messages(1000)
+    for node in seen:
+        g.wait(
+            lambda node=node: any(s['level'] == '1' for s in g.statuses(node)[seen[node] :]),
+            f'{node} to warn',
+        )
+    # one after the other: of many at once a status has the last
+    refused = (
+        ('an offset', 'layout announces 100 x 2 numbers'),
+        ('10,000 dimensions', '10000 dimensions are not'),
+        ('a label of 1 MB', 'a label of more than 200 characters'),
+        ('300,000 doubles', '300000 numbers in one message'),
+    )
+    messages = dict(odd_messages(150_000))
+    for what, said in refused:
+        (message,) = (m for name, m in messages.items() if name.startswith(what))
+        attack.send('voltage', message)
+        for node in ('stage', 'model'):
+            g.wait(
+                lambda said=said, node=node: any(said in s['message'] for s in g.statuses(node)),
+                f'{node} to say {said!r}',
+            )
+    # nothing that was sent is said again at its length
+    assert max(len(s['message']) for s in g.statuses('stage')) < 2000
+    assert max(len(s['message']) for s in g.statuses('model')) < 4000
+    g.wait(lambda: int(g.diagnostics('stage')['refused_malformed']) >= 15, 'refused blocks')
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_any_number_at_any_time_keeps_limits_and_slew(attack, seed):
+    before = attack.samples
+    attack.blocks(seed, 200)
+    assert attack.samples > before
+    at_rest(attack.g)
+    attack.is_safe('silence')
+    attack.g.wait(lambda: attack.applied[-1][-1] == 0.0, 'rest')
+
+
+@pytest.mark.parametrize('node', ['stage', 'excitation', 'identifier', 'model', 'player'])
+def test_parameters_of_wrong_types_are_refused(attack, node):
+    attack.parameters(node)
+    # a type that does not exist is said on the log
+    handle = attack.g.handle(node)
+    attack.g.wait(lambda: '99 is not a valid' in handle.log, 'the log')
+    assert 'the node goes on' in handle.log
+
+
+@pytest.mark.parametrize('node', ['stage', 'excitation'])
+def test_two_that_contradict_each_other_are_refused_together(attack, node):
+    answer = attack.set_raw(node, contradiction(), at_once=True)
+    assert not answer.result.successful
+    assert 'outside the voltage limits 0 .. 4 V' in answer.result.reason
+    attack.survived('a contradiction')
+
+
+def test_a_topic_full_of_foreign_models_is_refused(attack):
+    trace = Path('/tmp/piezo_ident_was_here')
+    trace.unlink(missing_ok=True)
+    said = attack.models(paper())
+    assert not trace.exists()
+    assert all('there is no model' in s and len(s) < 1000 for s in said)
+    attack.model.publish(attack._text(data=paper()))
+    g = attack.g
+    g.wait(lambda: g.status('model')['state'] == 'predicting', 'a model that is one')
+
+
+def test_four_clients_that_call_as_fast_as_they_can(attack):
+    rate = attack.services(2.0)
+    print(f'{rate:.0f} calls a second')
+    assert rate > 0
+    g = attack.g
+    g.call('excitation/stop')
+    at_rest(g)
+
+
+def test_the_stage_ramps_to_rest_whatever_the_clock_of_ros_does(attack):
+    g = attack.g
+    at_rest(g)
+    assert g.set('stage', 'use_sim_time', True)[0]
+    before = attack.samples
+    # whoever publishes on /clock holds the time of everybody who listens to it
+    for b in level(5.0, 160):
+        attack.send('voltage', b)
+        if round(b.t[0] * 200) % 40 == 39:
+            g.wait(lambda b=b: attack.samples >= before + round(b.t[-1] * 20_000), 'the stage')
+    assert max(v.max() for v in attack.applied) > 4.9
+    at_rest(g)
+    g.wait(lambda: attack.applied[-1][-1] == 0.0, 'rest')
+    attack.survived('a clock that stands still')
+
+
+def test_limits_that_are_moved_in_silence_are_kept(attack):
+    g = attack.g
+    at_rest(g)
+    try:
+        assert g.set('stage', 'rest', 2.0)[0]
+        g.wait(lambda: attack.applied[-1][-1] == 2.0, 'the new rest')
+        assert g.set('stage', 'voltage_low', 1.5)[0]
+        assert not g.set('stage', 'rest', 1.0)[0]
+    finally:
+        assert g.set('stage', 'voltage_low', 0.0)[0]
+        assert g.set('stage', 'rest', 0.0)[0]
+    g.wait(lambda: attack.applied[-1][-1] == 0.0, 'rest')

@@ -1,0 +1,105 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Access: the policy allows what the nodes do, and without credentials nobody gets in."""
+
+from pathlib import Path
+import shutil
+import subprocess
+
+from graph import Graph
+from piezo_ident.nodes.parameters import NODES
+from piezo_ident.nodes.policy import OPERATOR, rights
+import pytest
+from std_srvs.srv import Trigger
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_policy_allows_all_that_the_nodes_do():
+    with Graph() as g:
+        g.start_all(*((node, {}) for node in NODES))
+        assert g.set('recorder', 'output', str(g.folder / 'bag'))[0]
+        assert g.call('recorder/start')[0]
+        g.wait(lambda: g.status('recorder')['state'] == 'recording', 'the recorder')
+        for node in NODES:
+            may = rights(node)
+
+            def full(names, node=node):
+                return {
+                    f'/{node}{n[1:]}' if n[0] == '~' else n if n[0] == '/' else f'/{n}'
+                    for n in names
+                }
+
+            see = {
+                'publish': g.node.get_publisher_names_and_types_by_node,
+                'subscribe': g.node.get_subscriber_names_and_types_by_node,
+                'reply': g.node.get_service_names_and_types_by_node,
+                'request': g.node.get_client_names_and_types_by_node,
+            }
+            for right, ask in see.items():
+                found = {name for name, _ in ask(node, '/')}
+                assert found <= full(may[right]), f'{node} may not {right}'
+                # the player makes its publishers when it has a bag
+                if right in ('publish', 'reply') and node != 'player':
+                    optional = {f'/{node}/get_type_description'}
+                    assert full(may[right]) - optional <= found, f'{node} does not {right}'
+
+
+def enforced(keystore: Path) -> dict[str, str]:
+    return {
+        'ROS_SECURITY_ENABLE': 'true',
+        'ROS_SECURITY_STRATEGY': 'Enforce',
+        'ROS_SECURITY_KEYSTORE': str(keystore),
+    }
+
+
+def test_a_middleware_without_security_does_not_start_where_it_is_enforced(tmp_path):
+    (tmp_path / 'enclaves').mkdir()
+    with Graph() as g:
+        node = g.start('stage', wait=False, env=enforced(tmp_path))
+        # with the libraries it is the missing enclave that ends it
+        assert node.process.wait(60) != 0
+        assert 'security' in node.log.lower()
+
+
+@pytest.mark.skipif(
+    shutil.which('ros2') is None, reason='no ros2 here: SROS2 comes with the packages of Jazzy'
+)
+def test_without_credentials_nobody_commands_or_calls(tmp_path):
+    def ros2(*arguments: object) -> None:
+        command = ['ros2', 'security', *map(str, arguments)]
+        subprocess.run(command, check=True, env=environment, timeout=60)
+
+    with Graph() as g:
+        # permissions hold for one domain
+        environment, keystore = g.environment, tmp_path / 'keystore'
+        ros2('create_keystore', keystore)
+        for node in ('stage', 'excitation', OPERATOR):
+            ros2('create_enclave', keystore, f'/piezo_ident/{node}')
+            policy = ROOT / 'config/security/policy.xml'
+            ros2('create_permission', keystore, f'/piezo_ident/{node}', policy)
+        for node in ('stage', 'excitation'):
+            enclave = {'ROS_SECURITY_ENCLAVE_OVERRIDE': f'/piezo_ident/{node}'}
+            handle = g.start(node, wait=False, env={**enforced(keystore), **enclave})
+            handle.is_ended = False
+        client = g.node.create_client(Trigger, '/excitation/start')
+        g.publish_text('model', 'nobody listens')
+        g.never(
+            lambda: client.service_is_ready() or g.node.count_subscribers('/voltage'),
+            'a service or a listener was found',
+            15.0,
+        )
+        assert all(h.process.poll() is None for h in g.handles)

@@ -1,0 +1,62 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The whole graph for a while, faster than real time: nothing is lost, grows, or drifts."""
+
+from pathlib import Path
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from processes import take_domain
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
+
+from soak import clock_drift, slope, soak, Stream
+
+
+def test_what_is_missing_is_counted():
+    stream = Stream()
+    for first in (0, 100, 300, 0, 100):
+        stream.take(first, 100)
+    assert (stream.samples, stream.missing, stream.runs) == (500, 100, 2)
+    t = np.linspace(0.0, 7200.0, 1000)
+    k, error = slope(t, 3.0 + 2e-3 * t)
+    assert k == pytest.approx(2e-3) and error < 1e-9
+    # a sample clock that is 50 ppm fast, and blocks that come late by up to 30 ms
+    rng = np.random.default_rng(1)
+    late = 0.03 * rng.exponential(0.2, t.size)
+    drift, error = clock_drift(
+        [list(zip((t + late).tolist(), (t * (1 + 5e-5)).tolist(), strict=True))]
+    )
+    assert drift == pytest.approx(5e-5, abs=3e-6)
+
+
+def test_nothing_is_lost_and_the_recording_is_cut_into_parts(tmp_path, monkeypatch):
+    domain, lock = take_domain()
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with lock:
+        found = soak(12.0, 0.0, 2_500_000, tmp_path)
+    print('\n'.join(found.lines()))
+    assert not found.lost
+    assert found.parts >= 3
+    assert set(found.recorded.values()) == {found.samples}
+    for name in ('stage', 'excitation', 'recorder'):
+        first, last, _, _ = found.memory[name]
+        assert last - first < 50.0, f'{name} grew from {first} to {last} MB'

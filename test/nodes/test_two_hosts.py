@@ -1,0 +1,64 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A graph over two hosts, which are two network namespaces of this machine."""
+
+from pathlib import Path
+import sys
+import xml.etree.ElementTree as ET
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / 'benchmarks/reliability'))
+
+import netns  # noqa: E402
+
+REASON = netns.why_not()
+two_hosts = pytest.mark.skipif(bool(REASON), reason=REASON or 'there are two hosts')
+
+
+def test_the_profile_that_is_shipped_is_well_formed():
+    root = ET.parse(ROOT / 'config/fastdds_two_hosts.xml').getroot()
+    name = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
+    assert root.tag == f'{name}profiles'
+    assert len(root.findall(f'{name}data_writer')) == 1
+
+
+@two_hosts
+def test_five_percent_of_the_packets_cost_nothing():
+    outcome = netns.run(percent=5)
+    print(f'{outcome.dropped} packets dropped, {outcome.seconds} s')
+    assert outcome.dropped > 20
+    assert outcome.is_honest, outcome
+    # a busy machine may come too late with a repair; then it is said
+    if not outcome.lost and not outcome.faults:
+        assert (outcome.state, outcome.captured) == ('done', outcome.sent), outcome.message
+        assert outcome.model
+
+
+@two_hosts
+def test_nobody_is_seen_from_another_host_unless_asked():
+    # with no variable at all: what the starter does by itself
+    assert netns.seen_from('') == {'a': ['/host0/stage'], 'b': ['/host1/stage']}
+    assert not any(netns.leftover())
+
+
+@two_hosts
+def test_they_see_each_other_when_asked():
+    both = ['/host0/stage', '/host1/stage']
+    assert netns.seen_from('SUBNET') == {'a': both, 'b': both}

@@ -1,0 +1,52 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The page of all that was tried is made of the rows, and every row can be run again."""
+
+import json
+from pathlib import Path
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / 'benchmarks/reliability'))
+
+import build  # noqa: E402
+
+FILES = sorted(build.ROWS.glob('*.json'))
+
+
+def test_the_page_is_that_of_the_rows():
+    cure = 'run: python benchmarks/reliability/build.py'
+    assert (ROOT / 'docs/reliability.md').read_text(encoding='utf-8') == build.page(), cure
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda p: p.stem)
+def test_rows_have_all_they_need(path):
+    rows = json.loads(path.read_text(encoding='utf-8'))
+    assert rows
+    for row in rows:
+        # a study may keep more of its own beside
+        assert all(isinstance(row.get(key), str) and row[key].strip() for key in build.KEYS)
+        words = row['command'].split()
+        scripts = [w for w in words if w.endswith('.py')]
+        assert scripts or words[0] == 'make', row['command']
+        for script in scripts:
+            assert (ROOT / script).is_file(), row['command']
+
+
+def test_what_a_cell_holds_does_not_break_the_table():
+    assert build._cell('a | b\n c') == 'a \\| b c'
