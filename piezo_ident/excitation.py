@@ -140,6 +140,7 @@ def steps(
     The train begins on the lower level and is held for `hold` seconds on each.
     """
     # before as many levels are listed
+    sample_count(hold, sample_rate)
     sample_count(hold * (count + 1), sample_rate)
     low, high = bias - size / 2, bias + size / 2
     levels = [low if k % 2 == 0 else high for k in range(count + 1)]

@@ -266,12 +266,16 @@ class _Loop(Generic[T]):
                 while not wait([future], EVERY).done:
                     tick()
                 try:
-                    yield number, future.result()
+                    result = future.result()
                 except BrokenExecutor:
                     reason = PiezoIdentError(
                         'the process at work ended by itself; is there enough memory?'
                     )
                     yield number, self._failed(number, reason)
+                except Exception as error:  # noqa: BLE001
+                    yield number, self._failed(number, error)
+                else:
+                    yield number, result
 
 
 def run_all(

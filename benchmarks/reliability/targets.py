@@ -27,6 +27,7 @@ import json
 from pathlib import Path
 import struct
 from typing import Any
+from unittest import mock
 import zipfile
 
 import numpy as np
@@ -106,8 +107,8 @@ def stage(data: bytes, folder: Path | None = None) -> None:
 
 def programme(data: bytes, folder: Path | None = None) -> None:
     """Read a programme and play it at a low rate."""
-    excitation.MAX_SAMPLES = SHORT
-    parse_program(data.decode('utf-8', 'replace')).build(sample_rate=100.0)
+    with mock.patch.object(excitation, 'MAX_SAMPLES', SHORT):
+        parse_program(data.decode('utf-8', 'replace')).build(sample_rate=100.0)
 
 
 def effect(data: bytes, folder: Path | None = None) -> None:
