@@ -24,12 +24,14 @@ lint: .venv/.test
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-# a file of tests stays in one process; node tests mostly wait, and come when the rest is done
+# a file of tests stays in one process; node tests mostly wait, and come when the rest is done;
+# what another program's burst made fail is asked once more, alone
 PARALLEL := -n 2 --dist loadfile
 
 pytest: .venv/.test
 	.venv/bin/pytest $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS)
-	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS)
+	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
+	.venv/bin/pytest --last-failed --last-failed-no-failures none test/nodes $(PYTEST_ARGS)
 
 # node processes over DDS alone
 test-graph: .venv/.test
