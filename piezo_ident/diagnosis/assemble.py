@@ -48,6 +48,8 @@ __all__ = ['PASSES', 'assemble']
 
 #: held-out gain of the refitted base below which the model stays as it was given
 WORTH_REFIT = 0.05
+#: the same where structure stays unexplained: a refit that only bends H towards it helps nobody
+WORTH_IN_DOUBT = 0.5
 #: retuning of G that is worth a word, samples of delay
 TUNED = 0.05
 #: passes over the range, there or back, that a test on data not fitted needs
@@ -98,7 +100,8 @@ def assemble(
     refit = errors_of(rows, held_out_residual(rows, base), lost)
     after = errors_of(rows, held_out_residual(rows, fitted), lost)
     lasting = [name for name in findings.effects if not find_effect(name).time_driven]
-    if not findings.effects and refit.overall > (1.0 - WORTH_REFIT) * before.overall:
+    worth = WORTH_IN_DOUBT if findings.verdict == 'unexplained' else WORTH_REFIT
+    if not findings.effects and refit.overall > (1.0 - worth) * before.overall:
         state, refined, after = given, model, before
     elif findings.effects and not lasting:
         # H was refitted beside a drift that another record will not repeat
