@@ -31,7 +31,8 @@ import tempfile
 
 #: states of a node that is up
 UP = ('idle', 'waiting')
-START_LIMIT, END_LIMIT = 60.0, 5.0
+#: a node that has never run here compiles its kernels before it hears [s]
+START_LIMIT, END_LIMIT = 60.0, 60.0
 
 
 def see(client, space: Path, executable: str, log: Path) -> None:
