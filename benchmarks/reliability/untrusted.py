@@ -304,7 +304,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     'two levels only': (
         'refused: r.npz: from 0 to 5 s the voltage moves',
         'errs by 25 %',
-        'unexplained, errs by 25, then 23 % of stroke, warns',
+        'unexplained, errs by 25, then 25 % of stroke, warns',
     ),
     'noise up to 3 Hz only': ('model, errs by 0.41 % of stroke, warns', *_KNOWN),
     'noise is one sine': ('model, errs by 0.44 %', *_KNOWN),
