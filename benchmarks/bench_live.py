@@ -71,47 +71,45 @@ class Seen:
     captured: list[float] = field(default_factory=list)
 
 
-class Observer:
-    """Fetches what arrives in a thread of its own."""
+class Fetcher:
+    """Fetches what arrives on some topics, in a thread of its own."""
 
-    def __init__(self, client) -> None:
+    def __init__(self, client, topics: list[str]) -> None:
         from piezo_ident.nodes.taps import message_class, Taps
         from rclpy.serialization import deserialize_message
 
         self.client = client
-        self.seen = Seen()
-        self._kind, self._read = (
+        self._kind, self._deserialize = (
             message_class('std_msgs/msg/Float64MultiArray'),
             deserialize_message,
         )
-        self._taps = Taps(client.node, [f'/{t}' for t in (*STREAMS, 'captured')])
-        self._working = False
+        self._taps = Taps(client.node, topics)
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     @property
     def lost(self) -> int:
-        """Messages that were sent to the observer and did not arrive."""
+        """Messages that were sent here and did not arrive."""
         return self._taps.lost
+
+    def data(self, raw: bytes):
+        """Return the numbers of a message."""
+        return self._deserialize(raw, self._kind).data
+
+    def look(self) -> None:
+        """Do what is to be done before each fetch."""
+
+    def arrived(self, stamp: int, topic: str, raw: bytes) -> None:
+        """Take a message."""
+        raise NotImplementedError
 
     def _work(self) -> None:
         looked = 0.0
         while not self._end.wait(POLL):
-            now = time.time_ns()
-            busy = self.seen.busy
-            if self.client.status('identifier').get('state') != 'identifying':
-                self._working = False
-            elif self._working and busy:
-                busy[-1] = (busy[-1][0], now)
-            else:
-                busy.append((now, now))
-                self._working = True
-            for stamp, topic, raw in self._taps.arrived():
-                data = self._read(raw, self._kind).data
-                self.seen.arrivals[topic[1:]][data[-2]] = stamp
-                if topic == '/captured':
-                    self.seen.captured.append(data[-1])
+            self.look()
+            for message in self._taps.arrived():
+                self.arrived(*message)
             if time.monotonic() - looked > 0.5:
                 looked = time.monotonic()
                 self._taps.look()
@@ -121,6 +119,34 @@ class Observer:
         self._end.set()
         self._thread.join()
         self._taps.close()
+
+
+class Observer(Fetcher):
+    """Keeps when the blocks of the graph arrived, and when the identifier was at work."""
+
+    def __init__(self, client) -> None:
+        self.seen = Seen()
+        self._working = False
+        super().__init__(client, [f'/{t}' for t in (*STREAMS, 'captured')])
+
+    def look(self) -> None:
+        """See whether the identifier is at work."""
+        now = time.time_ns()
+        busy = self.seen.busy
+        if self.client.status('identifier').get('state') != 'identifying':
+            self._working = False
+        elif self._working and busy:
+            busy[-1] = (busy[-1][0], now)
+        else:
+            busy.append((now, now))
+            self._working = True
+
+    def arrived(self, stamp: int, topic: str, raw: bytes) -> None:
+        """Keep when a block arrived, by its last t."""
+        data = self.data(raw)
+        self.seen.arrivals[topic[1:]][data[-2]] = stamp
+        if topic == '/captured':
+            self.seen.captured.append(data[-1])
 
 
 def processes() -> dict[int, tuple[int, float]]:

@@ -32,10 +32,9 @@ import random
 import shlex
 import sys
 import tempfile
-import threading
 import time
 
-from bench_live import machine, POLL, RATE, Shares, sine
+from bench_live import Fetcher, machine, RATE, Shares, sine
 import numpy as np
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.model_io import save_model
@@ -52,45 +51,18 @@ STARTS = 5
 NODES = ('stage', 'model', 'excitation')
 
 
-class Watch:
-    """Fetches what arrives on some topics, in a thread of its own."""
+class Watch(Fetcher):
+    """Keeps when the blocks of some topics arrived, by their last t, or only counts them."""
 
     def __init__(self, client, topics: list[str], *, read: bool = True) -> None:
-        from piezo_ident.nodes.taps import message_class, Taps
-        from rclpy.serialization import deserialize_message
-
         self.arrivals: dict[str, dict[float, int]] = {topic: {} for topic in topics}
-        self._kind, self._deserialize = (
-            message_class('std_msgs/msg/Float64MultiArray'),
-            deserialize_message,
-        )
         self._read = read
-        self._taps = Taps(client.node, topics)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
+        super().__init__(client, topics)
 
-    @property
-    def lost(self) -> int:
-        """Messages that were sent here and did not arrive."""
-        return self._taps.lost
-
-    def _work(self) -> None:
-        looked = 0.0
-        while not self._end.wait(POLL):
-            for stamp, topic, raw in self._taps.arrived():
-                seen = self.arrivals[topic]
-                key = self._deserialize(raw, self._kind).data[-2] if self._read else len(seen)
-                seen[key] = stamp
-            if time.monotonic() - looked > 0.5:
-                looked = time.monotonic()
-                self._taps.look()
-
-    def close(self) -> None:
-        """Fetch no more."""
-        self._end.set()
-        self._thread.join()
-        self._taps.close()
+    def arrived(self, stamp: int, topic: str, raw: bytes) -> None:
+        """Keep when a block arrived."""
+        seen = self.arrivals[topic]
+        seen[self.data(raw)[-2] if self._read else len(seen)] = stamp
 
 
 class Bench:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.report.diagnosis_tables import STATES
 from piezo_ident.report.numbers import number
 from piezo_ident.report.tables import Table
 from piezo_ident.residual.reversals import Way, ways
@@ -28,7 +29,6 @@ __all__ = ['reversal_sentence', 'reversal_table', 'ways_of']
 NEAR = 0.05
 #: a residual stands near the reversals when it is this much larger there than elsewhere
 STANDS = 1.25
-STATES = ('as given', 'H refitted', 'refined')
 
 
 def ways_of(diagnosis: Diagnosis) -> tuple[Way, ...]:
