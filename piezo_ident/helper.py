@@ -305,6 +305,10 @@ def _give_way(nice: int) -> None:
     # gives way less where it may not; works all the same
     with contextlib.suppress(OSError):
         os.nice(nice)
+    if nice and hasattr(os, 'SCHED_IDLE'):
+        # who wakes up takes the core at once, and a core that only idles along counts as free
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     with contextlib.suppress(OSError):
         # Linux shares the time among sessions before it looks at the processes in them
         os.setsid()

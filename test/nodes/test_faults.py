@@ -417,6 +417,8 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     # in the middle of a stream it cannot know the memory, and says so
     unknown = 'its memory is unknown until the voltage has been at its lowest'
     g.wait(lambda: unknown in node.status()['message'], unknown)
+    # what it says of the hold may be on its way yet
+    g.wait(lambda: round(rig.prediction[-1].t[-1] * FS) == tick - 1, 'the hold to be predicted')
     count, rest = len(rig.prediction), shifted(BLOCKS[K:], tick)
     rig.send(rest)
     g.wait(lambda: len(rig.prediction) == count + len(rest), 'predictions')
