@@ -32,9 +32,9 @@ from piezo_ident.bag_check import rate_of
 from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag
 from piezo_ident.capture import APPLIED, record_of_streams
 from piezo_ident.errors import DataError
-from piezo_ident.join import Stream
 from piezo_ident.output import temporary_output
 from piezo_ident.record import Record
+from piezo_ident.stream import Stream
 from piezo_ident.wire_format import (
     BLOCK_SIZE,
     cut_blocks,

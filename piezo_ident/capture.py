@@ -30,10 +30,11 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import DataError
-from piezo_ident.join import join, Stream
+from piezo_ident.join import join
 from piezo_ident.ordering import at_times
 from piezo_ident.record import Fault, Record
 from piezo_ident.sampling import assemble
+from piezo_ident.stream import Stream
 from piezo_ident.wire_format import Samples
 
 __all__ = ['APPLIED', 'Capture', 'Snapshot', 'record_of_streams', 'refuse_incomplete']
@@ -95,6 +96,8 @@ def record_of_streams(
         joined.columns,
         joined.segments,
     )
+    if APPLIED in columns and np.array_equal(columns['voltage'], columns[APPLIED]):
+        del columns[APPLIED]
     if APPLIED in columns:
         v, applied = columns['voltage'], columns.pop(APPLIED)
         wrong = _guarded(v, applied, tolerance)
@@ -266,8 +269,8 @@ class Snapshot:
     def sent(self) -> dict[str, float]:
         """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
         stream = self.streams['voltage']
-        t = stream.rows[:, 0]
-        names, starts = stream.labels(np.arange(t.size))
+        t = stream.times
+        names, starts = stream.labels()
         times: dict[str, list[NDArray[np.float64]]] = {}
         for name, start, stop in zip(names, starts, [*starts[1:], t.size], strict=True):
             times.setdefault(name.partition(':')[0], []).append(t[start:stop])

@@ -157,14 +157,13 @@ def _breaks(t: Vector) -> NDArray[np.bool_]:
     Steps of like size form runs.  A short run of coarse steps beside a finer one is a gap; where
     two proper runs meet the rate changes, and the sample between them goes to the later one.
     """
-    step = np.diff(t)
-    if step.size < 2:
-        return np.zeros(step.size, dtype=np.bool_)
-    change = np.abs(np.diff(step)) > 0.6 * np.minimum(step[1:], step[:-1])
-    first = np.concatenate([[0], np.flatnonzero(change) + 1])
+    n = t.size - 1
+    if n < 2:
+        return np.zeros(max(n, 0), dtype=np.bool_)
+    first = np.array([0, *itertools.chain.from_iterable(_changes(t))])
     if first.size == 1:
-        return np.zeros(step.size, dtype=np.bool_)
-    length = np.diff(np.append(first, step.size))
+        return np.zeros(n, dtype=np.bool_)
+    length = np.diff(np.append(first, n))
     level = (t[first + length] - t[first]) / length
     before = np.concatenate([[np.inf], level[:-1]])
     after = np.concatenate([level[1:], [np.inf]])
@@ -175,17 +174,32 @@ def _breaks(t: Vector) -> NDArray[np.bool_]:
     return breaks
 
 
+def _changes(t: Vector) -> Iterator[list[int]]:
+    """Yield, chunk by chunk, the steps that differ from the one before them."""
+    for i in range(0, t.size - 2, _CHUNK):
+        step = np.diff(t[i : i + _CHUNK + 2])
+        change = np.abs(np.diff(step)) > 0.6 * np.minimum(step[1:], step[:-1])
+        yield (np.flatnonzero(change) + (i + 1)).tolist()
+
+
+def _wide(t: Vector, least: float) -> list[int]:
+    """Return the samples behind steps of more than a size."""
+    wide: list[int] = []
+    for i in range(0, t.size - 1, _CHUNK):
+        wide.extend((np.flatnonzero(np.diff(t[i : i + _CHUNK + 1]) > least) + (i + 1)).tolist())
+    return wide
+
+
 def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     """Return where a stretch without coarse breaks must still be cut; empty when uniform."""
     n = t.size
     if n < 3:
         return []
-    step = np.diff(t)
     dt = (t[-1] - t[0]) / (n - 1)
-    wide = np.flatnonzero(step > 1.5 * dt)
     # rounding to a few decimals can hide a missing sample from a look at neighbours only
-    if wide.size:
-        return [int(i) + 1 for i in wide]
+    wide = _wide(t, 1.5 * dt)
+    if wide:
+        return wide
     low, high = _rates(t, _rounding(resolution, dt))
     if low <= high:
         return []
@@ -193,6 +207,7 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT:
         return []
     # a change of rate is a kink, a jump of the clock a step: both peak where the cut belongs
+    step = np.diff(t)
     k = int(np.argmax(np.abs(t - (t[0] + np.arange(n) * dt))))
     if 0 < k < n - 1 and abs(step[k] - dt) > abs(step[k - 1] - dt) + 0.1 * dt:
         k += 1

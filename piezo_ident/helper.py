@@ -44,6 +44,7 @@ from typing import Any
 
 import piezo_ident
 from piezo_ident.errors import Cancelled, PiezoIdentError
+from piezo_ident.heap import keep_freed
 
 __all__ = ['Helper', 'serve']
 
@@ -291,6 +292,7 @@ def serve(reading: int, writing: int) -> None:
 
     nice, warm_up = channel.receive()
     _give_way(nice)
+    keep_freed()
     threading.Thread(target=listen, daemon=True).start()
     if warm_up is not None:
         # it only saves time

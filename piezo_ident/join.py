@@ -22,87 +22,20 @@ belongs to the first of the other; after a loss, the two that arrived closest to
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import DataError
 from piezo_ident.record import Fault
-from piezo_ident.wire_format import Samples
+from piezo_ident.stream import Stream
 
-__all__ = ['Joined', 'Stream', 'join']
+__all__ = ['Joined', 'join']
 
-#: numbers in a chunk of a stream
-CHUNK = 1 << 17
 #: rows of a stream no further apart than this are of the same run of the sample clock
 NEARBY = 300
-
-
-class Stream:
-    """All blocks of one topic so far, in flat buffers that grow chunk by chunk."""
-
-    def __init__(self) -> None:
-        self._chunks = [array('d')]  # only the last one grows, so that copies share the others
-        self._sizes = array('q')
-        self._arrivals = array('q')
-        self._segments: list[str] = []
-
-    def append(self, samples: Samples, arrival: int) -> None:
-        """Add a block that arrived at a time [ns] of a clock that all streams share."""
-        rows = np.column_stack([samples.t, samples.values])
-        if len(self._chunks[-1]) >= CHUNK:
-            self._chunks.append(array('d'))
-        self._chunks[-1].frombytes(rows.tobytes())
-        self._sizes.append(samples.t.size)
-        self._arrivals.append(arrival)
-        # one string for all blocks of a segment, not one a block
-        last = self._segments[-1] if self._segments else ''
-        self._segments.append(last if last == samples.segment else samples.segment)
-
-    def copy(self) -> Stream:
-        """Return the stream as it is now, without copying what no longer changes."""
-        other = Stream()
-        other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
-        other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
-        other._segments = self._segments[:]
-        return other
-
-    def drop(self, blocks: int) -> None:
-        """Forget the oldest blocks."""
-        left = 2 * sum(self._sizes[:blocks])
-        while left and len(self._chunks) > 1 and left >= len(self._chunks[0]):
-            left -= len(self._chunks.pop(0))
-        self._chunks[0] = self._chunks[0][left:]
-        del self._sizes[:blocks], self._arrivals[:blocks], self._segments[:blocks]
-
-    @property
-    def n(self) -> int:
-        """Number of samples."""
-        return sum(len(chunk) for chunk in self._chunks) // 2
-
-    @property
-    def rows(self) -> NDArray[np.float64]:
-        """Time [s] and value of each sample, a copy of shape (n, 2)."""
-        chunks = [np.frombuffer(chunk, dtype=np.float64) for chunk in self._chunks if chunk]
-        return np.concatenate([np.empty(0), *chunks]).reshape(-1, 2)
-
-    @property
-    def arrivals(self) -> NDArray[np.int64]:
-        """When each sample arrived [ns]."""
-        return np.repeat(np.array(self._arrivals, dtype=np.int64), self._sizes)
-
-    def labels(self, rows: NDArray[np.int64]) -> tuple[list[str], list[int]]:
-        """Return the label of each stretch of `rows`, and where in `rows` it begins."""
-        if not rows.size:
-            return [], []
-        codes = {label: i for i, label in enumerate(dict.fromkeys(self._segments))}
-        block = np.array([codes[label] for label in self._segments], dtype=np.int64)
-        code = np.repeat(block, self._sizes)[rows]
-        starts = np.concatenate([[0], np.flatnonzero(np.diff(code)) + 1])
-        names = list(codes)
-        return [names[c] for c in code[starts]], starts.tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,14 +69,20 @@ def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = No
     DataError
         When a stream has two values for one time, or no stamp is in all streams.
     """
-    (first, lead), *others = streams.items()
-    tables = {name: (s.rows, s.arrivals) for name, s in streams.items()}
-    rows, arrivals = tables[first]
-    partner = {}
+    beside = beside or {}
+    first, lead = next(iter(streams.items()))
+    t = lead.times
+    laps = _in_step(t, lead, streams, beside)
+    if laps is not None:
+        return _joined_in_step(t, lead, streams, beside, laps)
+    arrivals = lead.arrivals
+    stamps = {name: s.times for name, s in streams.items() if name != first}
+    partner = {
+        name: _partners(t, arrivals, x, streams[name].arrivals) for name, x in stamps.items()
+    }
     matched = np.ones(lead.n, dtype=np.bool_)
-    for name, _ in others:
-        partner[name] = _partners(rows[:, 0], arrivals, tables[name][0][:, 0], tables[name][1])
-        matched &= partner[name] >= 0
+    for rows in partner.values():
+        matched &= rows >= 0
     if not matched.any():
         names = ' and '.join(streams)
         raise DataError(
@@ -153,19 +92,143 @@ def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = No
     keep = np.flatnonzero(matched)
     used = {first: keep, **{name: p[keep] for name, p in partner.items()}}
     faults: list[Fault] = []
-    for name, (table, _) in tables.items():
-        faults.extend(_left_over(name, table, used[name]))
-    columns = {name: tables[name][0][used[name], 1] for name in streams}
-    for name, stream in (beside or {}).items():
-        table = stream.rows
-        row = _partners(rows[:, 0], arrivals, table[:, 0], stream.arrivals)[keep]
-        columns[name] = np.where(row >= 0, table[row, 1] if stream.n else np.nan, np.nan)
+    columns = {}
+    for name, stream in streams.items():
+        values = stream.values
+        faults.extend(_left_over(name, stamps.get(name, t), values, used[name]))
+        columns[name] = values[used[name]]
+    for name, stream in beside.items():
+        row = _partners(t, arrivals, stream.times, stream.arrivals)[keep]
+        columns[name] = np.where(row >= 0, stream.values[row] if stream.n else np.nan, np.nan)
     return Joined(
-        t=rows[keep, 0],
-        columns=columns,
-        segments=lead.labels(keep),
-        faults=tuple(faults),
+        t[keep], columns, _labels(lead, lambda rows: np.searchsorted(keep, rows)), tuple(faults)
     )
+
+
+def _labels(
+    stream: Stream, place: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+) -> tuple[list[str], list[int]]:
+    """Return the label of each stretch and its first row, from how many rows before one stay."""
+    names, starts = stream.labels()
+    at = place(np.append(starts, stream.n)).tolist()
+    kept: tuple[list[str], list[int]] = ([], [])
+    for name, (begin, end) in zip(names, itertools.pairwise(at), strict=True):
+        if begin < end and kept[0][-1:] != [name]:
+            kept[0].append(name)
+            kept[1].append(begin)
+    return kept
+
+
+@dataclass(frozen=True, eq=False)
+class _Lap:
+    """
+    A run of the sample clock that all streams went through together.
+
+    Attributes
+    ----------
+    starts : dict of str to int
+        Row of each stream where it begins.
+    sizes : dict of str to int
+        Rows of each stream that belong to it.
+    n : int
+        Rows of it that all streams have; they are its first ones.
+    """
+
+    starts: dict[str, int]
+    sizes: dict[str, int]
+    n: int
+
+
+def _in_step(
+    t: NDArray[np.float64],
+    lead: Stream,
+    streams: Mapping[str, Stream],
+    beside: Mapping[str, Stream],
+) -> list[_Lap] | None:
+    """
+    Return the runs of the clock where each stream has the stamps of the lead from its first one.
+
+    That is so wherever nothing was lost: then minutes of samples are joined without a table of
+    partners.  None where it is not so.
+    """
+    starts: dict[str, NDArray[np.int64]] = {}
+    same: list[NDArray[np.int64]] = []
+    for name, stream in {**streams, **beside}.items():
+        x = t if stream is lead else stream.times
+        starts[name] = begin = np.concatenate([[0], np.flatnonzero(x[1:] <= x[:-1]) + 1])
+        head = next(iter(starts.values()))
+        if not x.size or begin.size != head.size:
+            return None
+        one, other = (np.diff(begin, append=x.size), np.diff(head, append=t.size))
+        size = np.minimum(one, other)
+        if not all(
+            np.array_equal(x[a : a + n], t[b : b + n])
+            for a, b, n in zip(begin, head, size, strict=True)
+        ):
+            return None
+        # runs of one clock are told apart by when they came
+        came, came_lead = stream.arrived(begin), lead.arrived(head)
+        if (came[1:] <= came_lead[:-1]).any() or (came_lead[1:] <= came[:-1]).any():
+            return None
+        if name in streams:
+            same.append(size)
+    ends = {name: np.append(x[1:], {**streams, **beside}[name].n) for name, x in starts.items()}
+    return [
+        _Lap(
+            {name: int(x[k]) for name, x in starts.items()},
+            {name: int(ends[name][k] - x[k]) for name, x in starts.items()},
+            int(min(size[k] for size in same)),
+        )
+        for k in range(same[0].size)
+    ]
+
+
+def _joined_in_step(
+    t: NDArray[np.float64],
+    lead: Stream,
+    streams: Mapping[str, Stream],
+    beside: Mapping[str, Stream],
+    laps: list[_Lap],
+) -> Joined:
+    """Join streams by cutting what one of them has at the end of a run and another has not."""
+    first = next(iter(streams))
+    starts = np.array([lap.starts[first] for lap in laps])
+    sizes = np.array([lap.n for lap in laps])
+    ends = np.cumsum(sizes)
+
+    def place(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        k = np.searchsorted(starts, rows, 'right') - 1
+        return np.asarray(ends[k] - sizes[k] + np.minimum(rows - starts[k], sizes[k]))
+
+    faults: list[Fault] = []
+    columns = {}
+    for name, stream in {**streams, **beside}.items():
+        values = stream.values
+        columns[name] = _cut(values, name, laps)
+        left = [
+            np.arange(lap.starts[name] + lap.n, lap.starts[name] + lap.sizes[name]) for lap in laps
+        ]
+        rows = np.concatenate(left)
+        if name in streams and rows.size:
+            stamps = t if stream is lead else stream.times
+            faults.extend(_left_over(name, stamps[rows], values[rows], rows[:0]))
+    t = _cut(t, first, laps)
+    for column in (t, *columns.values()):
+        # nobody else has them, so that a record need not copy them
+        column.setflags(write=False)
+    return Joined(t, columns, _labels(lead, place), tuple(faults))
+
+
+def _cut(values: NDArray[np.float64], name: str, laps: list[_Lap]) -> NDArray[np.float64]:
+    """Return the rows of each run that all streams have; NaN where this one has none."""
+    if all(lap.sizes[name] == lap.n for lap in laps):
+        return values
+    column, at = np.full(sum(lap.n for lap in laps), np.nan), 0
+    for lap in laps:
+        begin, n = lap.starts[name], min(lap.n, lap.sizes[name])
+        column[at : at + n] = values[begin : begin + n]
+        at += lap.n
+    return column
 
 
 def _partners(
@@ -216,13 +279,17 @@ def _nearest(
     return best
 
 
-def _left_over(name: str, table: NDArray[np.float64], used: NDArray[np.int64]) -> list[Fault]:
+def _left_over(
+    name: str,
+    t: NDArray[np.float64],
+    x: NDArray[np.float64],
+    used: NDArray[np.int64],
+) -> list[Fault]:
     """Say what became of the samples of a stream that found no partner."""
-    left = np.ones(len(table), dtype=np.bool_)
+    left = np.ones(t.size, dtype=np.bool_)
     left[used] = False
     if not left.any():
         return []
-    t, x = table[:, 0], table[:, 1]
     by = np.argsort(t, kind='stable')
     same_time = t[by][1:] == t[by][:-1]
     same_value = x[by][1:] == x[by][:-1]

@@ -103,7 +103,7 @@ def in_order(table: Rows, name: str, met: list[Fault]) -> tuple[Rows, list[int]]
     if jumps.size:
         rows, epochs, again = _stretches(kept, jumps, name)
         repeated = np.concatenate([repeated, again])
-        if rows.size < t.size:
+        if rows is not None:
             kept = kept.take(rows)
         where = [f'from {kept.t[e - 1]:.6g} s back to {kept.t[e]:.6g} s' for e in epochs[1:4]]
         if where:
@@ -116,11 +116,16 @@ def in_order(table: Rows, name: str, met: list[Fault]) -> tuple[Rows, list[int]]
 
 def _stretches(
     table: Rows, jumps: NDArray[np.int64], name: str
-) -> tuple[NDArray[np.int64], list[int], NDArray[np.float64]]:
-    """Sort stretches of rising time into repeats and restarts; refuse what is neither."""
+) -> tuple[NDArray[np.int64] | None, list[int], NDArray[np.float64]]:
+    """
+    Sort stretches of rising time into repeats and restarts; refuse what is neither.
+
+    Returns the rows that stay, None for all, where each epoch begins, and the times of repeats.
+    """
     t = table.t
-    rows = np.empty(t.size, dtype=np.int64)
-    known = np.empty(t.size)  # t[rows], so that a look-up copies nothing
+    # as long as nothing is dropped, rows are their own numbers and need no table
+    rows: NDArray[np.int64] | None = None
+    known = t  # t[rows], so that a look-up copies nothing
     size, begin = 0, 0
     epochs, repeated = [0], []
     bounds = [0, *jumps.tolist(), t.size]
@@ -131,7 +136,7 @@ def _stretches(
             overlap = start + int(np.searchsorted(t[start:stop], epoch[-1], 'right'))
             place = np.searchsorted(epoch, t[start:overlap])
             same_time = epoch[place] == t[start:overlap]
-            old = rows[begin:size][place]
+            old = begin + place if rows is None else rows[begin:size][place]
             again = bool(same_time.all()) and all(
                 np.array_equal(x[old], x[start:overlap]) for x in table.columns.values()
             )
@@ -155,10 +160,17 @@ def _stretches(
                     f'{name}: time is unsorted, {t[start]:.9g} s follows {t[first - 1]:.9g} s; '
                     'sort the rows by t'
                 )
-        rows[size : size + stop - start] = np.arange(start, stop)
-        known[size : size + stop - start] = t[start:stop]
+        if rows is None and start > first:
+            rows, known = np.arange(t.size), t.copy()
+        if rows is not None:
+            rows[size : size + stop - start] = np.arange(start, stop)
+            known[size : size + stop - start] = t[start:stop]
         size += stop - start
-    return rows[:size], epochs, np.concatenate(repeated) if repeated else t[:0]
+    return (
+        None if rows is None else rows[:size],
+        epochs,
+        np.concatenate(repeated) if repeated else t[:0],
+    )
 
 
 def at_times(times: NDArray[np.float64]) -> str:

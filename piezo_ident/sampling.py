@@ -129,8 +129,9 @@ def assemble(
         )
     table = _drop_not_finite(table, name, met)
     table, epochs = in_order(table, name, met)
-    scaled = table.columns['y'] / UNITS[displacement_unit]
-    table = replace(table, columns={**table.columns, 'y': scaled})
+    if UNITS[displacement_unit] != 1.0:
+        scaled = table.columns['y'] / UNITS[displacement_unit]
+        table = replace(table, columns={**table.columns, 'y': scaled})
     _check_ranges(table, name, displacement_unit, voltage_limits)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
@@ -197,18 +198,17 @@ def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
 
 def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float] | None) -> None:
     v, y = table.columns['v'], table.columns['y']
-    latest = float(np.abs(table.t).max())
+    latest = _largest(table.t)
     if latest > MAX_TIME:
         raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
-    if limits is not None:
+    if limits is not None and (v.min() < limits[0] or v.max() > limits[1]):
         outside = np.flatnonzero((v < limits[0]) | (v > limits[1]))
-        if outside.size:
-            worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (limits[0] + limits[1])))]
-            raise DataError(
-                f'{name}: {outside.size} samples leave the voltage limits {limits[0]:g}..'
-                f'{limits[1]:g} V, worst {v[worst]:g} V at {table.t[worst]:.6g} s; '
-                'check the limits or the unit of v'
-            )
+        worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (limits[0] + limits[1])))]
+        raise DataError(
+            f'{name}: {outside.size} samples leave the voltage limits {limits[0]:g}..'
+            f'{limits[1]:g} V, worst {v[worst]:g} V at {table.t[worst]:.6g} s; '
+            'check the limits or the unit of v'
+        )
     stroke, span = float(y.max() - y.min()), float(v.max() - v.min())
     idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
     if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
@@ -221,12 +221,16 @@ def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float]
             '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
         )
     for key, x, moved in (('v', v, span), ('y', y, stroke)):
-        offset = float(np.abs(x).max())
+        offset = _largest(x)
         if moved and offset * np.finfo(np.float64).eps > LOST * moved:
             raise DataError(
                 f'{name}: {key} lies at {offset:.3g} and moves by {moved:.3g}: its digits are '
                 'used up by the offset; subtract it where the numbers are made'
             )
+
+
+def _largest(x: NDArray[np.float64]) -> float:
+    return max(float(x.max()), -float(x.min()))
 
 
 def _pieces(

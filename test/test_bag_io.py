@@ -23,8 +23,9 @@ import numpy as np
 from piezo_ident.bag_io import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
 from piezo_ident.capture import APPLIED, Capture
 from piezo_ident.errors import DataError
-from piezo_ident.join import join, Stream
+from piezo_ident.join import join
 from piezo_ident.record import Piece, Record, Segment
+from piezo_ident.stream import Stream
 from piezo_ident.wire_format import cut_blocks, decode, Dimension, encode, Samples
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer

@@ -297,4 +297,4 @@ def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
     assert len(lone.segments) == 21 and 'others' in lone.segments
     # the newest part is what is left
     assert lone.last_time('voltage') == 499 / RATE
-    assert lone.snapshot().streams['voltage'].rows[-1, 0] == 499 / RATE
+    assert lone.snapshot().streams['voltage'].times[-1] == 499 / RATE

@@ -35,7 +35,7 @@ from piezo_ident import excitation
 from piezo_ident.bag_io import MESSAGE_TYPE, typestore
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.errors import PiezoIdentError
-from piezo_ident.join import join, Stream
+from piezo_ident.join import join
 from piezo_ident.model import EffectSetting
 from piezo_ident.model_io import model_from_dict, parse_yaml
 from piezo_ident.program import parse_program
@@ -43,6 +43,7 @@ from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.record_io import read_record, write_record
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import stage_from_dict
+from piezo_ident.stream import Stream
 from piezo_ident.wire_format import decode, Dimension, encode, Samples
 
 __all__ = ['TARGETS', 'attempt', 'example', 'seeds']
