@@ -27,6 +27,8 @@ __all__ = ['line_error', 'misspelt', 'suspicions']
 
 #: samples in a row with one and the same displacement that are no chance
 STUCK = 50
+#: samples looked at together, so that temporaries stay small beside a long record
+_CHUNK = 1 << 20
 #: share of its range by which the voltage moves meanwhile
 MOVED = 0.01
 
@@ -39,13 +41,19 @@ def line_error(pieces: Iterable[Piece]) -> float:
     ----------
     pieces : iterable of Piece
     """
-    pieces = list(pieces)
-    v, y = (np.concatenate([getattr(p, name) for p in pieces]) for name in ('v', 'y'))
-    dv, dy = v - v.mean(), y - y.mean()
-    power = float(dv @ dv)
-    slope = float(dv @ dy) / power if power > 0.0 else 0.0
-    stroke = float(np.ptp(y))
-    return 100.0 * float(np.sqrt(np.mean((dy - slope * dv) ** 2))) / stroke if stroke else 0.0
+    parts = [
+        (p.v[i : i + _CHUNK], p.y[i : i + _CHUNK]) for p in pieces for i in range(0, p.n, _CHUNK)
+    ]
+    n = sum(y.size for _, y in parts)
+    stroke = max(float(y.max()) for _, y in parts) - min(float(y.min()) for _, y in parts)
+    if stroke == 0.0:
+        return 0.0
+    middle_v, middle_y = (sum(float(part[k].sum()) for part in parts) / n for k in (0, 1))
+    power = sum(float(np.sum((v - middle_v) ** 2)) for v, _ in parts)
+    cross = sum(float((v - middle_v) @ (y - middle_y)) for v, y in parts)
+    slope = cross / power if power > 0.0 else 0.0
+    square = sum(float(np.sum((y - middle_y - slope * (v - middle_v)) ** 2)) for v, y in parts)
+    return 100.0 * float(np.sqrt(square / n)) / stroke
 
 
 def misspelt(labels: Sequence[str]) -> list[str]:

@@ -84,11 +84,17 @@ class OutputErrorFit:
     improved: bool
 
 
-def _past(x: NDArray[np.float64], use: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
+def _past(
+    x: NDArray[np.float64], use: NDArray[np.bool_], count: int, sign: float = 1.0
+) -> NDArray[np.float64]:
     # before the record the stage was at rest; a constant has no part in what is eliminated with
     # the offsets, and without it the sums lose no digits
     level = float(x[use].mean())
-    return np.concatenate([np.full(count, x[0] - level), x - level])
+    past = np.empty(count + x.size)
+    past[:count] = x[0] - level
+    np.subtract(x, level, out=past[count:])
+    past *= sign
+    return past
 
 
 class _Problem:
@@ -103,9 +109,13 @@ class _Problem:
     def loss(self, model: Dynamics) -> tuple[float, NDArray[np.float64]]:
         total, offsets = 0.0, []
         for s in self.stretches:
-            e = (s.y - filter_arx(model.a, model.b, s.w))[s.use]
+            e = filter_arx(model.a, model.b, s.w)
+            np.subtract(s.y, e, out=e)
+            e = e[s.use]
             offsets.append(float(e.mean()))
-            total += float(np.sum((e - offsets[-1]) ** 2))
+            e -= offsets[-1]
+            np.square(e, out=e)
+            total += float(np.sum(e))
         return total / self.n, np.array(offsets)
 
     def normal(self, model: Dynamics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -113,13 +123,16 @@ class _Problem:
         H, g = np.zeros((p, p)), np.zeros(p)
         one = np.ones(1)
         for s, stretches in zip(self.stretches, self.used, strict=True):
-            y_sim = filter_arx(model.a, model.b, s.w)
-            w_f, y_f = filter_arx(model.a, one, s.w), filter_arx(model.a, one, y_sim)
-            e = s.y - y_sim
-            e -= e[s.use].mean()
+            e = filter_arx(model.a, model.b, s.w)
             # what is y(k-1), y(k-2), ... and w(k), w(k-1), ... to the products
-            groups = [(-_past(y_f, s.use, p), p - 1, slice(0, na), na)] if na else []
-            groups.append((_past(w_f, s.use, p), p, slice(na, p), p - na))
+            groups = []
+            if na:
+                y_f = _past(filter_arx(model.a, one, e), s.use, p, -1.0)
+                groups.append((y_f, p - 1, slice(0, na), na))
+            w_f = _past(filter_arx(model.a, one, s.w), s.use, p)
+            groups.append((w_f, p, slice(na, p), p - na))
+            np.subtract(s.y, e, out=e)
+            e -= e[s.use].mean()
             sums, n = np.zeros(p), 0
             for start, stop in stretches:
                 n += stop - start

@@ -261,12 +261,15 @@ def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
     """
     found: list[tuple[float, int]] = []
     for piece in pieces:
-        moves = np.flatnonzero(np.diff(piece.v) != 0.0) + 1
-        edges = np.concatenate([[0], moves, [piece.n]])
-        middles = (edges[:-1] + edges[1:]) // 2
-        long = np.flatnonzero(edges[1:] - middles >= max(100, 0.025 * piece.sample_rate))
-        for i in long:
-            y = piece.y[middles[i] : edges[i + 1]]
+        moves = np.concatenate([[True], piece.v[1:] != piece.v[:-1], [True]])
+        # a stretch begins with the last sample that moves, and ends before the next one that does
+        begins = np.flatnonzero(moves[:-1] & ~moves[1:])
+        ends = np.flatnonzero(~moves[:-1] & moves[1:]) + 1
+        for begin, end in zip(begins, ends, strict=True):
+            middle = (begin + end) // 2
+            if end - middle < max(100, 0.025 * piece.sample_rate):
+                continue
+            y = piece.y[middle:end]
             k = np.arange(y.size)
             rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
             found.append((float(rest @ rest) / (y.size - 2), y.size))

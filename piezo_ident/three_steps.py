@@ -281,10 +281,11 @@ def second_step(
     d = delay.samples
     run, start, stop = _longest_noise(runs)
     progress('dynamics', 0.0)
-    raw = _noise(run, run.u, start, stop)
     # only good enough to undo the hysteresis
+    raw = _noise(run, run.u, start, stop)
     [(_, first)] = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
-    rate = run.piece.sample_rate
+    rate, band = run.piece.sample_rate, raw.band
+    del raw  # of an hour's record it is a gigabyte
     G = first.without_slow_poles(SLOWEST, rate).normalised()
 
     excerpts = triangle_excerpts(runs)
@@ -302,37 +303,26 @@ def second_step(
     found = _orders(
         undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.2 * share)
     )
-    # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
-    stretches = _stretches(runs, H, delay)
-    held = _stretches(runs, H, delay, held=True)
-    best, result = float('inf'), found[0][0]
-    for i, (candidate, start_G) in enumerate(found):
-        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
-        fast = start_G.without_slow_poles(SLOWEST, rate).normalised()
-        fit = output_error(stretches, fast, maxiter=6, tick=tick)
-        score = simulation_error(held, fit.dynamics)
-        # a larger model comes later, and must earn its size
-        if score < best / (1.0 + GAIN):
-            best, result = score, candidate
-            G = fit.dynamics.without_slow_poles(SLOWEST, rate).normalised()
-        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
+    del undone
+    result, G = _best_in_free_run(found, runs, H, delay, progress)
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
-    fit = output_error(_stretches(runs, H, delay), G, maxiter=8, tick=tick)
+    fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
     G, gain = fit.dynamics.normalised(), fit.dynamics.gain
     scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
     covariance = fit.covariance * np.outer(scale, scale)
     progress('dynamics', 0.95)
     # the same regression on the measured and on the modelled answer: the plays that the noise
     # drags along count in both
-    noise = slice(start, stop)
-    g_u = filter_arx(G.a, G.b, delay.apply(run.u))[noise]
-    g_w = filter_arx(G.a, G.b, delay.apply(H(run.u)))[noise]
-    g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[noise]))
+    noise = slice(max(0, start - WARM_UP), stop)
+    g_u, g_w = (
+        filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :] for z in (run.u, H(run.u))
+    )
+    g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[start:stop]))
     slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
     bias = float(run.u[start:stop].mean())
     response = frequency_response(
-        run.u[start:stop], run.x[start:stop], run.piece.sample_rate, raw.band
+        run.u[start:stop], run.x[start:stop], run.piece.sample_rate, band
     )
     progress('dynamics', 1.0)
     return (
@@ -345,19 +335,47 @@ def second_step(
             bias=bias,
             slope_measured=slope_measured,
             slope_model=slope_model,
-            band=raw.band,
+            band=band,
         ),
         G,
     )
 
 
+def _best_in_free_run(
+    found: Sequence[tuple[DynamicsResult, Dynamics]],
+    runs: Sequence[Run],
+    H: Hysteresis,
+    delay: Delay,
+    progress: Progress,
+) -> tuple[DynamicsResult, Dynamics]:
+    """Refine each G by its free run, and return the best on what was held out."""
+    # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
+    stretches, held = _stretches(runs, H, delay)
+    rate = runs[0].piece.sample_rate
+    best, (result, G) = float('inf'), found[0]
+    G = G.without_slow_poles(SLOWEST, rate).normalised()
+    for i, (candidate, start) in enumerate(found):
+        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
+        fast = start.without_slow_poles(SLOWEST, rate).normalised()
+        fit = output_error(stretches, fast, maxiter=6, tick=tick)
+        score = simulation_error(held, fit.dynamics)
+        # a larger model comes later, and must earn its size
+        if score < best / (1.0 + GAIN):
+            best, result = score, candidate
+            G = fit.dynamics.without_slow_poles(SLOWEST, rate).normalised()
+        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
+    return result, G
+
+
 def _stretches(
-    runs: Sequence[Run], H: Hysteresis, delay: Delay, held: bool = False
-) -> list[Stretch]:
-    stretches = []
+    runs: Sequence[Run], H: Hysteresis, delay: Delay
+) -> tuple[list[Stretch], list[Stretch]]:
+    """Return what G is refined on, and the same with only what was held out."""
+    fitted: list[Stretch] = []
+    held: list[Stretch] = []
     for run in runs:
         out = run.held_out()
-        use = run.mask('step', 'settle', 'noise') & run.sound & (out if held else ~out)
+        use = run.mask('step', 'settle', 'noise') & run.sound
         if use.any():
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]
@@ -366,5 +384,7 @@ def _stretches(
             # both sides pass the same filter, so G is still what leads from one to the other
             sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
             w, y = signal.sosfilt(sos, w - w[0]), signal.sosfilt(sos, y - y[:20].mean())
-            stretches.append(Stretch(w, y, use[part]))
-    return stretches
+            for stretches, mask in ((fitted, use & ~out), (held, use & out)):
+                if mask.any():
+                    stretches.append(Stretch(w, y, mask[part]))
+    return fitted, held
