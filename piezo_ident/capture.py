@@ -32,12 +32,20 @@ from numpy.typing import NDArray
 from piezo_ident.errors import DataError
 from piezo_ident.join import join
 from piezo_ident.ordering import at_times
+from piezo_ident.overall import Overall
 from piezo_ident.record import Fault, Record
 from piezo_ident.sampling import assemble
 from piezo_ident.stream import Stream
 from piezo_ident.wire_format import Samples
 
-__all__ = ['APPLIED', 'Capture', 'Snapshot', 'record_of_streams', 'refuse_incomplete']
+__all__ = [
+    'APPLIED',
+    'Capture',
+    'Snapshot',
+    'record_of_streams',
+    'refuse_incomplete',
+    'tolerance_of',
+]
 
 #: key of what the amplifier got, which carries the quantity voltage
 APPLIED = 'applied_voltage'
@@ -62,6 +70,7 @@ def record_of_streams(
     voltage_limits: tuple[float, float] | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
+    overall: Overall | None = None,
 ) -> Record:
     """
     Make a record of streams of blocks.
@@ -77,7 +86,7 @@ def record_of_streams(
     tolerance : float, optional
         Difference of command and applied voltage that counts as none [V]; a thousandth of the
         range when absent.
-    displacement_unit, voltage_limits, sample_rate, faults
+    displacement_unit, voltage_limits, sample_rate, faults, overall
         As for `piezo_ident.sampling.assemble`.
 
     Raises
@@ -98,6 +107,8 @@ def record_of_streams(
     )
     if APPLIED in columns and np.array_equal(columns['voltage'], columns[APPLIED]):
         del columns[APPLIED]
+    if overall is not None:
+        overall.see_command(columns['voltage'], APPLIED in columns)
     if APPLIED in columns:
         v, applied = columns['voltage'], columns.pop(APPLIED)
         wrong = _guarded(v, applied, tolerance)
@@ -130,17 +141,23 @@ def record_of_streams(
         voltage_limits=voltage_limits,
         sample_rate=sample_rate,
         faults=met,
+        overall=overall,
     )
+
+
+def tolerance_of(v: NDArray[np.float64]) -> float:
+    """Return the difference of command and applied voltage that counts as none [V]."""
+    finite = v[np.isfinite(v)]
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    return TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
 
 
 def _guarded(
     v: NDArray[np.float64], applied: NDArray[np.float64], tolerance: float | None
 ) -> NDArray[np.bool_]:
     """Tell where another voltage was applied than commanded."""
-    finite = v[np.isfinite(v)]
     if tolerance is None:
-        span = float(np.ptp(finite)) if finite.size else 0.0
-        tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
+        tolerance = tolerance_of(v)
     return np.asarray(np.abs(v - applied) > tolerance)  # False where either is NaN
 
 

@@ -32,6 +32,7 @@ from piezo_ident.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.errors import DataError
 from piezo_ident.limits import PIECES
 from piezo_ident.ordering import at_times, in_order, Rows
+from piezo_ident.overall import Overall
 from piezo_ident.record import Fault, Piece, Record, Segment
 
 __all__ = ['UNITS', 'SegmentStarts', 'assemble', 'label_runs']
@@ -42,16 +43,8 @@ SegmentStarts = tuple[Sequence[str], ArrayLike]
 #: how many of a displacement unit make a metre
 UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm': 1e6, 'nm': 1e9}
 
-#: strokes of piezo stages [m]; anything else is the wrong unit
-STROKE = (1e-9, 10e-3)
-#: spans of a voltage [V]; the squares of others leave what a float64 can hold
-VOLTAGE = (1e-12, 1e12)
-#: share of a motion that a float64 may lose to an offset
-LOST = 1e-6
-#: share of samples without a number that can be cut out
-MAX_NOT_FINITE = 0.01
-#: later times [s] and higher rates [Hz] are counted in another unit than seconds
-MAX_TIME, MAX_RATE = 1e11, 1e9
+#: higher rates [Hz] are counted in another unit than seconds
+MAX_RATE = 1e9
 #: more pieces than this, with fewer samples than this in each, are no uniform sampling
 MANY = 10
 #: a stretch of fewer samples has no sampling rate
@@ -85,6 +78,7 @@ def assemble(
     voltage_limits: tuple[float, float] | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
+    overall: Overall | None = None,
 ) -> Record:
     """
     Make a record of raw columns.
@@ -110,6 +104,9 @@ def assemble(
         Rate that the file names [Hz]; the stamps must agree with it.
     faults : iterable of Fault
         Already met by the caller.
+    overall : Overall, optional
+        Where the columns are a part of a record: takes note of what the whole will be judged by,
+        voltage limits included, and nothing of that is judged here.
 
     Returns
     -------
@@ -127,12 +124,19 @@ def assemble(
         raise DataError(
             f'{name}: unknown displacement unit {displacement_unit!r}; use m, mm, um or nm'
         )
-    table = _drop_not_finite(table, name, met)
+    judged = Overall(voltage_limits) if overall is None else overall
+    table = _drop_not_finite(table, judged, met)
+    if overall is None:
+        judged.check_finite(name)
+    if not table.t.size:
+        raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
     if UNITS[displacement_unit] != 1.0:
         scaled = table.columns['y'] / UNITS[displacement_unit]
         table = replace(table, columns={**table.columns, 'y': scaled})
-    _check_ranges(table, name, displacement_unit, voltage_limits)
+    judged.see(table.t, table.columns['v'], table.columns['y'])
+    if overall is None:
+        judged.check_ranges(name, displacement_unit)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
 
@@ -177,60 +181,20 @@ def _table(
     return Rows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
 
 
-def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
+def _drop_not_finite(table: Rows, judged: Overall, met: list[Fault]) -> Rows:
     finite = np.isfinite(table.t)
     for x in table.columns.values():
         finite &= np.isfinite(x)
     bad = finite.size - int(np.count_nonzero(finite))
+    judged.rows += finite.size
+    judged.bad += bad
     if not bad:
         return table
-    if bad > MAX_NOT_FINITE * finite.size:
-        raise DataError(
-            f'{name}: {bad} of {finite.size} samples are NaN or infinite, more than 1 %; '
-            'cut the bad stretch out of the file'
-        )
     rows = np.flatnonzero(finite)
     where = at_times(table.t[~finite][np.isfinite(table.t[~finite])])
     met.append(Fault('not_finite', where, bad, 'cut out, record split there'))
     torn = np.flatnonzero(np.diff(rows) > 1) + 1
     return replace(table.take(rows), torn=torn)
-
-
-def _check_ranges(table: Rows, name: str, unit: str, limits: tuple[float, float] | None) -> None:
-    v, y = table.columns['v'], table.columns['y']
-    latest = _largest(table.t)
-    if latest > MAX_TIME:
-        raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
-    if limits is not None and (v.min() < limits[0] or v.max() > limits[1]):
-        outside = np.flatnonzero((v < limits[0]) | (v > limits[1]))
-        worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (limits[0] + limits[1])))]
-        raise DataError(
-            f'{name}: {outside.size} samples leave the voltage limits {limits[0]:g}..'
-            f'{limits[1]:g} V, worst {v[worst]:g} V at {table.t[worst]:.6g} s; '
-            'check the limits or the unit of v'
-        )
-    stroke, span = float(y.max() - y.min()), float(v.max() - v.min())
-    idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
-    if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
-        raise DataError(f'{name}: v spans {span:.3g} V, which is no voltage; write v in volts')
-    if stroke == 0.0 and not idle:
-        raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
-    if stroke > STROKE[1] or (stroke < STROKE[0] and not idle):
-        raise DataError(
-            f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
-            '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
-        )
-    for key, x, moved in (('v', v, span), ('y', y, stroke)):
-        offset = _largest(x)
-        if moved and offset * np.finfo(np.float64).eps > LOST * moved:
-            raise DataError(
-                f'{name}: {key} lies at {offset:.3g} and moves by {moved:.3g}: its digits are '
-                'used up by the offset; subtract it where the numbers are made'
-            )
-
-
-def _largest(x: NDArray[np.float64]) -> float:
-    return max(float(x.max()), -float(x.min()))
 
 
 def _pieces(

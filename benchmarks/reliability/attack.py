@@ -60,6 +60,8 @@ CALLED = (
     'recorder/stop',
     'player/start',
 )
+#: how long an answer may take on a machine that has much to do [s]
+ANSWERED = 60.0
 
 
 def odd_messages(large: int = 5_000_000) -> Iterator[tuple[str, Any]]:
@@ -329,16 +331,12 @@ class Attack:
         """Ask for parameters as they are; None when the node does not answer such a request."""
         kind = self._atomically if at_once else self._set
         name = 'set_parameters_atomically' if at_once else 'set_parameters'
-        client = self.g._clients.setdefault(f'{node}/{name}', None) or self.g.node.create_client(
-            kind, f'/{node}/{name}'
-        )
-        self.g._clients[f'{node}/{name}'] = client
-        self.g.wait(client.service_is_ready, name)
+        client = self.g.client(kind, f'{node}/{name}')
         future = client.call_async(kind.Request(parameters=parameters))
-        deadline = time.monotonic() + 3.0
         # a type that does not exist ends the callback: it is said on the log, and not answered
-        patience = 0.3 if any(p.value.type > 9 for p in parameters) else 10.0
-        while not future.done() and time.monotonic() < deadline - 3.0 + patience:
+        patience = 0.3 if any(p.value.type > 9 for p in parameters) else ANSWERED
+        deadline = time.monotonic() + patience
+        while not future.done() and time.monotonic() < deadline:
             time.sleep(0.005)
         return future.result() if future.done() else None
 
@@ -373,14 +371,24 @@ class Attack:
         """Call services as fast as so many processes can; return calls answered a second."""
         command = [sys.executable, str(HERE), '--client', str(seconds)]
         running = [
-            subprocess.Popen(command, stdout=subprocess.PIPE, env=self.g.environment, text=True)
+            subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=self.g.environment,
+                text=True,
+            )
             for _ in range(clients)
         ]
         try:
-            counts = [int(p.communicate(timeout=seconds + 60.0)[0]) for p in running]
+            said = [p.communicate(timeout=seconds + 2 * ANSWERED) for p in running]
         finally:
             for process in running:
                 process.kill()
+                process.wait()
+        failed = [error for (_, error), p in zip(said, running, strict=True) if p.returncode]
+        assert not failed, f'a client ended under service calls: {failed[0][-2000:]}'
+        counts = [int(out) for out, _ in said]
         self._count('service calls', sum(counts))
         self.survived('service calls')
         return sum(counts) / seconds
@@ -396,12 +404,12 @@ def client(seconds: float) -> int:
     count = 0
     with Client(f'attacker_{os.getpid()}') as c:
         for service in CALLED:
-            c.call(service, 30.0)
+            c.call(service, ANSWERED)
         end = time.monotonic() + seconds
         for service in itertools.cycle(CALLED):
             if time.monotonic() > end:
                 break
-            c.call(service, 30.0)
+            c.call(service, ANSWERED)
             count += 1
     print(count)
     return 0

@@ -36,7 +36,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.parameters import Declaration, NODES
-from piezo_ident.nodes.wire import LATCHED, PREVIEW
+from piezo_ident.nodes.wire import LATCHED, PREVIEW, QUESTIONS
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -226,7 +226,7 @@ class LabNode(Node):
                 response.message, response.success = str(error), False
             return response
 
-        self.create_service(Trigger, f'~/{name}', answer)
+        self.create_service(Trigger, f'~/{name}', answer, qos_profile=QUESTIONS)
 
     def await_listeners(self) -> None:
         """Wait a moment until the last status was heard."""

@@ -24,7 +24,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.errors import PiezoIdentError
-from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.nodes.wire import LATCHED, QUESTIONS, STREAM
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
 import rclpy
@@ -36,6 +36,9 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 __all__ = ['Client']
+
+#: after how long without an answer what may be asked twice is asked again [s]
+AGAIN = 3.0
 
 
 class Client:
@@ -84,12 +87,14 @@ class Client:
         """
         Call a Trigger service and return its answer.
 
+        It is asked once: a second start would be refused, or begin a replay once more.
+
         Raises
         ------
         PiezoIdentError
             When nobody answers in time.
         """
-        response = self._ask(Trigger, service, Trigger.Request(), timeout)
+        response = self._ask(Trigger, service, Trigger.Request(), timeout, timeout)
         return bool(response.success), str(response.message)
 
     def set(self, node: str, name: str, value: Any, timeout: float = 10.0) -> tuple[bool, str]:
@@ -103,22 +108,33 @@ class Client:
         """
         parameter: Parameter = PythonParameter(name, value=value).to_parameter_msg()
         request = SetParameters.Request(parameters=[parameter])
-        result = self._ask(SetParameters, f'{node}/set_parameters', request, timeout).results[0]
+        # a value that is set twice is the same
+        answer = self._ask(SetParameters, f'{node}/set_parameters', request, timeout, AGAIN)
+        result = answer.results[0]
         return bool(result.successful), str(result.reason)
 
-    def _ask(self, kind: Any, service: str, request: Any, timeout: float) -> Any:
+    def _ask(self, kind: Any, service: str, request: Any, timeout: float, again: float) -> Any:
+        """Return the first answer to a question that is asked every so many seconds."""
         if service not in self._clients:
-            self._clients[service] = self.node.create_client(kind, service)
+            self._clients[service] = self.node.create_client(kind, service, qos_profile=QUESTIONS)
         client = self._clients[service]
         deadline = time.monotonic() + timeout
         if not client.wait_for_service(timeout_sec=timeout):
             raise PiezoIdentError(f'{service}: no such service within {timeout:g} s')
-        done = threading.Event()
-        future = client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(max(0.0, deadline - time.monotonic())):
+        done, futures = threading.Event(), []
+        while True:
+            futures.append(client.call_async(request))
+            futures[-1].add_done_callback(lambda _: done.set())
+            if done.wait(min(again, max(0.0, deadline - time.monotonic()))):
+                break
+            if time.monotonic() >= deadline:
+                break
+        answered = [f for f in futures if f.done()]
+        for future in futures:
+            client.remove_pending_request(future)
+        if not answered:
             raise PiezoIdentError(f'{service}: no answer within {timeout:g} s')
-        return future.result()
+        return answered[0].result()
 
     def follow(self, node: str) -> None:
         """Follow the status of a node."""

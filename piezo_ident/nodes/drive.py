@@ -23,7 +23,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from piezo_ident.nodes.wire import LATCHED
+from piezo_ident.nodes.wire import LATCHED, QUESTIONS
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -74,9 +74,14 @@ class Drive:
         self._streams, self._missing = streams, missing
         self._begin: Callable[[], None] = _nothing
         self._ended: Callable[[str | None], None] = _nothing
-        self._set = node.create_client(SetParameters, 'excitation/set_parameters')
-        self._start = node.create_client(Trigger, 'excitation/start')
-        self._stop = node.create_client(Trigger, 'excitation/stop')
+        self._set, self._start, self._stop = (
+            node.create_client(kind, f'excitation/{name}', qos_profile=QUESTIONS)
+            for kind, name in (
+                (SetParameters, 'set_parameters'),
+                (Trigger, 'start'),
+                (Trigger, 'stop'),
+            )
+        )
         node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
         self._phase = ''
         self._future: Any = None

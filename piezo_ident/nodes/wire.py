@@ -23,7 +23,7 @@ from piezo_ident.wire_format import decode, encode, Samples
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
-__all__ = ['LATCHED', 'PREVIEW', 'STREAM', 'from_message', 'to_message']
+__all__ = ['LATCHED', 'PREVIEW', 'QUESTIONS', 'STREAM', 'from_message', 'to_message']
 
 #: most samples of a block, and characters of a label; a label is said again in answers and status
 MOST, LONGEST = 100_000, 200
@@ -44,6 +44,14 @@ LATCHED = QoSProfile(
 )
 #: what people look at, and diagnostics
 PREVIEW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
+#: services: whoever asks gets the answers to all who ask, and of the usual ten the eleventh pushes
+#: out his own where he is slow to take it
+QUESTIONS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
 
 
 def to_message(samples: Samples) -> Float64MultiArray:
