@@ -47,10 +47,12 @@ bench: .venv-bench/.bench
 	.venv-bench/bin/python benchmarks/run_all.py \
 		$(if $(QUICK),--quick --out build/benchmarks.md,--out docs/benchmarks.md)
 
-# the running graph in real time, 20 kHz for so many seconds, and faster
+# the running graph in real time, 20 kHz for so many seconds, and faster; then blocks of all sizes,
+# nodes in one process, and how many stages this machine carries: about a quarter of an hour
 BENCH_SECONDS ?= 300
 bench-live: .venv/.demo
 	.venv/bin/python benchmarks/bench_live.py --seconds $(BENCH_SECONDS) --out docs/live.md
+	.venv/bin/python benchmarks/bench_stages.py --out docs/live_stages.md
 
 # twenty seeds, three noise levels, stages on and off the grid: about five minutes
 study-identification: .venv/.demo

@@ -24,27 +24,30 @@ A bag whose recorder was killed is refused, or read as far as it goes when that 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-import functools
 from pathlib import Path
 from typing import Any
 
-from piezo_ident.bag_check import rate_of
-from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag
-from piezo_ident.capture import APPLIED, record_of_streams
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.bag_samples import (
+    carried_quantities,
+    MESSAGE_TYPE,
+    opened_samples,
+    typestore,
+)
+from piezo_ident.capture import record_of_streams
 from piezo_ident.errors import DataError
+from piezo_ident.long_record import LongRecord, Outline, parts_of, Progress
 from piezo_ident.output import temporary_output
-from piezo_ident.record import Record
+from piezo_ident.record import Piece, Record
 from piezo_ident.stream import Stream
 from piezo_ident.wire_format import (
     BLOCK_SIZE,
     cut_blocks,
-    decode,
     encode,
-    quantity_of,
     Samples,
 )
 from rosbags.interfaces import (
-    Connection,
     Qos,
     QosDurability,
     QosHistory,
@@ -53,8 +56,6 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
-from rosbags.typesys.store import Typestore
 
 __all__ = [
     'MESSAGE_TYPE',
@@ -64,8 +65,6 @@ __all__ = [
     'typestore',
     'write_bag',
 ]
-
-MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
 
 _FOREVER = QosTime(9223372036, 854775807)
 #: reliable, volatile, keep last 100: the contract of every topic that carries samples
@@ -80,12 +79,6 @@ SAMPLE_QOS = Qos(
     liveliness_lease_duration=_FOREVER,
     avoid_ros_namespace_conventions=False,
 )
-
-
-@functools.cache
-def typestore() -> Typestore:
-    """Return the message types of Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def read_bag(
@@ -125,142 +118,35 @@ def read_bag(
         carries the voltage or the displacement, and for all that `assemble` refuses.
     """
     path = Path(path)
-    asked = {'voltage': voltage_topic, 'displacement': displacement_topic}
-    with opened_bag(path) as bag:
-        if bag.faults and not recover:
-            raise DataError(
-                f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
-                f"'piezo_ident convert {path} OUT' saves what is whole of it"
-            )
-        carried = carried_quantities(bag)
-        topics = _choose(carried, asked, namespace, path)
-        streams = _collect(bag, topics, path)
-        faults = bag.faults
+    with opened_samples(
+        path,
+        namespace=namespace,
+        voltage_topic=voltage_topic,
+        displacement_topic=displacement_topic,
+        recover=recover,
+    ) as source:
+        streams = {quantity: Stream() for quantity in source.topics}
+        for quantity, samples, stamp in source.blocks():
+            streams[quantity].append(samples, stamp)
     return record_of_streams(
         streams,
         name=str(path),
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
-        sample_rate=rate_of(path) if path.is_dir() else rate_of(path.parent, path.name),
-        faults=faults,
+        sample_rate=source.sample_rate,
+        faults=source.faults,
     ).renamed(path.name)
 
 
-def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
-    for connection, stamp, raw in bag.messages(connections):
-        with damage_as_data_error(bag.path):
-            message = typestore().deserialize_cdr(raw, connection.msgtype)
-        yield connection.topic, stamp, message
-
-
-def carried_quantities(bag: Bag) -> dict[str, str]:
-    """
-    Return what each topic carries, as its first message says.
-
-    Raises
-    ------
-    DataError
-        When no topic carries samples.
-    """
-    found = {}
-    for connection in bag.connections:
-        if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
-            continue
-        for topic, _, message in _messages(bag, [connection]):
-            base = topic.rpartition('/')[2]
-            # a damaged layout must not hide a topic that is ours by name
-            ours = base if base in ('voltage', 'displacement') else None
-            quantity = quantity_of(message.layout.dim) or ours
-            if quantity:
-                found[topic] = quantity
-            break
-    if not found:
-        topics = ', '.join(sorted({c.topic for c in bag.connections})) or 'none'
-        raise DataError(
-            f"{bag.path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
-            f"(topics: {topics}); record the stage's voltage and displacement"
-        )
-    return found
-
-
-def _choose(
-    carried: Mapping[str, str],
-    asked: Mapping[str, str | None],
-    namespace: str | None,
-    path: Path,
-) -> dict[str, str]:
-    """Return the topic of each quantity, and of the applied voltage where it is there."""
-    prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
-    chosen = {}
-    for quantity, wish in asked.items():
-        if wish is not None:
-            topic = f'/{wish.lstrip("/")}'
-            if topic not in carried:
-                raise DataError(
-                    f'{path}: no samples on topic {topic}; topics with samples: '
-                    + ', '.join(sorted(carried))
-                )
-            chosen[quantity] = topic
-            continue
-        there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
-        # applied_voltage and prediction carry the same quantity under another name
-        commanded = [t for t in there if t.rpartition('/')[2] != APPLIED] or there
-        named = [t for t in commanded if t.rpartition('/')[2] == quantity]
-        fit = named if len(commanded) > 1 and named else commanded
-        if not fit:
-            raise DataError(
-                f"{path}: no topic carries 't,{quantity}'"
-                f'{"" if namespace is None else f" below {prefix}"}; topics with samples: '
-                + ', '.join(sorted(carried))
-            )
-        if len(fit) > 1:
-            raise DataError(
-                f'{path}: several topics carry {quantity}: {", ".join(sorted(fit))}; '
-                'name the stage with a namespace, or the topics'
-            )
-        chosen[quantity] = fit[0]
-    home = chosen['voltage'].rpartition('/')[0] + '/'
-    applied = f'{home}{APPLIED}'
-    if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
-        chosen[APPLIED] = applied
-    for topic, quantity in sorted(carried.items(), key=lambda item: item[::-1]):
-        if quantity.startswith('x_') and topic.startswith(home):
-            if quantity in chosen:
-                raise DataError(
-                    f'{path}: {chosen[quantity]} and {topic} both carry {quantity}; '
-                    'record only one of them'
-                )
-            chosen[quantity] = topic
-    return chosen
-
-
-def _collect(bag: Bag, topics: Mapping[str, str], path: Path) -> dict[str, Stream]:
-    streams = {quantity: Stream() for quantity in topics}
-    by_topic = {topic: streams[quantity] for quantity, topic in topics.items()}
-    index = dict.fromkeys(by_topic, 0)
-    wanted = [c for c in bag.connections if c.topic in by_topic and c.msgtype == MESSAGE_TYPE]
-    for topic, stamp, message in _messages(bag, wanted):
-        layout = message.layout
-        try:
-            samples = decode(message.data, layout.dim, layout.data_offset)
-        except DataError as error:
-            raise DataError(
-                f'{path}: topic {topic}, message {index[topic]}: {error}; record it again with '
-                'a publisher that keeps to the layout'
-            ) from None
-        by_topic[topic].append(samples, stamp)
-        index[topic] += 1
-    return streams
-
-
 def write_bag(
-    record: Record,
+    record: Record | LongRecord,
     path: str | Path,
     *,
     storage: str | None = None,
     overwrite: bool = False,
     custom_data: Mapping[str, str] | None = None,
     block_size: int = BLOCK_SIZE,
+    progress: Progress = lambda step, share: None,
 ) -> None:
     """
     Write a record as a rosbag2 folder, or as a single file when `path` ends so.
@@ -271,7 +157,7 @@ def write_bag(
 
     Parameters
     ----------
-    record : Record
+    record : Record or LongRecord
         What to write.
     path : path
         The folder, or a file name that ends in .mcap or .db3.
@@ -283,6 +169,8 @@ def write_bag(
         For the bag's metadata beside ``sample_rate``: seed, programme.
     block_size : int
         Samples a block.
+    progress : callable, optional
+        Called as ``progress(step, share)`` while a long record is read.
 
     Raises
     ------
@@ -307,29 +195,46 @@ def write_bag(
         with Writer(folder, version=9, storage_plugin=plugin) as writer:
             for key, value in custom.items():
                 writer.set_custom_data(key, value)
-            _write_pieces(writer, record, block_size)
+            _write_pieces(writer, record, block_size, progress)
         if suffix:
             next(f for f in folder.iterdir() if f.suffix == path.suffix.lower()).replace(target)
 
 
-def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
+def _write_pieces(
+    writer: Writer, record: Record | LongRecord, block_size: int, progress: Progress
+) -> None:
     quantities = ['voltage', 'displacement']
     quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
     senders = {q: _sender(writer, q) for q in quantities}
     shift, latest = 0, 0.0
-    for piece in record:
-        t = piece.t
+    for piece, parts in parts_of(record, progress):
+        first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
         # later by whole seconds, until nothing is before what was written already
-        while t[0] + shift < latest:
-            shift += 1 + int(latest - t[0] - shift)
-        latest = float(t[-1]) + shift
-        columns = {'voltage': piece.v, 'displacement': piece.y}
-        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
-        for start, stop, label in cut_blocks(piece.n, piece.segments, block_size):
-            stamp = round(t[start] * 1e9) + shift * 1_000_000_000
+        while first + shift < latest:
+            shift += 1 + int(latest - first - shift)
+        latest = last + shift
+        for start, stop, label, columns in _cut_parts(piece, parts, block_size):
+            t = piece.time(start, stop)
+            stamp = round(t[0] * 1e9) + shift * 1_000_000_000
             for quantity, x in columns.items():
-                samples = Samples(t[start:stop], x[start:stop], label, quantity)
-                senders[quantity](samples, stamp)
+                senders[quantity](Samples(t, x, label, quantity), stamp)
+
+
+def _cut_parts(
+    piece: Piece | Outline, parts: Iterator[Piece], size: int
+) -> Iterator[tuple[int, int, str, dict[str, NDArray[np.float64]]]]:
+    """Yield the blocks of a piece, whatever parts it comes in."""
+    held: dict[str, NDArray[np.float64]] = {}
+    at = end = 0  # samples that are held
+    for start, stop, label in cut_blocks(piece.n, piece.segments, size):
+        while stop > end:
+            more = next(parts)
+            new = {'voltage': more.v, 'displacement': more.y}
+            new |= {f'x_{name}': x for name, x in more.channels.items()}
+            if start < end:
+                new = {q: np.concatenate([held[q][start - at :], x]) for q, x in new.items()}
+            held, at, end = new, start, end + more.n
+        yield start, stop, label, {q: x[start - at : stop - at] for q, x in held.items()}
 
 
 def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:

@@ -50,7 +50,7 @@ class Extent:
     low: float = float('inf')
     high: float = -float('inf')
 
-    def with_(self, x: Vector) -> Extent:
+    def including(self, x: Vector) -> Extent:
         """Return the extent with more numbers, NaN left out."""
         if not x.size:
             return self
@@ -100,12 +100,12 @@ class Overall:
 
     def see_command(self, v: Vector, is_guarded: bool) -> None:
         """Take note of commanded voltages [V], and whether others were applied."""
-        self.command = self.command.with_(v[np.isfinite(v)])
+        self.command = self.command.including(v[np.isfinite(v)])
         self.is_guarded |= is_guarded
 
     def see(self, t: Vector, v: Vector, y: Vector) -> None:
         """Take note of samples with numbers [s, V, m]."""
-        self.t, self.v, self.y = self.t.with_(t), self.v.with_(v), self.y.with_(y)
+        self.t, self.v, self.y = self.t.including(t), self.v.including(v), self.y.including(y)
         if self.limits is None or not v.size:
             return
         low, high = self.limits

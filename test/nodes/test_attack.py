@@ -84,7 +84,7 @@ def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
 def test_any_number_at_any_time_keeps_limits_and_slew(attack, seed):
     before = attack.samples
     attack.blocks(seed, 200)
-    assert attack.samples > before
+    attack.g.wait(lambda: attack.samples > before, 'what is applied')
     at_rest(attack.g)
     attack.is_safe('silence')
     attack.g.wait(lambda: attack.applied[-1][-1] == 0.0, 'rest')
@@ -131,6 +131,9 @@ def test_the_stage_ramps_to_rest_whatever_the_clock_of_ros_does(attack):
     g = attack.g
     at_rest(g)
     assert g.set('stage', 'use_sim_time', True)[0]
+    silence = g.get('stage', 'silence')
+    # the stream is as slow as the machine is busy
+    assert g.set('stage', 'silence', 60.0)[0]
     before = attack.samples
     # whoever publishes on /clock holds the time of everybody who listens to it
     for b in level(5.0, 160):
@@ -138,6 +141,7 @@ def test_the_stage_ramps_to_rest_whatever_the_clock_of_ros_does(attack):
         if round(b.t[0] * 200) % 40 == 39:
             g.wait(lambda b=b: attack.samples >= before + round(b.t[-1] * 20_000), 'the stage')
     assert max(v.max() for v in attack.applied) > 4.9
+    assert g.set('stage', 'silence', silence)[0]
     at_rest(g)
     g.wait(lambda: attack.applied[-1][-1] == 0.0, 'rest')
     attack.survived('a clock that stands still')

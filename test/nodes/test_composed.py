@@ -70,9 +70,12 @@ def test_stage_model_and_identifier_in_one_process():
             assert model_of(models[-1]).delay.samples == 3
             g.wait(lambda: g.status('lab/model')['state'] == 'predicting', 'a prediction')
             before = len(predictions)
-            g.publish('lab/voltage', block(10**7, np.full(100, 0.0), 'hold'))
+            g.publish('lab/voltage', block(10**7, np.full(100, 0.0), 'hold'), subscribers=3)
             g.wait(lambda: len(predictions) > before, 'the prediction of a block')
             assert answers
         finally:
             process.send_signal(signal.SIGINT)
-            assert process.wait(10.0) == 0
+            try:
+                assert process.wait(60.0) == 0
+            finally:
+                process.kill()

@@ -25,12 +25,15 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph, Handle
+from piezo_ident.program import parse_program
 from piezo_ident.wire_format import Samples
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / 'examples/daq_driver.py'
 FS = 20_000.0
-SILENCE, RAMP = 1.0, 20.0
+#: longer than a busy machine keeps a test from its next block
+SILENCE = 5.0
+RAMP = 20.0
 PROGRAM = """
 limits: [0, 10]
 segments:
@@ -69,7 +72,7 @@ def send(g: Graph, volts: list[float]) -> None:
         g.publish('voltage', block(100 * k, v))
         want += 1
         if k % 20 == 19:
-            g.wait(lambda n=want: len(y) == n, 'answers')
+            g.wait(lambda n=want: len(y) >= n, 'answers')
 
 
 def at_rest(g: Graph) -> bool:
@@ -78,19 +81,22 @@ def at_rest(g: Graph) -> bool:
 
 
 def test_a_programme_is_followed_bit_by_bit(lab):
-    lab.start('identifier')
-    lab.start('excitation', {'program': PROGRAM, 'subscribers': 2})
     voltage = lab.collect('voltage')
+    lab.start('identifier')
+    # the third is the one who looks
+    lab.start('excitation', {'program': PROGRAM, 'subscribers': 3})
+    n = parse_program(PROGRAM).build(FS).n
     assert lab.call('excitation/start')[0]
     lab.wait(lambda: lab.status('excitation')['state'] == 'done', 'the programme')
     applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
-    lab.wait(lambda: len(applied) == len(y) == len(voltage), 'all answers')
+    for stream in (voltage, applied, y):
+        lab.wait(lambda s=stream: column(s).size >= n, 'the whole programme')
     assert [b.segment for b in y] == [b.segment for b in voltage]
     assert column(applied).tobytes() == column(voltage).tobytes()
     for back in (applied, y):
         assert column(back, 't').tobytes() == column(voltage, 't').tobytes()
     np.testing.assert_array_equal(column(y), 7.5e-6 * column(voltage))
-    seconds = f'{column(voltage).size / FS:.3f} s'
+    seconds = f'{n / FS:.3f} s'
     lab.wait(
         lambda: lab.status('identifier')['message'].count(seconds) >= 2, 'both streams captured'
     )
@@ -121,7 +127,7 @@ def test_silence_and_what_comes_after_it(lab):
 
 def test_a_second_publisher_is_refused(lab):
     y = lab.collect('displacement')
-    lab.start('excitation', {'program': PROGRAM.replace('0.4', '5.0'), 'subscribers': 1})
+    lab.start('excitation', {'program': PROGRAM.replace('0.4', '120'), 'subscribers': 1})
     assert lab.call('excitation/start')[0]
     lab.wait(lambda: len(y) > 40, 'a stream')
     for k in range(5):
@@ -140,7 +146,7 @@ def test_it_ends_at_rest(lab, number):
     send(lab, [9.0] * 100)
     (driver,) = lab.handles
     driver.send(number)
-    assert driver.process.wait(20.0) == 0 and driver.log == ''
+    assert driver.process.wait(60.0) == 0 and driver.log == ''
     lab.wait(lambda: at_rest(lab), 'rest')
 
 

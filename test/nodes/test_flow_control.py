@@ -79,7 +79,7 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
     with Graph() as g:
         g.collect('captured')
         identifier = g.start('identifier')
-        g.start('player', {'bag': str(bag(tmp_path / 'bag')), 'rate': 100.0, 'wait_limit': 1.0})
+        g.start('player', {'bag': str(bag(tmp_path / 'bag')), 'rate': 100.0, 'wait_limit': 30.0})
         g.matched('captured')
         for round_ in (1, 2):
             _, status = play(g, 'player')
@@ -90,6 +90,7 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
         assert last.quantity == 'captured' and last.segment == 'noise'
         assert last.t[-1] == (100 * N - 1) / FS
         # one that says no more is waited for, but not for ever
+        assert g.set('player', 'wait_limit', 1.0)[0]
         identifier.send(signal.SIGSTOP)
         _, status = play(g, 'player')
         assert status['state'] == 'failed' and 'no captured for 1 s' in status['message']
@@ -97,6 +98,7 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
         identifier.send(signal.SIGCONT)
         # one that has gone is not waited for
         assert identifier.stop() == 0
+        assert g.set('player', 'wait_limit', 30.0)[0]
         assert g.set('player', 'subscribers', 0)[0]
         assert play(g, 'player')[1]['state'] == 'done'
         for value, reason in (
