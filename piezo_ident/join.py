@@ -72,9 +72,9 @@ def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = No
     beside = beside or {}
     first, lead = next(iter(streams.items()))
     t = lead.times
-    laps = _in_step(t, lead, streams, beside)
+    laps = _in_step(t, streams, beside)
     if laps is not None:
-        return _joined_in_step(t, lead, streams, beside, laps)
+        return _joined_in_step(t, streams, beside, laps)
     arrivals = lead.arrivals
     stamps = {name: s.times for name, s in streams.items() if name != first}
     partner = {
@@ -120,115 +120,95 @@ def _labels(
 
 
 @dataclass(frozen=True, eq=False)
-class _Lap:
+class _Laps:
     """
-    A run of the sample clock that all streams went through together.
+    Runs of the sample clock that all streams went through together.
 
     Attributes
     ----------
-    starts : dict of str to int
-        Row of each stream where it begins.
-    sizes : dict of str to int
-        Rows of each stream that belong to it.
-    n : int
-        Rows of it that all streams have; they are its first ones.
+    starts, sizes : dict of str to ndarray of int
+        For each stream the row where each run begins, and its rows.
+    n : ndarray of int
+        Rows of each run that all streams have; they are its first ones.
     """
 
-    starts: dict[str, int]
-    sizes: dict[str, int]
-    n: int
+    starts: dict[str, NDArray[np.int64]]
+    sizes: dict[str, NDArray[np.int64]]
+    n: NDArray[np.int64]
+
+    def cut(self, name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rows that all streams have; NaN where this one lacks some."""
+        if np.array_equal(self.sizes[name], self.n):
+            return values
+        column, ends = np.full(int(self.n.sum()), np.nan), np.cumsum(self.n)
+        have = np.minimum(self.sizes[name], self.n)
+        for to, begin, n in zip(ends - self.n, self.starts[name], have, strict=True):
+            column[to : to + n] = values[begin : begin + n]
+        return column
+
+    def rest(self, name: str) -> NDArray[np.int64]:
+        """Return the rows of a stream that another one has not."""
+        begins, ends = self.starts[name] + self.n, self.starts[name] + self.sizes[name]
+        return np.concatenate([np.arange(a, b) for a, b in zip(begins, ends, strict=True)])
+
+    def place(self, name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many rows before some rows of a stream all streams have."""
+        k = np.searchsorted(self.starts[name], rows, 'right') - 1
+        inside = np.minimum(rows - self.starts[name][k], self.n[k])
+        return np.asarray(np.cumsum(self.n)[k] - self.n[k] + inside)
 
 
 def _in_step(
-    t: NDArray[np.float64],
-    lead: Stream,
-    streams: Mapping[str, Stream],
-    beside: Mapping[str, Stream],
-) -> list[_Lap] | None:
+    t: NDArray[np.float64], streams: Mapping[str, Stream], beside: Mapping[str, Stream]
+) -> _Laps | None:
     """
-    Return the runs of the clock where each stream has the stamps of the lead from its first one.
+    Return the runs of the clock in which each stream has the stamps of the lead from its first on.
 
     That is so wherever nothing was lost: then minutes of samples are joined without a table of
     partners.  None where it is not so.
     """
+    first, lead = next(iter(streams.items()))
     starts: dict[str, NDArray[np.int64]] = {}
-    same: list[NDArray[np.int64]] = []
+    sizes: dict[str, NDArray[np.int64]] = {}
     for name, stream in {**streams, **beside}.items():
         x = t if stream is lead else stream.times
-        starts[name] = begin = np.concatenate([[0], np.flatnonzero(x[1:] <= x[:-1]) + 1])
-        head = next(iter(starts.values()))
-        if not x.size or begin.size != head.size:
+        begin = np.concatenate([[0], np.flatnonzero(x[1:] <= x[:-1]) + 1])
+        starts[name], sizes[name] = begin, np.diff(begin, append=x.size)
+        if not x.size or begin.size != starts[first].size:
             return None
-        one, other = (np.diff(begin, append=x.size), np.diff(head, append=t.size))
-        size = np.minimum(one, other)
-        if not all(
-            np.array_equal(x[a : a + n], t[b : b + n])
-            for a, b, n in zip(begin, head, size, strict=True)
-        ):
-            return None
+        same = np.minimum(sizes[name], sizes[first])
+        for a, b, n in zip(begin, starts[first], same, strict=True):
+            if not np.array_equal(x[a : a + n], t[b : b + n]):
+                return None
         # runs of one clock are told apart by when they came
-        came, came_lead = stream.arrived(begin), lead.arrived(head)
+        came, came_lead = stream.arrived(begin), lead.arrived(starts[first])
         if (came[1:] <= came_lead[:-1]).any() or (came_lead[1:] <= came[:-1]).any():
             return None
-        if name in streams:
-            same.append(size)
-    ends = {name: np.append(x[1:], {**streams, **beside}[name].n) for name, x in starts.items()}
-    return [
-        _Lap(
-            {name: int(x[k]) for name, x in starts.items()},
-            {name: int(ends[name][k] - x[k]) for name, x in starts.items()},
-            int(min(size[k] for size in same)),
-        )
-        for k in range(same[0].size)
-    ]
+    return _Laps(starts, sizes, np.min([sizes[name] for name in streams], axis=0))
 
 
 def _joined_in_step(
     t: NDArray[np.float64],
-    lead: Stream,
     streams: Mapping[str, Stream],
     beside: Mapping[str, Stream],
-    laps: list[_Lap],
+    laps: _Laps,
 ) -> Joined:
     """Join streams by cutting what one of them has at the end of a run and another has not."""
-    first = next(iter(streams))
-    starts = np.array([lap.starts[first] for lap in laps])
-    sizes = np.array([lap.n for lap in laps])
-    ends = np.cumsum(sizes)
-
-    def place(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        k = np.searchsorted(starts, rows, 'right') - 1
-        return np.asarray(ends[k] - sizes[k] + np.minimum(rows - starts[k], sizes[k]))
-
+    first, lead = next(iter(streams.items()))
     faults: list[Fault] = []
     columns = {}
     for name, stream in {**streams, **beside}.items():
         values = stream.values
-        columns[name] = _cut(values, name, laps)
-        left = [
-            np.arange(lap.starts[name] + lap.n, lap.starts[name] + lap.sizes[name]) for lap in laps
-        ]
-        rows = np.concatenate(left)
-        if name in streams and rows.size:
+        columns[name] = laps.cut(name, values)
+        rest = laps.rest(name)
+        if name in streams and rest.size:
             stamps = t if stream is lead else stream.times
-            faults.extend(_left_over(name, stamps[rows], values[rows], rows[:0]))
-    t = _cut(t, first, laps)
+            faults.extend(_left_over(name, stamps[rest], values[rest], rest[:0]))
+    t = laps.cut(first, t)
     for column in (t, *columns.values()):
         # nobody else has them, so that a record need not copy them
         column.setflags(write=False)
-    return Joined(t, columns, _labels(lead, place), tuple(faults))
-
-
-def _cut(values: NDArray[np.float64], name: str, laps: list[_Lap]) -> NDArray[np.float64]:
-    """Return the rows of each run that all streams have; NaN where this one has none."""
-    if all(lap.sizes[name] == lap.n for lap in laps):
-        return values
-    column, at = np.full(sum(lap.n for lap in laps), np.nan), 0
-    for lap in laps:
-        begin, n = lap.starts[name], min(lap.n, lap.sizes[name])
-        column[at : at + n] = values[begin : begin + n]
-        at += lap.n
-    return column
+    return Joined(t, columns, _labels(lead, lambda rows: laps.place(first, rows)), tuple(faults))
 
 
 def _partners(

@@ -58,7 +58,7 @@ def test_it_is_what_the_table_of_partners_gives(lengths, data):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(joining, '_in_step', lambda *_: None)
         slow = join(streams, beside)
-    assert joining._in_step(streams['voltage'].times, streams['voltage'], streams, beside)
+    assert joining._in_step(streams['voltage'].times, streams, beside)
     np.testing.assert_array_equal(quick.t, slow.t)
     assert list(quick.columns) == list(slow.columns)
     for name, column in slow.columns.items():
@@ -72,7 +72,7 @@ def test_what_was_lost_in_the_middle_goes_by_the_table():
     for k in (0, 2):
         rows = np.arange(100 * k, 100 * (k + 1))
         torn.append(Samples(rows / RATE, -1.0 * rows, 'noise'), k)
-    assert joining._in_step(whole.times, whole, {'v': whole, 'y': torn}, {}) is None
+    assert joining._in_step(whole.times, {'v': whole, 'y': torn}, {}) is None
     joined = join({'v': whole, 'y': torn})
     np.testing.assert_array_equal(joined.columns['v'], -joined.columns['y'])
     assert joined.t.size == 200 and joined.faults[0].count == 100
@@ -87,7 +87,7 @@ def test_runs_that_came_at_another_time_are_no_partners():
     for k in range(5):
         rows = np.arange(10 * k, 10 * (k + 1))
         other.append(Samples(rows / RATE, rows + 2000.0, 'step'), 1_000_000 * (20_000 + k))
-    assert joining._in_step(one.times, one, {'v': one, 'y': other}, {}) is None
+    assert joining._in_step(one.times, {'v': one, 'y': other}, {}) is None
 
 
 def test_joined_columns_are_shared_with_the_record_and_not_with_the_stream():
