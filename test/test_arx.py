@@ -16,6 +16,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose
+from paper_stage import A, B
 from piezo_ident.arx import (
     arx_factor,
     excited_band,
@@ -31,20 +32,6 @@ import pytest
 from scipy import signal
 
 FS = 20_000.0
-# Gu, Li, Zhu and Su (2016), the reference stage
-A = [-1.5157, 0.3685, 0.5132, 0.02363, -0.09831, -0.2931, 0.0842, 0.2921, -0.2582, 0.05803]
-B = [
-    0.02146,
-    0.02553,
-    0.01495,
-    -0.001324,
-    0.001639,
-    0.01780,
-    0.02112,
-    0.01059,
-    0.001185,
-    -0.001171,
-]
 PAPER = Dynamics(A, B)
 SMALL = Dynamics([-1.5, 0.8], [0.1, 0.25])
 

@@ -16,26 +16,14 @@
 
 import numpy as np
 from numpy.testing import assert_array_equal
+from paper_stage import A, B
 from piezo_ident.delay import average_step, delay_from_loss, delay_from_steps, find_jumps
 from piezo_ident.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.record import Piece
 import pytest
 
 FS = 20_000.0
-# Gu, Li, Zhu and Su (2016), the reference stage: its first coefficient is 2 % of the final value
-A = [-1.5157, 0.3685, 0.5132, 0.02363, -0.09831, -0.2931, 0.0842, 0.2921, -0.2582, 0.05803]
-B = [
-    0.02146,
-    0.02553,
-    0.01495,
-    -0.001324,
-    0.001639,
-    0.01780,
-    0.02112,
-    0.01059,
-    0.001185,
-    -0.001171,
-]
+# its first coefficient is 2 % of the final value
 G = Dynamics(A, B)
 
 

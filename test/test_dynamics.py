@@ -20,26 +20,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import A, B
 from piezo_ident.block import Block
 from piezo_ident.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator, filter_arx
 from piezo_ident.errors import ModelError
 import pytest
 from scipy import signal
 
-# Gu, Li, Zhu and Su (2016), the reference stage
-A = [-1.5157, 0.3685, 0.5132, 0.02363, -0.09831, -0.2931, 0.0842, 0.2921, -0.2582, 0.05803]
-B = [
-    0.02146,
-    0.02553,
-    0.01495,
-    -0.001324,
-    0.001639,
-    0.01780,
-    0.02112,
-    0.01059,
-    0.001185,
-    -0.001171,
-]
 PAPER = Dynamics(A, B)
 
 

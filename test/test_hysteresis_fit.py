@@ -16,6 +16,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import A, B
 from piezo_ident.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.errors import IdentificationError
 from piezo_ident.excitation import triangle
@@ -30,20 +31,6 @@ from piezo_ident.hysteresis_fit import (
 )
 import pytest
 
-# Gu, Li, Zhu and Su (2016), the reference stage
-A = [-1.5157, 0.3685, 0.5132, 0.02363, -0.09831, -0.2931, 0.0842, 0.2921, -0.2582, 0.05803]
-B = [
-    0.02146,
-    0.02553,
-    0.01495,
-    -0.001324,
-    0.001639,
-    0.01780,
-    0.02112,
-    0.01059,
-    0.001185,
-    -0.001171,
-]
 G = Dynamics(A, B).normalised()
 Q = [0.4777, 0.4473, 0.1113, 0.0671, 0.1411, 0.0104, 0.0001, 0.0354, 0.0961, 0.0084]
 H = Hysteresis(np.arange(10) / 10, Q, -0.2774, 0.6232)

@@ -43,22 +43,10 @@ from typing import Any
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[2]
+sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes')]
+from course import PROGRAM
+
 PROFILES = ROOT / 'config/fastdds_two_hosts.xml'
-#: three seconds with all that the three steps stand on
-PROGRAM = """
-limits: [0, 10]
-sample_rate: 20000
-seed: 1
-rest: 0
-slew: 40
-segments:
-  - {signal: idle, duration: 0.1}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 8}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 8, frequency: 20}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
-  - {signal: triangle, slope: 40}
-  - {signal: idle, duration: 0.1}
-"""
 SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'nice': 0}
 #: what a run may take, and what a busy machine may add to the start of a node [s]
 LIMIT = 90.0
@@ -415,7 +403,6 @@ def main() -> int:
     if reason:
         print(f'skipped: {reason}')
         return 0
-    sys.path.insert(0, str(HERE.parent))
     from rows import crowd, write_rows
 
     rows, perfect, honest = [], '', True

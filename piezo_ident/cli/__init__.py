@@ -166,6 +166,21 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_results(parser: argparse.ArgumentParser, model: str, validation: str) -> None:
+    parser.add_argument('--model', type=_path, metavar='YAML', help=f'write the {model} there')
+    parser.add_argument(
+        '--report', type=_path, metavar='DIR', help='write page and pictures there'
+    )
+    parser.add_argument(
+        '--validation',
+        nargs='+',
+        type=_path,
+        default=[],
+        metavar='RECORD',
+        help=f'further records: {validation}',
+    )
+
+
 def _build_parser() -> _Parser:
     parser = _Parser(
         prog='piezo_ident',
@@ -198,16 +213,7 @@ def _build_parser() -> _Parser:
     p.add_argument(
         'records', nargs='+', type=_path, metavar='RECORD', help='file, bag, or folder of records'
     )
-    p.add_argument('--model', type=_path, metavar='YAML', help='write the model there')
-    p.add_argument('--report', type=_path, metavar='DIR', help='write tables and pictures there')
-    p.add_argument(
-        '--validation',
-        nargs='+',
-        type=_path,
-        default=[],
-        metavar='RECORD',
-        help='further records: predicted, not fitted',
-    )
+    _add_results(p, 'model', 'predicted, not fitted')
     p.add_argument(
         '--thresholds',
         type=_thresholds,
@@ -256,16 +262,7 @@ def _build_parser() -> _Parser:
         metavar='RECORD',
         help='file, bag, or folder of records that the model was not identified from',
     )
-    p.add_argument('--model', type=_path, metavar='YAML', help='write the refined model there')
-    p.add_argument('--report', type=_path, metavar='DIR', help='write page and pictures there')
-    p.add_argument(
-        '--validation',
-        nargs='+',
-        type=_path,
-        default=[],
-        metavar='RECORD',
-        help='further records: predicted before and after, with no part in the diagnosis',
-    )
+    _add_results(p, 'refined model', 'predicted before and after, with no part in the diagnosis')
     for option, text in (
         ('--only', 'try this effect and no other'),
         ('--without', 'do not try this effect'),

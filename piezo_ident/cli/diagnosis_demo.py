@@ -23,14 +23,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import json
-import os
 from pathlib import Path
-import random
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.graph_demo import _ask, _follow, _set
+from piezo_ident.cli.graph_demo import _ask, _follow, _set, lab_graph
 from piezo_ident.diagnosis import diagnose
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.identification import identify
@@ -159,14 +157,7 @@ def diagnosis_demo(out: Path, console: Console) -> DiagnosisRun:
     PiezoIdentError
         When a node ends, refuses, or does not answer in time.
     """
-    os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    try:
-        from piezo_ident.nodes.client import Client
-    except ImportError as error:
-        raise PiezoIdentError(f'rclpy is installed but cannot be imported: {error}') from None
-
-    with Nodes(out / 'log') as nodes, Client('piezo_ident_diagnosis_demo') as client:
+    with lab_graph(out / 'log', 'piezo_ident_diagnosis_demo') as (nodes, client):
         return _session(nodes, client, out, console)
 
 

@@ -22,7 +22,8 @@ read offline; and the three models are compared.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+import contextlib
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -117,6 +118,34 @@ def largest_difference(one: StageModel, other: StageModel) -> float:
     return float(np.max(np.abs(a - b) / scale))
 
 
+@contextlib.contextmanager
+def lab_graph(log: Path, name: str = 'piezo_ident_client') -> Iterator[tuple[Nodes, Client]]:
+    """
+    Open a graph whose nodes end with it, and a client of it.
+
+    Parameters
+    ----------
+    log : path
+        Folder for what the nodes print.
+    name : str, optional
+        Of the client.
+
+    Raises
+    ------
+    PiezoIdentError
+        When rclpy cannot be imported.
+    """
+    # our own corner of the network, unless the user has chosen one
+    os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    try:
+        from piezo_ident.nodes.client import Client
+    except ImportError as error:
+        raise PiezoIdentError(f'rclpy is installed but cannot be imported: {error}') from None
+    with Nodes(log) as nodes, Client(name) as client:
+        yield nodes, client
+
+
 def graph_demo(out: Path, console: Console) -> GraphRun:
     """
     Run the graph.
@@ -132,19 +161,11 @@ def graph_demo(out: Path, console: Console) -> GraphRun:
     PiezoIdentError
         When a node ends, refuses, or does not answer in time.
     """
-    # our own corner of the network, unless the user has chosen one
-    os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    try:
-        from piezo_ident.nodes.client import Client
-    except ImportError as error:
-        raise PiezoIdentError(f'rclpy is installed but cannot be imported: {error}') from None
-
     folder = out / 'graph'
     for old in ('identification', 'validation'):
         for name in (old, f'{old}_again'):
             shutil.rmtree(folder / name, ignore_errors=True)
-    with Nodes(folder / 'log') as nodes, Client() as client:
+    with lab_graph(folder / 'log') as (nodes, client):
         return _session(nodes, client, folder, console)
 
 

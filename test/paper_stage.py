@@ -1,0 +1,29 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reference stage of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868."""
+
+A = [-1.5157, 0.3685, 0.5132, 0.02363, -0.09831, -0.2931, 0.0842, 0.2921, -0.2582, 0.05803]
+B = [
+    0.02146,
+    0.02553,
+    0.01495,
+    -0.001324,
+    0.001639,
+    0.01780,
+    0.02112,
+    0.01059,
+    0.001185,
+    -0.001171,
+]
