@@ -20,7 +20,11 @@ import sys
 
 from course import level, paper
 from graph import Graph
+from piezo_ident.nodes.wire import QUESTIONS
 import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
 
@@ -125,6 +129,28 @@ def test_four_clients_that_call_as_fast_as_they_can(attack):
     g = attack.g
     g.call('excitation/stop')
     at_rest(g)
+
+
+def test_an_answer_waits_for_who_is_slow_to_take_it(attack):
+    g = attack.g
+    node = Node('slow', context=g.context, start_parameter_services=False, enable_rosout=False)
+    executor = SingleThreadedExecutor(context=g.context)
+    executor.add_node(node)
+    try:
+        client = node.create_client(Trigger, '/recorder/stop', qos_profile=QUESTIONS)
+        g.wait(client.service_is_ready, 'the service')
+        # made after the client: when this one is known, so is that
+        g.client(Trigger, 'recorder/stop')
+        g._known_to('recorder')
+        answer = client.call_async(Trigger.Request())
+        # everybody's answers come to all who ask
+        for _ in range(50):
+            assert not g.call('recorder/stop')[0]
+        executor.spin_until_future_complete(answer, 60.0)
+        assert answer.done() and 'not recording' in answer.result().message
+    finally:
+        executor.shutdown()
+        node.destroy_node()
 
 
 def test_the_stage_ramps_to_rest_whatever_the_clock_of_ros_does(attack):

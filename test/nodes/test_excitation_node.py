@@ -115,7 +115,7 @@ def test_it_keeps_time(lab):
         lab.wait(lambda: len(lab.diagnoses('excitation')) > told, 'numbers')
         assert lab.diagnostics('excitation')['samples'] == str(sequence.n)
         slipped = float(lab.diagnostics('excitation')['slipped'])
-        # the least delay at the end is that at the beginning, but for what the clock itself reports
+        # the least delay at the end is that at the beginning, but for what the clock reports
         delay = np.array(lab.arrivals('voltage')[since:]) - [b.t[0] for b in voltage[since:]]
         quarter = delay.size // 4
         drift = abs(delay[-quarter:].min() - delay[:quarter].min() - slipped)

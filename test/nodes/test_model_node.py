@@ -103,17 +103,17 @@ def test_without_a_model_it_waits_and_says_so(lab):
     prediction = lab.collect('prediction')
     since = len(lab.diagnoses('model'))
     send(lab, blocks(2000))
-    lab.wait(
-        lambda: (
-            [float(d['rate']) > 0 for d in lab.diagnoses('model')[since:]][-2:] == [True, False]
-        ),
-        'all of it to have come',
-    )
+
+    def is_over():
+        rates = [float(d['rate']) for d in lab.diagnoses('model')[since:]]
+        return any(rates) and not rates[-1]
+
+    lab.wait(is_over, 'all of it to have come')
     assert lab.diagnostics('model')['message'] == 'no model yet'
     lab.publish_text('model', paper())
     lab.wait(lambda: node.status()['state'] == 'predicting', 'model')
     send(lab, blocks(500, 2000))
-    lab.wait(lambda: len(prediction) == 5, 'prediction')
+    lab.wait(lambda: len(prediction) >= 5, 'prediction')
     _, v = sine(2500)
     expected = model_of(paper()).stream().process(v, np.arange(2500) / FS)[2000:]
     np.testing.assert_array_equal(np.concatenate([b.values for b in prediction]), expected)
@@ -135,11 +135,14 @@ def test_a_new_model_takes_over_without_a_glitch(fast):
     since = reset(fast)
     send(fast, blocks(6000))
     heard(fast, 'prediction', since['prediction'], 60)
+    taken = int(fast.status('model')['models'])
     fast.publish_text('model', OTHER)
     new, (_, v) = model_of(OTHER), sine(12_000)
     whole = new.stream().process(v, np.arange(12_000) / FS)
     # the swap happens while blocks come: each of them is of one model or the other
-    send(fast, blocks(6000, 6000))
+    send(fast, blocks(3000, 6000))
+    fast.wait(lambda: int(fast.status('model')['models']) > taken, 'the new model')
+    send(fast, blocks(3000, 9000))
     t, y = heard(fast, 'prediction', since['prediction'], 120)
     old = model_of(paper()).stream().process(v, t)
     of_new = np.isclose(y, whole, rtol=0, atol=1e-12 * 75e-6)
@@ -185,15 +188,18 @@ def watch(g, several, topic='preview'):
         g.publish('displacement', Samples(block.t, y + 2e-9, '', 'displacement'))
         time.sleep(0.00125)
 
-    ticks = iter(range(0, 10**9, 100))
+    ticks, last = iter(range(0, 10**9, 100)), []
 
     def more():
-        (block,) = blocks(100, next(ticks))
-        both(block, np.zeros(100))
+        last[:] = blocks(100, next(ticks))
+        both(last[0], np.zeros(100))
 
     reset(g)
     # nothing else tells when this reader has been met; one block alone is no run of the clock
     g.wait(lambda: len(shown) > 2, 'previews', meanwhile=more)
+    # of these nothing may be under way when it begins
+    residual = g.collect('residual')
+    g.wait(lambda: residual and residual[-1].t[-1] == last[0].t[-1], 'the last residual')
     since = reset(g)
     y = model_of(paper()).stream().process(sine(4000)[1], np.arange(4000) / FS)
     shown.clear()
@@ -210,8 +216,10 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
         for quantity in ('displacement', 'prediction', 'residual')
         for what in ('mean', 'min', 'max')
     ]
-    # the last bin is complete when the next begins
-    fast.wait(lambda: len(rows_of(shown)) >= 9, 'previews')
+    # the last bin is complete when the next begins; one of before may have come late
+    mean = pytest.approx(np.split(y, 10)[8].mean(), rel=1e-9)
+    fast.wait(lambda: [r['prediction/mean'] == mean for r in rows_of(shown)][-1:] == [True], 'all')
+    assert len(rows_of(shown)) >= 9
     assert list(shown[-1].name) == names and shown[-1].header.stamp.sec > 0
     rows = rows_of(shown)[-9:]
     for row, part in zip(rows, np.split(y, 10)[:9], strict=True):
@@ -326,13 +334,14 @@ def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     prediction = lab.collect('prediction')
     lab.matched('prediction')
     send(lab, blocks(1000))
-    lab.wait(lambda: len(prediction) == 10, 'predictions')
+    lab.wait(lambda: len(prediction) >= 10, 'predictions')
     _, v = sine(1000)
     expected = load_model(other).stream().process(v, np.arange(1000) / FS)
     np.testing.assert_array_equal(np.concatenate([b.values for b in prediction]), expected)
     # every 10 ms rather than 20
     shown, y, _ = watch(lab, blocks(4000))
-    lab.wait(lambda: len(rows_of(shown)) >= 19, 'previews')
+    mean = pytest.approx(np.split(y, 20)[18].mean(), rel=1e-9)
+    lab.wait(lambda: [r['prediction/mean'] == mean for r in rows_of(shown)][-1:] == [True], 'all')
     means = [row['prediction/mean'] for row in rows_of(shown)[-19:]]
     np.testing.assert_allclose(means, [p.mean() for p in np.split(y, 20)[:19]], rtol=1e-9)
 

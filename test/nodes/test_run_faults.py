@@ -155,7 +155,8 @@ def test_a_stage_that_stops_answering_in_a_run(lab):
         stage.send(signal.SIGCONT)
     assert lab.set('identifier', 'excitation_limit', 20.0)[0]
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'the stage at rest')
-    assert lab.collect('applied_voltage')[-1].values[-1] == 0.0
+    applied = lab.collect('applied_voltage')
+    lab.wait(lambda: applied[-1].values[-1] == 0.0, '0 V')
     assert len(lab.texts('model')) == models
 
 

@@ -16,7 +16,7 @@
 
 import json
 
-from course import column, FS, model_of, numbers, PROGRAM, QUICK, voltage_of
+from course import column, FS, HIGH, model_of, numbers, PROGRAM, QUICK, voltage_of
 from graph import Graph
 import numpy as np
 from piezo_ident.bag_recovery import opened_bag
@@ -84,8 +84,8 @@ def test_three_graphs_side_by_side(tmp_path):
         # each has the whole programme and nothing but it
         sent = column(voltage_of(PROGRAM))
         for where in WHERE:
-            g.wait(lambda w=where: len(applied[w]) == len(voltage[w]), 'the last block')
             for stream in (voltage[where], applied[where]):
+                g.wait(lambda s=stream: column(s)[0].size >= sent[0].size, 'the last block')
                 t, v = column(stream)
                 assert t.tobytes() == sent[0].tobytes() and v.tobytes() == sent[1].tobytes()
             kept = g.diagnoses(f'{where}identifier')
@@ -111,7 +111,7 @@ def test_three_graphs_side_by_side(tmp_path):
         # one of them goes on, and the others are silent
         heard = {where: len(voltage[where]) for where in WHERE}
         foreseen = len(expected['b/'])
-        assert g.set('b/excitation', 'program', PROGRAM)[0]
+        assert g.set('b/excitation', 'program', HIGH)[0]
         assert g.call('b/excitation/start')[0]
         g.wait(lambda: len(expected['b/']) > foreseen, 'a prediction')
         assert g.call('b/excitation/stop')[0]

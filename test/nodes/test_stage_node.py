@@ -35,13 +35,20 @@ def idle(g):
     """Let the stage go to rest; the next stream may take its time."""
     assert g.set('stage', 'silence', 0.05)[0]
     g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+    got, rest = g.collect('applied_voltage'), g.get('stage', 'rest')
+    # the end of the ramp belongs to what was before
+    g.wait(lambda: not got or abs(got[-1].values[-1] - rest) < 1e-9, 'what was applied last')
     assert g.set('stage', 'silence', 600.0)[0]
+    return len(g.statuses('stage'))
 
 
-def warned(g, text):
-    """Wait for a warning in the status."""
+def warned(g, text, since=0):
+    """Wait for a warning in the status, which is shown for three seconds."""
     g.wait(
-        lambda: text in g.status('stage')['message'] and g.status('stage')['level'] == '1', text
+        lambda: any(
+            text in s['message'] and s['level'] == '1' for s in g.statuses('stage')[since:]
+        ),
+        text,
     )
 
 
@@ -112,7 +119,8 @@ def test_every_fault_in_one_stream_sample_by_sample():
         g.publish('voltage', Float64MultiArray())
         warned(g, 'is not')
         send('h')
-        g.wait(lambda: len(seen) == 7 and len(got) == 8, 'the answers')
+        g.wait(lambda: len(seen) >= 7 and len(got) >= 8, 'the answers')
+        assert (len(seen), len(got)) == (7, 8)
         assert [b.segment for b in got].count('hold:gap') == 1
         assert column(got)[1].tobytes() == np.concatenate(applied).tobytes()
         assert column(seen)[1].tobytes() == np.concatenate(back).tobytes()
@@ -139,7 +147,7 @@ def test_every_fault_in_one_stream_sample_by_sample():
 
 @pytest.mark.parametrize(('rest', 'ramp_slew'), [(0.0, 20.0), (2.0, 40.0)])
 def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab, rest, ramp_slew):
-    idle(lab)
+    told = idle(lab)
     seen, got = lab.collect('displacement'), lab.collect('applied_voltage')
     before, applied = len(seen), len(got)
     assert lab.set('stage', 'ramp_slew', ramp_slew) == (True, '')
@@ -149,12 +157,12 @@ def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab, rest, ramp_slew)
         lab.publish('voltage', b)
         if round(b.t[0] * 200) % 40 == 39:
             lab.wait(lambda b=b: seen and seen[-1].t[-1] == b.t[-1], 'the answers')
-    lab.wait(lambda: len(seen) == before + 120, 'the answers')
+    lab.wait(lambda: len(seen) >= before + 120, 'the answers')
     expected = Guard(replace(SETTINGS, ramp_slew=ramp_slew)).process(column(stream)[1])
     assert expected.altered == {'joining': int(200_000 / ramp_slew)}
     lab.wait(lambda: len(got) >= applied + 120, 'what is applied')
     assert column(got[applied : applied + 120])[1].tobytes() == expected.voltage.tobytes()
-    assert 'joined by a ramp' in lab.status('stage')['message']
+    warned(lab, 'joined by a ramp', told)
     # no displacement is missing, altered or not
     assert column(seen[before:])[0].tobytes() == column(stream)[0].tobytes()
 
@@ -206,7 +214,7 @@ def test_the_next_stream_joins_while_the_ramp_is_under_way(lab):
 
 
 def test_limits_and_slew_may_be_set_and_hold_at_once(lab):
-    idle(lab)
+    told = idle(lab)
     got = lab.collect('applied_voltage')
     assert lab.set('stage', 'voltage_high', 4.0) == (True, '')
     assert lab.set('stage', 'slew', 20000.0) == (True, '')
@@ -220,7 +228,7 @@ def test_limits_and_slew_may_be_set_and_hold_at_once(lab):
         lab.publish('voltage', block(0, [0.0, 0.0, 7.0, 7.0, 7.0, 7.0, 7.0, 0.0]))
         lab.wait(lambda: len(got) > applied, 'what is applied')
         assert got[applied].values.tolist() == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 4.0, 3.0]
-        warned(lab, 'are faster than slew')
+        warned(lab, 'are faster than slew', told)
     finally:
         assert lab.set('stage', 'voltage_high', 10.0)[0]
         assert lab.set('stage', 'slew', 40000.0)[0]
@@ -248,7 +256,7 @@ def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
     lab.publish('voltage', level(0.0, 1)[0])
     lab.wait(second.get_subscription_count, 'the match')
     lab.wait(lambda: lab.diagnostics('stage').get('publishers') == '2', 'two publishers')
-    idle(lab)
+    told = idle(lab)
     try:
         before, applied = len(seen), len(got)
         mine = level(0.0, 40, segment='first')
@@ -256,15 +264,15 @@ def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
         for a, b in zip(mine, others, strict=True):
             lab.publish('voltage', a)
             second.publish(to_message(b))
-        warned(lab, 'second publisher')
-        lab.wait(lambda: len(seen) == before + 40, 'the answers')
-        lab.wait(lambda: len(got) == applied + 40, 'what is applied')
+        warned(lab, 'second publisher', told)
+        lab.wait(lambda: len(seen) >= before + 40, 'the answers')
+        lab.wait(lambda: len(got) >= applied + 40, 'what is applied')
         assert {b.segment for b in seen[before:]} == {'first'}
         assert column(got[applied:])[1].max() == 0.0
         idle(lab)
         for b in level(3.0, 90, 200000, 'second'):
             second.publish(to_message(b))
-        lab.wait(lambda: len(seen) == before + 130, 'the second one alone')
+        lab.wait(lambda: len(seen) >= before + 130, 'the second one alone')
         assert seen[-1].segment == 'second'
         lab.wait(lambda: got[-1].t[-1] == seen[-1].t[-1], 'what is applied')
         assert column(got[applied:])[1].max() == 3.0
