@@ -39,10 +39,9 @@ import sys
 import tempfile
 import time
 
+from growth_of_bags import BAG_BYTES, BAG_MEASURES, Measure, paper, RATE, sine, SPARE
 import numpy as np
 from piezo_ident.arx import arx_factor, scan_orders
-from piezo_ident.bag_io import read_bag, typestore, write_bag
-from piezo_ident.bag_recovery import opened_bag
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.hysteresis import Hysteresis
@@ -54,16 +53,12 @@ from piezo_ident.program import load_program, parse_program
 from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.wire_format import decode
 from side_by_side import markdown, seconds, take_turns, versions
 
-RATE = 20_000.0
 #: the effect that the diagnosed stage has, and its size [% of stroke]
 EFFECT, SIZE = 'creep', 0.3
 #: points at the large end through which the exponent is drawn
 LARGE_END = 3
-#: bytes that a second of voltage and displacement takes in a bag, and how much must stay free
-BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
 #: seconds of the identification record of which the longer ones are multiples
 PROGRAM = """
 limits: [0, 10]
@@ -78,20 +73,6 @@ segments:
   - {{signal: triangle, slope: {slope}}}
   - {{signal: idle, duration: 0.3}}
 """
-
-Measure = tuple[float, float]
-
-
-def paper() -> StageModel:
-    """Return the paper's stage."""
-    return load_stage(find_config('paper', 'stage')).model
-
-
-def sine(n: int, model: StageModel) -> Piece:
-    """Return a record of a 50 Hz sine without its answer."""
-    v = 5.0 + 5.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE)
-    return Piece(v, np.zeros(n), model.sample_rate)
-
 
 # -- what a child measures: (size, folder) -> seconds, number of samples -----------------------
 
@@ -116,50 +97,6 @@ def stream(size: float, folder: Path) -> Measure:
     for _ in range(round(size)):
         running.process(v)
     return time.perf_counter() - start, round(size) * v.size
-
-
-def writing(size: float, folder: Path) -> Measure:
-    """Write a record as a bag."""
-    model = paper()
-
-    def record(n: int) -> Record:
-        piece = sine(n, model)
-        return Record((Piece(piece.v, model.predict_piece(piece), RATE),), 'long')
-
-    # what the next measures warm up on as well
-    write_bag(record(20_000), folder / 'short', overwrite=True)
-    long = record(round(size * RATE))
-    start = time.perf_counter()
-    write_bag(long, folder / f'bag_{size:g}', overwrite=True)
-    return time.perf_counter() - start, long.n
-
-
-def reading(size: float, folder: Path) -> Measure:
-    """Read a bag into a record."""
-    read_bag(folder / 'short')
-    start = time.perf_counter()
-    record = read_bag(folder / f'bag_{size:g}')
-    return time.perf_counter() - start, record.n
-
-
-def following(size: float, folder: Path) -> Measure:
-    """Read a bag message by message, predict, and forget."""
-    _follow(folder / 'short')
-    start = time.perf_counter()
-    n = _follow(folder / f'bag_{size:g}')
-    return time.perf_counter() - start, n
-
-
-def _follow(path: Path) -> int:
-    running, n = paper().stream(), 0
-    with opened_bag(path) as bag:
-        wanted = [c for c in bag.connections if c.topic.endswith('voltage')]
-        for connection, _, raw in bag.messages(wanted):
-            message = typestore().deserialize_cdr(raw, connection.msgtype)
-            samples = decode(message.data, message.layout.dim, message.layout.data_offset)
-            running.process(samples.values, samples.t)
-            n += samples.values.size
-    return n
 
 
 def labelled(times: float) -> Record:
@@ -236,9 +173,7 @@ MEASURES: dict[str, Callable[[float, Path], Measure]] = {
     'nothing': nothing,
     'predict': predict,
     'stream': stream,
-    'write': writing,
-    'read': reading,
-    'follow': following,
+    **BAG_MEASURES,
     'identify': identifying,
     'diagnose': diagnosing,
 }
@@ -317,11 +252,27 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
             'Prediction of a record in memory',
             (10, 60) if quick else (10, 30, 60, 120, 300, 600),
         ),
-        'write': ('Writing a bag', (10, 30) if quick else (10, 60, 600, hour)),
-        'read': ('Reading a bag into a record', (10, 30) if quick else (10, 60, 600)),
+        'write': ('Writing a bag', (10, 60) if quick else (10, 60, 600, hour)),
+        'read': ('Reading a bag into a record', (10, 60) if quick else (10, 60, 600)),
         'follow': (
             'Reading a bag message by message, predicting meanwhile: constant memory',
-            (10, 30) if quick else (10, 60, 600, hour),
+            (10, 60) if quick else (10, 60, 600, hour),
+        ),
+        'convert': (
+            'Converting a bag to a bag: constant memory',
+            (10, 60) if quick else (10, 60, 600, hour),
+        ),
+        'convert_csv': (
+            'Converting a bag to CSV: constant memory',
+            (10,) if quick else (10, 60, 600),
+        ),
+        'convert_npz': (
+            'Converting a bag to npz: constant memory',
+            (10,) if quick else (10, 60, 600, hour),
+        ),
+        'predict_bag': (
+            'Predicting a bag file, with the prediction as npz: constant memory',
+            (10, 60) if quick else (10, 60, 600, hour),
         ),
         'identify': (
             'Identification, the three steps',
@@ -335,14 +286,14 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
     base = measured('nothing', 0.0, folder)[2]
     text, said = [], []
     for kind, (title, sizes) in plans.items():
-        if kind in ('write', 'follow') and hour in sizes:
-            # the hour as a bag takes some gigabytes for a moment
-            if shutil.disk_usage(folder).free < hour * BAG_BYTES + SPARE:
+        if kind in BAG_MEASURES and hour in sizes:
+            # the hour as a bag takes some gigabytes for a moment, and what is made of it too
+            if shutil.disk_usage(folder).free < 4 * hour * BAG_BYTES + SPARE:
                 sizes = tuple(size for size in sizes if size < hour)
                 said.append(f'Too little room on the disk for a bag of 1 h ({title.lower()}).')
         rows, line = along_the_record(kind, sizes, folder)
         text += [f'**{title}.** {line}'.strip(), '', markdown(HEADS, rows), '']
-        if kind == 'follow':
+        if kind == 'predict_bag':
             for path in folder.glob('bag_*'):
                 shutil.rmtree(path)
     intro = (

@@ -40,7 +40,7 @@ __all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'memories_of', 'start_memory
 PULL = 1e-4
 
 
-def forgotten(u: NDArray[np.float64], share: float = 0.98) -> int:
+def forgotten(u: NDArray[np.float64], share: float = 0.98, span: float | None = None) -> int:
     """
     Return the sample from which the start is forgotten.
 
@@ -50,9 +50,11 @@ def forgotten(u: NDArray[np.float64], share: float = 0.98) -> int:
         Voltage in any unit.
     share : float, optional
         Share of the record's range that must have been swept.
+    span : float, optional
+        That range, where `u` is the beginning of the record alone.
     """
     swept = np.maximum.accumulate(u) - np.minimum.accumulate(u)
-    return int(np.argmax(swept >= share * swept[-1]))
+    return int(np.argmax(swept >= share * (swept[-1] if span is None else span)))
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:

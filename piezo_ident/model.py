@@ -251,15 +251,7 @@ class StageModel:
             When the piece has another sampling rate.
         """
         self.check_rate(piece)
-        stream = self.stream(memory)
-        if not stream.sees_more:
-            return stream.process(piece.v)
-        y = np.empty(piece.n)
-        for start in range(0, piece.n, CHUNK):
-            cut = slice(start, start + CHUNK)
-            channels = {name: x[cut] for name, x in piece.channels.items()}
-            y[cut] = stream.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
-        return y
+        return self.stream(memory).follow(piece)
 
     def predict(
         self, record: Record, memories: tuple[ArrayLike | None, ...] | None = None
@@ -304,18 +296,24 @@ class StageModel:
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
         """Return a warning when the voltage leaves the range in which the model was identified."""
-        low, high = self.scaling.range
-        slack = 1e-3 * (high - low)
-        seen = record.voltage_range
-        if low - slack <= seen[0] and seen[1] <= high + slack:
-            return ()
-        outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
+        outside = sum(self.outside(p.v) for p in record)
         if not outside:
             return ()
+        return (self.outside_warning(record.name, outside / record.n, record.voltage_range),)
+
+    def outside(self, v: NDArray[np.float64]) -> int:
+        """Return how many voltages [V] leave the range in which the model was identified."""
+        low, high = self.scaling.range
+        slack = 1e-3 * (high - low)
+        return int(np.sum((v < low - slack) | (v > high + slack)))
+
+    def outside_warning(self, name: str, share: float, seen: tuple[float, float]) -> str:
+        """Return what to say when a share of a record that reaches so far [V] is outside."""
+        low, high = self.scaling.range
         return (
-            f'{record.name}: {outside / record.n:.1%} of the samples lie outside the identified '
+            f'{name}: {share:.1%} of the samples lie outside the identified '
             f'range {low:g} .. {high:g} V (they reach {seen[0]:g} .. {seen[1]:g} V); '
-            'the prediction is an extrapolation there',
+            'the prediction is an extrapolation there'
         )
 
 
@@ -351,6 +349,17 @@ class Stream:
         u0 = float(self.model.scaling.u(v0))
         self._count, self._started = 0, True
         return float(self.model.scaling.y(self._chain.reset(u0, u0)))
+
+    def follow(self, piece: Piece) -> NDArray[np.float64]:
+        """Return the displacement [m] for the next samples, which are a piece or a part of one."""
+        if not self.sees_more:
+            return self.process(piece.v)
+        y = np.empty(piece.n)
+        for start in range(0, piece.n, CHUNK):
+            cut = slice(start, start + CHUNK)
+            channels = {name: x[cut] for name, x in piece.channels.items()}
+            y[cut] = self.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
+        return y
 
     def process(
         self,

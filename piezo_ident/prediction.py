@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +28,10 @@ from piezo_ident.metrics import fit_percent, percent_of_stroke
 from piezo_ident.model import Prediction, StageModel
 from piezo_ident.record import Record
 
-__all__ = ['RecordErrors', 'RecordPrediction', 'predict_record']
+__all__ = ['DIVERGES', 'RecordErrors', 'RecordPrediction', 'predict_record', 'start_warning']
+
+#: what is said of a prediction that is not finite
+DIVERGES = 'the model diverges on this record; identify it again'
 
 
 @dataclass(frozen=True)
@@ -116,11 +120,7 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
     )
     prediction = model.predict(record, memories)
     if any(estimated):
-        said = (
-            f'{record.name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
-            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start was '
-            'estimated from their early part'
-        )
+        said = start_warning(model, record.name, estimated)
         prediction = replace(prediction, warnings=(said, *prediction.warnings))
     late = []
     for piece, unknown in zip(record, estimated, strict=True):
@@ -133,13 +133,22 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
     y = np.concatenate([piece.y for piece in record])
     y_hat = np.concatenate(prediction.pieces)
     if not np.all(np.isfinite(y_hat)):
-        raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
+        raise ModelError(f'{record.name}: {DIVERGES}')
     mask = np.concatenate(late)
     return RecordPrediction(
         prediction=prediction,
         estimated=estimated,
         whole=_errors(y, y_hat, record.stroke),
         after=_errors(y[mask], y_hat[mask], record.stroke) if mask.any() else None,
+    )
+
+
+def start_warning(model: StageModel, name: str, estimated: Sequence[bool]) -> str:
+    """Return what to say of a record where the memory at the start of pieces was estimated."""
+    return (
+        f'{name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
+        f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start was '
+        'estimated from their early part'
     )
 
 

@@ -19,18 +19,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 import re
+from typing import Any
 
 import numpy as np
 from piezo_ident.bag_io import read_bag, write_bag
 from piezo_ident.errors import DataError
 from piezo_ident.limits import regular_file
+from piezo_ident.long_bag import read_long_bag
+from piezo_ident.long_record import LongRecord, NeedsWhole, Progress
 from piezo_ident.output import temporary_output
+from piezo_ident.overall import Overall
 from piezo_ident.record import Fault, Record
 from piezo_ident.sampling import assemble
 from piezo_ident.table_io import READERS, Table, WRITERS
+from piezo_ident.table_parts import PART_WRITERS
 from piezo_ident.yaml_io import broken_link
 
-__all__ = ['read_record', 'write_record']
+__all__ = ['read_long', 'read_record', 'write_record']
 
 _FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 
@@ -110,21 +115,64 @@ def read_record(
     ).renamed(path.name)
 
 
+def read_long(
+    path: str | Path,
+    *,
+    progress: Progress = lambda step, share: None,
+    to_write: bool = False,
+    **options: Any,
+) -> Record | LongRecord:
+    """
+    Read a record as `read_record` does, but leave the samples of a long bag in it.
+
+    Parameters
+    ----------
+    path : path
+    progress : callable, optional
+        Called as ``progress(step, share)`` while a long bag is looked through.
+    to_write : bool, optional
+        Whether it is for `write_record`, which says what a file will not give back: the whole
+        record is then read where there is something to say.
+    **options
+        Of `read_record`.
+
+    Raises
+    ------
+    DataError
+        As `read_record` does.
+    """
+    path = Path(path)
+    is_bag = path.is_dir() or path.suffix.lower() in ('.mcap', '.db3')
+    if not is_bag or broken_link(path):
+        return read_record(path, **options)
+    inspect = _refuse_losses if to_write else None
+    return read_long_bag(path, progress=progress, inspect=inspect, **options)
+
+
+def _refuse_losses(record: Record) -> None:
+    _check_labels(record, Path(record.name))
+    losses = _losses(record, _flatten(record), Overall())
+    if losses:
+        raise NeedsWhole(losses[0])
+
+
 def write_record(
-    record: Record,
+    record: Record | LongRecord,
     path: str | Path,
     *,
     overwrite: bool = False,
     storage: str | None = None,
     custom_data: Mapping[str, str] | None = None,
+    progress: Progress = lambda step, share: None,
 ) -> tuple[str, ...]:
     """
     Write a record; the suffix names the format, no suffix a bag folder.
 
     Parameters
     ----------
-    record : Record
-        What to write; its faults are no part of any file.
+    record : Record or LongRecord
+        What to write; its faults are no part of any file.  A long one must have been read for
+        this, and is not written as .mat.
     path : path
         Where to; nothing is left there when writing fails.
     overwrite : bool
@@ -133,6 +181,8 @@ def write_record(
         Storage of a bag folder.
     custom_data : mapping of str to str, optional
         For a bag's metadata: seed, programme.
+    progress : callable, optional
+        Called as ``progress(step, share)`` while a long record is read.
 
     Returns
     -------
@@ -147,21 +197,46 @@ def write_record(
     path = Path(path)
     suffix = path.suffix.lower()
     _check_labels(record, path)
-    table = _flatten(record, path)
-    if suffix in ('', '.mcap', '.db3') or (path / 'metadata.yaml').is_file():
-        write_bag(record, path, storage=storage, overwrite=overwrite, custom_data=custom_data)
-        return _losses(record, table)
-    if suffix not in WRITERS:
+    is_bag = suffix in ('', '.mcap', '.db3') or (path / 'metadata.yaml').is_file()
+    if not is_bag and suffix not in WRITERS:
         raise DataError(f'{path}: unknown format {suffix}; give {_FORMATS}')
-    if storage is not None:
+    if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
-    with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
-        WRITERS[suffix](file, table)
-    notes = ('custom data are kept by bags only',) if custom_data else ()
-    return notes + _losses(record, table)
+    if is_bag:
+        write_bag(
+            record,
+            path,
+            storage=storage,
+            overwrite=overwrite,
+            custom_data=custom_data,
+            progress=progress,
+        )
+    elif isinstance(record, Record):
+        with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
+            WRITERS[suffix](file, _flatten(record))
+    elif suffix in PART_WRITERS:
+        _write_parts(record, path, overwrite, progress)
+    else:
+        raise DataError(f'{path}: a long bag is not written as {suffix}; choose .csv or .npz')
+    notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
+    return notes + (_losses(record, _flatten(record)) if isinstance(record, Record) else ())
 
 
-def _check_labels(record: Record, path: Path) -> None:
+def _write_parts(record: LongRecord, path: Path, overwrite: bool, progress: Progress) -> None:
+    columns = ['t', 'v', 'y', *(f'x_{name}' for name in record.pieces[0].channels)]
+    names, starts = _labels(record)
+    with (
+        temporary_output(path, overwrite=overwrite) as target,
+        target.open('xb') as file,
+        PART_WRITERS[path.suffix.lower()](file, columns, names, starts) as add,
+    ):
+        for _, parts in record.parts(progress):
+            for part in parts:
+                channels = {f'x_{name}': x for name, x in part.channels.items()}
+                add({'t': part.t, 'v': part.v, 'y': part.y, **channels})
+
+
+def _check_labels(record: Record | LongRecord, path: Path) -> None:
     for label in record.labels:
         if label != label.strip() or not label.isprintable():
             raise DataError(
@@ -179,7 +254,7 @@ def _check_labels(record: Record, path: Path) -> None:
             )
 
 
-def _flatten(record: Record, path: Path) -> Table:
+def _flatten(record: Record) -> Table:
     """Return all pieces below each other; time alone tells them apart."""
     columns = {
         't': np.concatenate([p.t for p in record]),
@@ -188,6 +263,11 @@ def _flatten(record: Record, path: Path) -> Table:
     }
     for name in record.pieces[0].channels:
         columns[f'x_{name}'] = np.concatenate([p.channels[name] for p in record])
+    return Table(columns, *_labels(record))
+
+
+def _labels(record: Record | LongRecord) -> tuple[list[str], list[int]]:
+    """Return the label of each stretch and its first row, nothing for unlabelled records."""
     names: list[str] = []
     starts: list[int] = []
     offset = 0
@@ -204,12 +284,10 @@ def _flatten(record: Record, path: Path) -> Table:
         if end < offset:
             names.append('')
             starts.append(end)
-    if not any(names):
-        return Table(columns)
-    return Table(columns, names, starts)
+    return (names, starts) if any(names) else ([], [])
 
 
-def _losses(record: Record, table: Table) -> tuple[str, ...]:
+def _losses(record: Record, table: Table, overall: Overall | None = None) -> tuple[str, ...]:
     """Read the columns as a reader would, and say what differs."""
     columns = dict(table.columns)
     try:
@@ -220,6 +298,7 @@ def _losses(record: Record, table: Table) -> tuple[str, ...]:
             (table.names, table.starts),
             columns,
             name='the file',
+            overall=overall,
         )
     except DataError as error:
         return (f'reading refuses it: {error}',)

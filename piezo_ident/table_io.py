@@ -28,7 +28,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import csv
 from dataclasses import dataclass, field
-import io
 import itertools
 from pathlib import Path
 import re
@@ -41,6 +40,7 @@ from piezo_ident.errors import DataError
 from piezo_ident.limits import COLUMNS, unpacked
 from piezo_ident.mat_read import read_variables
 from piezo_ident.sampling import label_runs
+from piezo_ident.table_parts import csv_parts
 import scipy.io
 
 __all__ = ['READERS', 'WRITERS', 'Table']
@@ -223,26 +223,8 @@ def _torn_at_commas(row: list[str], header: list[str]) -> bool:
 
 def write_csv(file: BinaryIO, table: Table) -> None:
     """Write a CSV file whose numbers read back exactly."""
-    n = table.columns['t'].size
-    starts = np.asarray(table.starts, dtype=np.int64)
-    labels = [_quoted(name) for name in table.names]
-    header = [*table.columns, *(['segment'] if labels else [])]
-    file.write((','.join(header) + '\n').encode())
-    for i in range(0, n, _ROWS):
-        columns: list[Iterable[str]] = [
-            map(repr, x[i : i + _ROWS].tolist()) for x in table.columns.values()
-        ]
-        if labels:
-            rows = np.arange(i, min(i + _ROWS, n))
-            columns.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
-        lines = map(','.join, zip(*columns, strict=True))
-        file.write(('\n'.join(lines) + '\n').encode())
-
-
-def _quoted(text: str) -> str:
-    line = io.StringIO()
-    csv.writer(line, lineterminator='').writerow([text, ''])
-    return line.getvalue()[:-1]
+    with csv_parts(file, tuple(table.columns), table.names, table.starts) as add:
+        add(table.columns)
 
 
 # --- npz ------------------------------------------------------------------------------------

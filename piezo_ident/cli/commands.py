@@ -21,14 +21,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.cli.common import check_record_output, read, say_faults, story
+from piezo_ident.cli.common import check_record_output, read, read_long, say_faults, story
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
 from piezo_ident.cli.outputs import check_folder, check_link
 from piezo_ident.errors import ConfigError
+from piezo_ident.long_record import LongRecord
 from piezo_ident.program import load_program
+from piezo_ident.record import Record
 from piezo_ident.record_io import write_record
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import load_stage, simulate
@@ -93,9 +95,20 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
 def convert_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_record_output(args)
-    record = read(args.record, args)
-    with interrupts.waiting():
-        losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
+    with console.progress() as progress:
+        if args.out.suffix.lower() == '.mat':
+            # its variables are written at once, and hold 2 GB at most
+            record: Record | LongRecord = read(args.record, args)
+        else:
+            record = read_long(args.record, args, progress, to_write=True)
+        with interrupts.waiting():
+            losses = write_record(
+                record,
+                args.out,
+                overwrite=args.overwrite,
+                storage=args.storage,
+                progress=progress,
+            )
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
         f'{record.duration:.6g} s'

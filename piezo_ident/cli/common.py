@@ -22,9 +22,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from piezo_ident import record_io
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.long_record import LongRecord, Progress
 from piezo_ident.record import Record
 from piezo_ident.record_io import read_record
 
@@ -36,6 +38,7 @@ __all__ = [
     'naming',
     'read',
     'read_all',
+    'read_long',
     'say_faults',
     'story',
 ]
@@ -95,16 +98,26 @@ def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
 
 def read(path: Path, args: argparse.Namespace) -> Record:
     """Read one record as the options say."""
-    return read_record(
-        path,
-        displacement_unit=args.displacement_unit,
-        voltage_limits=check_limits(args),
-        namespace=args.namespace,
-        voltage_topic=args.voltage_topic,
-        displacement_topic=args.displacement_topic,
+    return read_record(path, **_reading(args))
+
+
+def read_long(
+    path: Path, args: argparse.Namespace, progress: Progress, *, to_write: bool = False
+) -> Record | LongRecord:
+    """Read one record as the options say; a long bag is only looked through."""
+    return record_io.read_long(path, progress=progress, to_write=to_write, **_reading(args))
+
+
+def _reading(args: argparse.Namespace) -> dict[str, Any]:
+    return {
+        'displacement_unit': args.displacement_unit,
+        'voltage_limits': check_limits(args),
+        'namespace': args.namespace,
+        'voltage_topic': args.voltage_topic,
+        'displacement_topic': args.displacement_topic,
         # saving what is whole of a bag is for convert; the others send there
-        recover=args.verb == 'convert',
-    )
+        'recover': args.verb == 'convert',
+    }
 
 
 def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
@@ -130,7 +143,7 @@ def check_record_output(args: argparse.Namespace) -> None:
     check_file(args.out, overwrite=args.overwrite, folder_too=True)
 
 
-def say_faults(record: Record, losses: Sequence[str], console: Console) -> None:
+def say_faults(record: Record | LongRecord, losses: Sequence[str], console: Console) -> None:
     """Say what was met in a record, and what the file it was written to cannot keep."""
     for fault in record.faults:
         console.say(f'met: {fault}')
@@ -138,7 +151,7 @@ def say_faults(record: Record, losses: Sequence[str], console: Console) -> None:
         console.say(f'not kept: {loss}')
 
 
-def story(record: Record, losses: Sequence[str]) -> dict[str, Any]:
+def story(record: Record | LongRecord, losses: Sequence[str]) -> dict[str, Any]:
     """Return for programs what `say_faults` says, and what the record holds."""
     return {
         'record': record.name,

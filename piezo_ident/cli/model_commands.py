@@ -23,11 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.cli.common import (
     expand,
     naming,
     read,
     read_all,
+    read_long,
     RECORD_FILES,
     say_faults,
     story,
@@ -38,14 +40,17 @@ from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
 from piezo_ident.errors import ConfigError
 from piezo_ident.identification import identify
+from piezo_ident.long_prediction import predict_long
+from piezo_ident.long_record import LongRecord, NeedsWhole, Progress
 from piezo_ident.metrics import FORMULA
 from piezo_ident.model import StageModel
 from piezo_ident.model_io import load_model, save_model
 from piezo_ident.output import temporary_output
 from piezo_ident.prediction import predict_record, RecordPrediction
-from piezo_ident.record import Record
+from piezo_ident.record import Piece, Record
 from piezo_ident.results import Settings
 from piezo_ident.table_io import Table, WRITERS
+from piezo_ident.table_parts import PART_WRITERS
 
 __all__ = ['MODEL_FILES', 'check_order', 'identify_command', 'predict_command']
 
@@ -162,23 +167,12 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             check_distinct(path, [args.model, args.record])
     check_order(args.model, args.record, 'predict')
     model = load_model(args.model)
-    record = read(args.record, args)
-    with naming(str(args.model)):
-        free_run = predict_record(model, record)
-    if args.out is not None:
-        columns = {
-            't': np.concatenate([p.t for p in record]),
-            'v': np.concatenate([p.v for p in record]),
-            'y': np.concatenate([p.y for p in record]),
-            'y_hat': np.concatenate(free_run.prediction.pieces),
-        }
-        with (
-            interrupts.waiting(),
-            temporary_output(args.out, overwrite=True) as target,
-            target.open('xb') as file,
-        ):
-            WRITERS[args.out.suffix.lower()](file, Table(columns))
-    if args.plot is not None:
+    with console.progress() as progress:
+        try:
+            record, free_run = _predicted(model, args, progress)
+        except NeedsWhole:
+            record, free_run = _predicted_whole(model, args)
+    if args.plot is not None and isinstance(record, Record):
         from piezo_ident.plots import write_prediction_plot
 
         with interrupts.waiting():
@@ -198,6 +192,53 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             'plot': None if args.plot is None else str(args.plot),
         }
     )
+
+
+def _predicted(
+    model: StageModel, args: argparse.Namespace, progress: Progress
+) -> tuple[Record | LongRecord, RecordPrediction]:
+    """Predict a record, and write the prediction where that is asked for."""
+    if args.plot is not None:
+        return _predicted_whole(model, args)
+    record = read_long(args.record, args, progress)
+    if isinstance(record, Record):
+        return _predicted_whole(model, args, record)
+    with naming(str(args.model)):
+        if args.out is None:
+            return record, predict_long(model, record, progress=progress)
+        with (
+            interrupts.waiting(),
+            temporary_output(args.out, overwrite=True) as target,
+            target.open('xb') as file,
+            PART_WRITERS[args.out.suffix.lower()](file, ('t', 'v', 'y', 'y_hat')) as add,
+        ):
+
+            def keep(part: Piece, y_hat: NDArray[np.float64]) -> None:
+                add({'t': part.t, 'v': part.v, 'y': part.y, 'y_hat': y_hat})
+
+            return record, predict_long(model, record, add=keep, progress=progress)
+
+
+def _predicted_whole(
+    model: StageModel, args: argparse.Namespace, record: Record | None = None
+) -> tuple[Record, RecordPrediction]:
+    record = read(args.record, args) if record is None else record
+    with naming(str(args.model)):
+        free_run = predict_record(model, record)
+    if args.out is not None:
+        columns = {
+            't': np.concatenate([p.t for p in record]),
+            'v': np.concatenate([p.v for p in record]),
+            'y': np.concatenate([p.y for p in record]),
+            'y_hat': np.concatenate(free_run.prediction.pieces),
+        }
+        with (
+            interrupts.waiting(),
+            temporary_output(args.out, overwrite=True) as target,
+            target.open('xb') as file,
+        ):
+            WRITERS[args.out.suffix.lower()](file, Table(columns))
+    return record, free_run
 
 
 def check_order(model: Path, record: Path, verb: str) -> None:

@@ -471,10 +471,12 @@ def test_an_identifier_that_is_killed_and_comes_back(rig):
     assert g.set('identifier', 'thresholds', '100')[0]
     assert g.call('identifier/identify')[0]
     g.wait(lambda: old.status()['message'] == 'hysteresis', 'the swarm')
-    started = old.children()
+    started, listeners = old.children(), g.listeners('voltage')
     assert started
     old.die()
     g.wait(lambda: not any(alive(pid) for pid in started), 'the end of what it had started')
+    # until the middleware has given it up, it keeps the memory of what was sent to it
+    g.wait(lambda: g.listeners('voltage') < listeners, 'the dead node to be given up')
     rig.rest(clear=False)
     rig.send(BLOCKS[:K])
     new = g.restart(old)

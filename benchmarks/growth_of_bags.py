@@ -1,0 +1,154 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What `bench_growth` measures of bags: writing, reading, following, converting and predicting them.
+
+Each function takes a length [s] and a folder, in which `writing` has left a bag of that length,
+and returns a time [s] and the number of samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import io
+from pathlib import Path
+import shutil
+import time
+
+import numpy as np
+from piezo_ident.bag_io import read_bag, typestore, write_bag
+from piezo_ident.bag_recovery import opened_bag
+from piezo_ident.cli import main as piezo_ident
+from piezo_ident.model import StageModel
+from piezo_ident.model_io import save_model
+from piezo_ident.record import Piece, Record
+from piezo_ident.shipped import find_config
+from piezo_ident.simulation import load_stage
+from piezo_ident.wire_format import decode
+
+RATE = 20_000.0
+#: bytes that a second of voltage and displacement takes in a bag, and how much must stay free
+BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
+
+Measure = tuple[float, float]
+
+
+def paper() -> StageModel:
+    """Return the paper's stage."""
+    return load_stage(find_config('paper', 'stage')).model
+
+
+def sine(n: int, model: StageModel) -> Piece:
+    """Return a record of a 50 Hz sine without its answer."""
+    v = 5.0 + 5.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE)
+    return Piece(v, np.zeros(n), model.sample_rate)
+
+
+def writing(size: float, folder: Path) -> Measure:
+    """Write a record as a bag."""
+    model = paper()
+
+    def record(n: int) -> Record:
+        piece = sine(n, model)
+        return Record((Piece(piece.v, model.predict_piece(piece), RATE),), 'long')
+
+    # what the next measures warm up on as well
+    write_bag(record(20_000), folder / 'short', overwrite=True)
+    long = record(round(size * RATE))
+    start = time.perf_counter()
+    write_bag(long, folder / f'bag_{size:g}', overwrite=True)
+    return time.perf_counter() - start, long.n
+
+
+def reading(size: float, folder: Path) -> Measure:
+    """Read a bag into a record."""
+    read_bag(folder / 'short')
+    start = time.perf_counter()
+    record = read_bag(folder / f'bag_{size:g}')
+    return time.perf_counter() - start, record.n
+
+
+def following(size: float, folder: Path) -> Measure:
+    """Read a bag message by message, predict, and forget."""
+    _follow(folder / 'short')
+    start = time.perf_counter()
+    n = _follow(folder / f'bag_{size:g}')
+    return time.perf_counter() - start, n
+
+
+def _follow(path: Path) -> int:
+    running, n = paper().stream(), 0
+    with opened_bag(path) as bag:
+        wanted = [c for c in bag.connections if c.topic.endswith('voltage')]
+        for connection, _, raw in bag.messages(wanted):
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+            samples = decode(message.data, message.layout.dim, message.layout.data_offset)
+            running.process(samples.values, samples.t)
+            n += samples.values.size
+    return n
+
+
+def converting(suffix: str) -> Callable[[float, Path], Measure]:
+    """Return what measures ``piezo_ident convert BAG OUT``, for OUT with a suffix."""
+
+    def measure(size: float, folder: Path) -> Measure:
+        return _command(size, folder, lambda bag, out: ['convert', bag, out], f'out{suffix}')
+
+    return measure
+
+
+def predicting(size: float, folder: Path) -> Measure:
+    """Measure ``piezo_ident predict MODEL BAG --out OUT.npz``."""
+    model = folder / 'paper.yaml'
+    save_model(paper(), model)
+    return _command(
+        size, folder, lambda bag, out: ['predict', str(model), bag, '--out', out], 'out.npz'
+    )
+
+
+def _command(
+    size: float, folder: Path, arguments: Callable[[str, str], list[str]], name: str
+) -> Measure:
+    out = folder / name
+    took = 0.0
+    for bag in ('short', f'bag_{size:g}'):
+        start = time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            status = piezo_ident([*arguments(str(folder / bag), str(out))])
+        took = time.perf_counter() - start
+        if status:
+            raise RuntimeError(said.getvalue())
+        _remove(out)
+    return took, round(size * RATE)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+#: by the name with which `bench_growth` measures them
+BAG_MEASURES: dict[str, Callable[[float, Path], Measure]] = {
+    'write': writing,
+    'read': reading,
+    'follow': following,
+    'convert': converting(''),
+    'convert_csv': converting('.csv'),
+    'convert_npz': converting('.npz'),
+    'predict_bag': predicting,
+}
