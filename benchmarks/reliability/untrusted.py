@@ -289,7 +289,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     'voltage and displacement swapped': (
         'model, errs by 3.5 % of stroke, warns',
         'errs by 36 %',
-        'unexplained, errs by 36, then 11 %',
+        'unexplained, errs by 36, then 36 %',
     ),
     'saturated at 60 %': (
         'model, errs by 2.8 % of stroke, warns',
@@ -299,7 +299,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     'saturated both ends': (
         'model, errs by 8.1 % of stroke, warns',
         'errs by 41 %',
-        'unexplained, errs by 41, then 14 % of stroke, warns',
+        'unexplained, errs by 41, then 41 % of stroke, warns',
     ),
     'two levels only': (
         'refused: r.npz: from 0 to 5 s the voltage moves',

@@ -30,6 +30,7 @@ from piezo_ident.diagnosis.results import (
     Residual,
 )
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.scatter import refit_holds
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import (
@@ -101,7 +102,9 @@ def assemble(
     after = errors_of(rows, held_out_residual(rows, fitted), lost)
     lasting = [name for name in findings.effects if not find_effect(name).time_driven]
     worth = WORTH_IN_DOUBT if findings.verdict == 'unexplained' else WORTH_REFIT
-    if not findings.effects and refit.overall > (1.0 - worth) * before.overall:
+    if not findings.effects and (
+        refit.overall > (1.0 - worth) * before.overall or not refit_holds(rows, e_given, base)
+    ):
         state, refined, after = given, model, before
     elif findings.effects and not lasting:
         # H was refitted beside a drift that another record will not repeat

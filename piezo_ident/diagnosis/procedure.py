@@ -121,7 +121,7 @@ def diagnose(
     rounds, taken, fitted = search.run(base)
     if not taken:
         fitted = base
-    findings = judge(rows, base, fitted, taken, noise, search.left_out)
+    findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
     progress('verdict', 0.0)
     result = assemble(
         simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings
@@ -179,6 +179,8 @@ class _Search:
         tried = have | {effect.name for effect in self._candidates}
         #: effects that nobody can find, since they are not tried
         self.left_out = frozenset(catalogue()) - tried
+        #: what an effect that bent G would leave, where a linear change was preferred
+        self.bent: Round | None = None
         self._count = 0
 
     def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:
@@ -192,9 +194,20 @@ class _Search:
         linear, bent = self._round(base), None
         if self._left(linear) > self._least:
             bent = self._round(retuned)
-        if bent is not None and self._left(bent) < BENT * self._left(linear):
-            return self._from(retuned, bent)
+        if bent is not None and self._is_taken(bent):
+            if self._left(bent) < BENT * self._left(linear):
+                return self._from(retuned, bent)
+            self.bent = bent
         return self._from(base, linear)
+
+    def _is_taken(self, first: Round) -> bool:
+        explainable = max(first.before.mean_square - self._noise, 0.0)
+        return self._takes(first, explainable, first=True)
+
+    def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
+        rows = self._simulator.rows
+        # a branch that was passed once only cannot be held out
+        return rows.passes >= PASSES and takes(rows, this, self._noise, explainable, first=first)
 
     @property
     def _least(self) -> float:
@@ -222,12 +235,9 @@ class _Search:
 
     def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
         simulator, fitted, this = self._simulator, start, first
-        rows = simulator.rows
         rounds, taken = [first], list[Round]()
         explainable = max(start.mean_square - self._noise, 0.0)
-        # a branch that was passed once only cannot be held out
-        testable = rows.passes >= PASSES
-        while testable and takes(rows, this, self._noise, explainable, first=not taken):
+        while self._takes(this, explainable, first=not taken):
             taken.append(this)
             fitted, dropped = drop_needless(
                 self._simulator, this.contenders[0].fitted, self._least

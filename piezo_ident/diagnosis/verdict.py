@@ -26,6 +26,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from piezo_ident.diagnosis.apart import experiment_for, look_alikes, rivals_of
 from piezo_ident.diagnosis.fit import Fitted
 from piezo_ident.diagnosis.results import (
     Candidate,
@@ -35,10 +36,10 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Contender, Round
+from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import catalogue, find_effect
 
-__all__ = ['Findings', 'candidates_of', 'judge', 'rivals_of', 'takes', 'untestable_of']
+__all__ = ['Findings', 'candidates_of', 'judge', 'takes', 'untestable_of']
 
 #: least share of the explainable part that a name stands for; below the second nothing is added
 NAMED, ADDED = 0.92, 0.5
@@ -50,25 +51,8 @@ BEYOND_CHANCE = 1.5
 FURTHER = 0.6
 #: how much an effect may raise the error of any kind of excitation
 HARM = 1.25
-#: a rival that leaves less than this times what the best one leaves is not told from it
-AHEAD = 1.6
-#: a rival with more parameters must leave less than this times what the best one leaves
-BOUGHT = 0.95
-#: what two effects may leave without a difference, % of stroke: H is never right to more than that
-INDISTINCT = 0.01
-#: effects that imitate each other on most data: one is no answer while another was not tried
-LOOK_ALIKES = (
-    ('creep', 'thermal_drift', 'gain_drift'),
-    ('creep', 'rate_dependent_hysteresis'),
-    ('even_nonlinearity', 'preload_loss', 'noncongruent_minor_loops'),
-    ('even_nonlinearity', 'sensor_nonlinearity'),
-    ('noncongruent_minor_loops', 'sensor_nonlinearity'),
-    ('slew_limit', 'amplifier_lag'),
-    # all linear
-    ('delay_change', 'amplifier_lag', 'changed_dynamics', 'input_feedthrough'),
-    # both act where a full stroke turns
-    ('backlash', 'saturation'),
-)
+#: names of a class, at most
+MOST = 3
 #: a candidate is not testable when a refit of the base swallows all but this share of it
 SWALLOWED = 1e-4
 
@@ -143,21 +127,6 @@ def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
     return bool(np.any(other > HARM**2 * one + trifle))
 
 
-def rivals_of(rows: Rows, this: Round, noise: float) -> tuple[Contender, ...]:
-    """Return the contenders that the data do not tell from the best one."""
-    best, *others = this.contenders
-    floor = (INDISTINCT * rows.stroke / 100.0) ** 2
-    left = max(best.fitted.mean_square - noise, 0.0) + floor
-    size = len(best.fitted.handles)
-    return tuple(
-        c
-        for c in others
-        # more parameters should have bought something
-        if max(c.fitted.mean_square - noise, 0.0) + floor
-        <= left * (AHEAD if len(c.fitted.handles) <= size else BOUGHT)
-    )
-
-
 def judge(
     rows: Rows,
     base: Fitted,
@@ -165,6 +134,7 @@ def judge(
     taken: Sequence[Round],
     noise: float,
     left_out: Collection[str] = (),
+    bent: Round | None = None,
 ) -> Findings:
     """
     Return the verdict.
@@ -180,6 +150,8 @@ def judge(
         Mean square of the noise of a row.
     left_out : collection of str, optional
         Effects that were not tried.
+    bent : Round, optional
+        What else the first one may have been: an effect that bent G at the identification.
     """
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
@@ -191,28 +163,24 @@ def judge(
     share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
     rest = Unexplained(1.0 - share, percent(rows, left), '')
-    groups = [
-        (this.contenders[0].name, *(c.name for c in rivals_of(rows, this, noise)))
-        for this in taken
-    ]
     if share < NAMED:
         return Findings('partly_explained', share, effects, None, rest)
-    for names in groups:
-        untried = [name for name in _look_alikes(names[0]) if name in left_out]
+    for i, this in enumerate(taken):
+        contenders = (*this.contenders, *(bent.contenders[:1] if bent and i == 0 else ()))
+        # what the effects after it account for is held against none of them
+        rest_of = max(this.contenders[0].fitted.mean_square - fitted.mean_square, 0.0) + noise
+        size = (base if i == 0 else this.before).mean_square
+        rivals = rivals_of(rows, contenders, rest_of, size - rest_of)
+        names = tuple(dict.fromkeys((effects[i], *(c.name for c in rivals))))
+        untried = [name for name in look_alikes(names[0]) if name in left_out]
         if len(names) > 1 or untried:
-            group = _class((*names, *untried)[:3], untried)
+            group = _class((*names, *untried)[:MOST], untried)
             return Findings('class', share, effects, group, rest)
     return Findings('named', share, effects, None, rest)
 
 
-def _look_alikes(name: str) -> list[str]:
-    found = dict.fromkeys(other for group in LOOK_ALIKES if name in group for other in group)
-    return [other for other in found if other != name]
-
-
 def _class(names: Sequence[str], untried: Sequence[str]) -> Class:
-    needs = dict.fromkeys(find_effect(name).needs for name in names)
-    todo = 'record ' + '; and '.join(n for n in needs if n)
+    todo = f'record {experiment_for(names)}'
     if untried:
         todo = f'diagnose again with {" and ".join(untried)} among the candidates; {todo}'
     return Class(tuple(names), todo)

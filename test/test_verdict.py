@@ -1,0 +1,271 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The rules of a verdict, on made-up errors of blocks: what is told apart, and what is kept."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from piezo_ident.diagnosis import procedure
+from piezo_ident.diagnosis.apart import CONTAINS, experiment_for, LOOK_ALIKES, rivals_of
+from piezo_ident.diagnosis.scatter import refit_holds, standard_errors
+from piezo_ident.diagnosis.verdict import judge, takes
+from piezo_ident.effects import catalogue, find_effect
+import pytest
+
+BLOCKS, SIZE = 80, 50
+#: mean square of an effect of 1 % of stroke; of one of 10 %, what the base leaves
+WHOLE = 1e-4
+FLAT = np.ones(BLOCKS)
+
+
+@pytest.fixture
+def rows():
+    """Return a stroke of one in eighty blocks of fifty rows, ten blocks of each kind."""
+    return SimpleNamespace(
+        n=BLOCKS * SIZE,
+        stroke=1.0,
+        block=np.repeat(np.arange(BLOCKS), SIZE),
+        group=np.arange(BLOCKS) // 10,
+        labels=tuple(f'kind {i}' for i in range(8)),
+        of_record=np.zeros(BLOCKS * SIZE, dtype=int),
+    )
+
+
+def fitted(mean_square, shape=FLAT, handles=3, transfer=None):
+    """Return a fit that leaves this mean square, spread over the blocks like a shape."""
+    errors = mean_square * BLOCKS * SIZE * shape / shape.sum()
+    return SimpleNamespace(
+        errors=errors,
+        transfer=errors if transfer is None else transfer,
+        mean_square=errors.sum() / (BLOCKS * SIZE),
+        handles=(None,) * handles,
+    )
+
+
+def contender(name, share_left, **kwargs):
+    fit = fitted(share_left * WHOLE, **kwargs)
+    return SimpleNamespace(name=name, effect=find_effect(name), fitted=fit)
+
+
+def a_round(*contenders, before=WHOLE):
+    return SimpleNamespace(before=fitted(before), contenders=contenders, chance={}, best={})
+
+
+def rivals(rows, *contenders):
+    return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE)]
+
+
+# -- which candidates are told apart -----------------------------------------------------------
+
+
+def test_a_clear_lead_tells_apart(rows):
+    best = contender('sensor_nonlinearity', 0.004)
+    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.02, handles=6))
+    assert not rivals(rows, best, contender('even_nonlinearity', 0.02, handles=3))
+    assert rivals(rows, best, contender('even_nonlinearity', 0.005, handles=3))
+
+
+def test_the_simpler_law_that_fits_is_taken_before_a_richer_one_that_fits_as_well(rows):
+    best = contender('sensor_nonlinearity', 0.004)
+    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.004, handles=6))
+    # too much is left for that: neither has the form of the effect, and a tie is a tie
+    best = contender('sensor_nonlinearity', 0.03)
+    rival = contender('noncongruent_minor_loops', 0.033, handles=6)
+    assert rivals(rows, best, rival) == ['noncongruent_minor_loops']
+
+
+def test_a_law_that_holds_the_other_as_a_part_does_not_rival_it_by_a_tie(rows):
+    best = contender('delay_change', 0.03, handles=1)
+    assert not rivals(rows, best, contender('changed_dynamics', 0.03, handles=4))
+    assert rivals(rows, best, contender('changed_dynamics', 0.01, handles=4))
+
+
+def test_a_rich_law_does_not_rule_out_a_simple_one_that_fits(rows):
+    best = contender('changed_dynamics', 0.001, handles=4)
+    assert rivals(rows, best, contender('amplifier_lag', 0.003, handles=1)) == ['amplifier_lag']
+    assert not rivals(rows, best, contender('amplifier_lag', 0.006, handles=1))
+    # one that does not fit is ruled out by less
+    best = contender('changed_dynamics', 0.02, handles=4)
+    assert not rivals(rows, best, contender('amplifier_lag', 0.06, handles=1))
+
+
+def test_a_lead_that_one_block_makes_is_no_lead(rows):
+    one = FLAT.copy()
+    one[7] = BLOCKS
+    best = contender('saturation', 0.02)
+    assert rivals(rows, best, contender('backlash', 0.04, shape=one)) == ['backlash']
+    assert not rivals(rows, best, contender('backlash', 0.04))
+    # twice as much in rms is a lead wherever it comes from
+    assert not rivals(rows, best, contender('backlash', 0.12, shape=one))
+
+
+def test_standard_errors_pair_the_blocks():
+    assert standard_errors(np.zeros(5)) == 0.0
+    assert standard_errors(np.ones(5)) == np.inf
+    hard = np.array([100.0, 1.0, 50.0, 3.0])
+    assert standard_errors(1.1 * hard - hard) == pytest.approx(standard_errors(hard), rel=1e-6)
+    assert abs(standard_errors(np.array([1.0, -1.0, 1.0, -1.1]))) < 0.2
+
+
+# -- the verdict -------------------------------------------------------------------------------
+
+
+def verdict(rows, taken, left, bent=None):
+    return judge(rows, fitted(WHOLE), fitted(left * WHOLE), taken, 0.0, (), bent)
+
+
+def test_a_tie_of_laws_that_do_not_fit_is_a_class(rows):
+    this = a_round(
+        contender('sensor_nonlinearity', 0.03),
+        contender('noncongruent_minor_loops', 0.035, handles=6),
+    )
+    found = verdict(rows, [this], 0.03)
+    assert found.verdict == 'class'
+    assert found.group.names == ('sensor_nonlinearity', 'noncongruent_minor_loops')
+    assert 'minor loops of two widths' in found.group.separating_experiment
+
+
+def test_what_a_later_effect_explains_is_held_against_no_candidate_of_the_first(rows):
+    first = a_round(contender('creep', 0.3), contender('thermal_drift', 0.4))
+    second = a_round(contender('saturation', 0.002), before=0.3 * WHOLE)
+    assert verdict(rows, [first, second], 0.002).verdict == 'named'
+    # without it the two left about the same
+    assert verdict(rows, [first], 0.07).verdict == 'named'
+    close = a_round(contender('creep', 0.06), contender('thermal_drift', 0.08))
+    assert verdict(rows, [close], 0.06).group.names == ('creep', 'thermal_drift')
+
+
+def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
+    linear = a_round(contender('changed_dynamics', 0.04, handles=4))
+    bent = a_round(contender('backlash', 0.02, handles=6), before=0.1 * WHOLE)
+    assert verdict(rows, [linear], 0.04).verdict == 'named'
+    found = verdict(rows, [linear], 0.04, bent)
+    assert found.group.names == ('changed_dynamics', 'backlash')
+
+
+def test_an_effect_that_shows_in_one_kind_alone_is_taken(rows):
+    # nothing is known of it where this kind is left out
+    best = contender('slew_limit', 0.05, transfer=1e3 * fitted(WHOLE).errors)
+    assert takes(rows, a_round(best), 0.0, WHOLE, first=True)
+
+
+def test_an_effect_that_costs_a_kind_is_not(rows):
+    worse = np.where(rows.group == 2, 1.0, 0.05)
+    best = contender('creep', 0.3, shape=worse)
+    assert not takes(rows, a_round(best), 0.0, WHOLE, first=True)
+
+
+# -- a change of G, or an effect that bent it ---------------------------------------------------
+
+
+@pytest.fixture
+def choose(rows, monkeypatch):
+    """Return what a search starts from, given what either round leaves, and the rival it keeps."""
+
+    def chosen(linear, bent):
+        search = object.__new__(procedure._Search)
+        search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
+        search._noise, search.bent = 0.0, None
+        rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
+        starts = {
+            key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
+            for key, this in rounds.items()
+        }
+        monkeypatch.setattr(procedure, 'fit_jointly', lambda *_: starts['retuned'])
+        monkeypatch.setattr(procedure, 'replace', lambda *_, **__: None)
+        search._round = lambda start: rounds[next(k for k, v in starts.items() if v is start)]
+        search._from = lambda start, first: next(k for k, v in starts.items() if v is start)
+        return search.run(starts['as it is']), search.bent
+
+    return chosen
+
+
+def test_an_effect_that_explains_much_more_beside_a_bent_g_is_preferred(choose):
+    start, bent = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.005))
+    assert start == 'retuned' and bent is None
+
+
+def test_one_that_explains_about_as_much_stays_a_rival(choose):
+    start, bent = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.02))
+    assert start == 'as it is' and bent.contenders[0].name == 'backlash'
+
+
+def test_a_bent_g_beside_which_nothing_is_an_effect_does_not_hide_the_linear_one(choose):
+    # much less is left, but by the four numbers of the retuning, not by the effect
+    start, bent = choose(contender('amplifier_lag', 0.9), contender('amplifier_lag', 0.045))
+    assert start == 'as it is' and bent is None
+
+
+# -- a refit of H ------------------------------------------------------------------------------
+
+
+def residual(rows, rms=0.001, shift=0.0):
+    signs = np.where(np.arange(rows.n) % 2, 1.0, -1.0)
+    # blocks differ a little, as they do
+    return rms * signs * (1.0 + 0.1 * np.sin(rows.block)) + shift
+
+
+def refit(transfer):
+    return SimpleNamespace(transfer=np.asarray(transfer))
+
+
+def test_a_refit_that_helps_everywhere_is_kept(rows):
+    e = residual(rows)
+    assert refit_holds(rows, e, refit(np.full(BLOCKS, 0.5 * 1e-6 * SIZE)))
+
+
+def test_a_refit_that_costs_a_kind_of_excitation_is_not(rows):
+    left = np.full(BLOCKS, 0.5 * 1e-6 * SIZE)
+    left[rows.group == 3] = 1.3 * 1e-6 * SIZE
+    assert not refit_holds(rows, residual(rows), refit(left))
+
+
+def test_what_a_shift_of_the_record_does_is_no_merit_of_a_refit(rows):
+    e = residual(rows, shift=0.01)
+    assert not refit_holds(rows, e, refit(np.full(BLOCKS, 1.02e-6 * SIZE)))
+    assert refit_holds(rows, e, refit(np.full(BLOCKS, 0.5e-6 * SIZE)))
+
+
+def test_a_gain_in_one_block_is_within_its_scatter(rows):
+    e = residual(rows)
+    e[rows.block == 11] *= 20.0
+    left = np.bincount(rows.block, residual(rows) ** 2)
+    assert not refit_holds(rows, e, refit(left))
+
+
+# -- what would part them ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('group', LOOK_ALIKES)
+def test_look_alikes_come_with_an_experiment(group):
+    assert set(group) <= set(catalogue())
+    assert len(experiment_for(group)) > 20
+
+
+def test_the_order_of_names_does_not_matter():
+    pair = ('sensor_nonlinearity', 'noncongruent_minor_loops')
+    assert experiment_for(pair) == experiment_for(pair[::-1])
+
+
+def test_a_pair_that_no_rule_speaks_of_says_what_each_needs():
+    pair = ('cross_coupling', 'slew_limit')
+    assert experiment_for(pair) == '; and '.join(find_effect(name).needs for name in pair)
+
+
+def test_a_law_is_richer_than_those_that_it_contains():
+    for name, parts in CONTAINS.items():
+        assert {name, *parts} <= set(catalogue())
+        count = len(find_effect(name).parameters)
+        assert all(len(find_effect(part).parameters) < count for part in parts)
