@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.bag_samples import (
+    BagSamples,
     carried_quantities,
     MESSAGE_TYPE,
     opened_samples,
@@ -62,6 +63,7 @@ __all__ = [
     'SAMPLE_QOS',
     'carried_quantities',
     'read_bag',
+    'record_in',
     'typestore',
     'write_bag',
 ]
@@ -128,14 +130,30 @@ def read_bag(
         streams = {quantity: Stream() for quantity in source.topics}
         for quantity, samples, stamp in source.blocks():
             streams[quantity].append(samples, stamp)
+    return record_in(source, streams, displacement_unit, voltage_limits)
+
+
+def record_in(
+    source: BagSamples,
+    streams: Mapping[str, Stream],
+    displacement_unit: str = 'm',
+    voltage_limits: tuple[float, float] | None = None,
+) -> Record:
+    """
+    Return the record of all samples of a bag; parameters are those of `read_bag`.
+
+    Raises
+    ------
+    DataError
+    """
     return record_of_streams(
         streams,
-        name=str(path),
+        name=str(source.path),
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
         sample_rate=source.sample_rate,
         faults=source.faults,
-    ).renamed(path.name)
+    ).renamed(source.path.name)
 
 
 def write_bag(

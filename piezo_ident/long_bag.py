@@ -36,7 +36,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.bag_io import read_bag
+from piezo_ident.bag_io import read_bag, record_in
 from piezo_ident.bag_samples import BagSamples, opened_samples
 from piezo_ident.capture import record_of_streams, tolerance_of
 from piezo_ident.errors import DataError
@@ -100,14 +100,7 @@ def read_long_bag(
     with opened() as source:
         streams = _collected(source, 2 * window)
     if streams is not None:
-        return record_of_streams(
-            streams,
-            name=str(path),
-            displacement_unit=displacement_unit,
-            voltage_limits=voltage_limits,
-            sample_rate=source.sample_rate,
-            faults=source.faults,
-        ).renamed(path.name)
+        return record_in(source, streams, displacement_unit, voltage_limits)
     reading = _Reading(opened, path, displacement_unit, window)
     overall = Overall(voltage_limits)
     try:
