@@ -170,9 +170,17 @@ class Taps:
         return met
 
     def close(self) -> None:
-        """Take back all subscriptions."""
+        """Take back all subscriptions; from any thread."""
+        self._closed = True
+        executor = self._node.executor
+        if executor is None:
+            self._destroy_all()
+        else:
+            # one that goes while the executor gathers what to wait for breaks it
+            executor.create_task(self._destroy_all)
+
+    def _destroy_all(self) -> None:
         with self._lock:
-            self._closed = True
             for tap in self._taps.values():
                 self._destroy(tap)
 

@@ -61,8 +61,10 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
@@ -250,7 +252,7 @@ class Graph:
             DiagnosticStatus, f'/{name}/status', lambda _: came.set(), HEARD
         )
         self.wait(came.is_set, f'{name} to know of its readers', meanwhile=meanwhile)
-        self.node.destroy_subscription(last)
+        self.forget(last)
 
     # looking
 
@@ -488,4 +490,19 @@ class Graph:
 
     def unpublish(self, topic: str) -> None:
         """Take back the publisher of a topic."""
-        self.node.destroy_publisher(self._publishers.pop(topic))
+        self.forget(self._publishers.pop(topic))
+
+    def forget(self, entity: Publisher | Subscription) -> None:
+        """Take back a publisher or a subscription, between two turns of the observer."""
+        # rclpy's executor ends when an entity goes while it gathers what to wait for
+        gone = threading.Event()
+
+        def destroy() -> None:
+            if isinstance(entity, Publisher):
+                self.node.destroy_publisher(entity)
+            else:
+                self.node.destroy_subscription(entity)
+            gone.set()
+
+        self._executor.create_task(destroy)
+        self.wait(gone.is_set, f'{entity.topic_name} to be forgotten')

@@ -274,7 +274,7 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         # it may take a moment to know of it
         g.wait(lambda: said in play(g)['message'], said)
         assert state(g) == 'failed'
-        g.node.destroy_publisher(other)
+        g.forget(other)
         g.wait(lambda: len(voltage) >= 7, 'the blocks in flight')
         assert len(voltage) == 7
         # a second publisher
@@ -290,7 +290,7 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
 
         g.wait(is_refused, 'the refusal')
         g.wait(lambda: state(g) not in ('waiting', 'running', 'stopping'), 'rest')
-        g.node.destroy_publisher(second)
+        g.forget(second)
         # one that comes while a programme is played is reported
         g.wait(lambda: g.call('excitation/start')[0], 'the start')
         g.wait(lambda: state(g) == 'running', 'running')

@@ -360,7 +360,7 @@ def test_blocks_of_a_second_publisher_change_nothing(rig):
             lambda: int(g.diagnostics('stage')['refused_second']) == before + 3, 'three refused'
         )
     finally:
-        g.node.destroy_publisher(second)
+        g.forget(second)
     models = len(rig.models)
     end = identified(g)
     assert (end['state'], end['level']) == ('done', '1'), end

@@ -227,7 +227,7 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
             assert row[f'prediction/{what}'] == pytest.approx(value, rel=1e-9)
             assert row[f'displacement/{what}'] == pytest.approx(value + 2e-9, rel=1e-9)
             assert row[f'residual/{what}'] == pytest.approx(2e-9, rel=1e-6)
-    fast.node.destroy_subscription(subscription)
+    fast.forget(subscription)
 
 
 def test_faults_of_the_stream_are_said_and_survived(fast):

@@ -277,5 +277,5 @@ def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
         lab.wait(lambda: got[-1].t[-1] == seen[-1].t[-1], 'what is applied')
         assert column(got[applied:])[1].max() == 3.0
     finally:
-        lab.node.destroy_publisher(second)
+        lab.forget(second)
     idle(lab)

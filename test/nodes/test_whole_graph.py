@@ -183,7 +183,7 @@ def test_diagnostics_are_those_of_the_table(whole):
         stamps.setdefault(status.name, []).append(stamp.sec + 1e-9 * stamp.nanosec)
     assert set(stamps) == {f'/{node}' for node in NODES}
     assert 0.8 < np.median(np.concatenate([np.diff(t) for t in stamps.values()])) < 1.5
-    whole.node.destroy_subscription(subscription)
+    whole.forget(subscription)
 
 
 @pytest.mark.parametrize('node', NODES)
