@@ -110,6 +110,17 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
     assert after < before / 3
 
 
+def test_of_a_long_record_the_beginning_is_used_and_the_rest_is_the_check(truths):
+    model, record, unseen = measured('creep', 0.3, 1)
+    result = diagnose(model, record, DiagnosisSettings(most_samples=record.n * 2 // 3))
+    assert [e.name for e in result.effects] == ['creep'], result.sentence
+    before, after = unseen_errors(result, unseen)
+    assert after < before / 3
+    (said,) = [w for w in result.warnings if 'samples were used' in w]
+    assert 'changes later' not in said
+    assert sum(part.piece.n for part in result.residuals) == record.n * 2 // 3
+
+
 def test_effect_outside_the_catalogue_stays_unexplained(truths):
     model, record, unseen = measured('floor_vibration', 0.3, 1)
     result = diagnose(model, record)

@@ -278,6 +278,13 @@ def _build_parser() -> _Parser:
     p.add_argument(
         '--most-effects', type=_whole, default=4, metavar='N', help='to be added (default: 4)'
     )
+    p.add_argument(
+        '--most-samples',
+        type=_whole,
+        default=6_000_000,
+        metavar='N',
+        help='to be used of the beginnings of records; the rest is a check (default: 6000000)',
+    )
     p.add_argument('--seed', type=_whole, default=0, help='of what is drawn (default: 0)')
 
     p = verb('convert', 'Turn a record into another format', _reading(), _json())

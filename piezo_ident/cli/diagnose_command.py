@@ -104,6 +104,7 @@ def _settings(args: argparse.Namespace) -> DiagnosisSettings:
         effects=only or None,
         without=without,
         most_effects=args.most_effects,
+        most_samples=args.most_samples,
         seed=args.seed,
     )
 

@@ -31,6 +31,7 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.diagnosis.assemble import assemble, PASSES
+from piezo_ident.diagnosis.beginnings import beginnings, said_of
 from piezo_ident.diagnosis.fit import (
     base_thresholds,
     fit_base,
@@ -95,7 +96,8 @@ def diagnose(
         When the records carry nothing to judge.
     """
     settings = settings or DiagnosisSettings()
-    records = [records] if isinstance(records, Record) else list(records)
+    whole = [records] if isinstance(records, Record) else list(records)
+    records = beginnings(whole, settings.most_samples)
     progress('residual', 0.0)
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
@@ -126,6 +128,10 @@ def diagnose(
     result = assemble(
         simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings
     )
+    if records != whole:
+        progress('verdict', 0.5)
+        said = said_of(model, result.model, whole, records)
+        result = replace(result, warnings=(*result.warnings, said))
     progress('verdict', 1.0)
     return result
 

@@ -59,6 +59,8 @@ class DiagnosisSettings:
         Candidates to leave out.
     most_effects : int
         Effects that are added at most.
+    most_samples : int
+        Samples of the records that are used at most: their beginnings, about 500 bytes each.
     seed : int
         For everything that is drawn by chance.
 
@@ -71,6 +73,7 @@ class DiagnosisSettings:
     effects: tuple[str, ...] | None = None
     without: tuple[str, ...] = ()
     most_effects: int = 4
+    most_samples: int = 6_000_000
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -81,6 +84,8 @@ class DiagnosisSettings:
                 raise ConfigError(str(error)) from None
         if not 1 <= self.most_effects <= 10:
             raise ConfigError(f'most_effects must be 1 to 10, got {self.most_effects}')
+        if self.most_samples < 1000:
+            raise ConfigError(f'most_samples must be at least 1000, got {self.most_samples}')
         if self.seed < 0:
             raise ConfigError(f'seed must not be negative, got {self.seed}')
 
