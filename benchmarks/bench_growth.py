@@ -32,7 +32,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from collections.abc import Callable, Sequence
 import json
 from pathlib import Path
-import resource
 import shutil
 import subprocess
 import sys
@@ -40,39 +39,18 @@ import tempfile
 import time
 
 from growth_of_bags import BAG_BYTES, BAG_MEASURES, Measure, paper, RATE, sine, SPARE
+from growth_of_fits import base_model, beginnings, EFFECT, FIT_MEASURES, labelled, to_diagnose
 import numpy as np
 from piezo_ident.arx import arx_factor, scan_orders
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.hysteresis_fit import Excerpt, factorise, fit_hysteresis
-from piezo_ident.identification import identify
 from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, save_model
-from piezo_ident.program import load_program, parse_program
-from piezo_ident.record import Piece, Record, Segment
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from side_by_side import markdown, seconds, take_turns, versions
+from side_by_side import markdown, peak_memory, seconds, take_turns, versions
 
-#: the effect that the diagnosed stage has, and its size [% of stroke]
-EFFECT, SIZE = 'creep', 0.3
 #: points at the large end through which the exponent is drawn
 LARGE_END = 3
-#: seconds of the identification record of which the longer ones are multiples
-PROGRAM = """
-limits: [0, 10]
-sample_rate: 20000
-seed: 1
-slew: 20
-segments:
-  - {{signal: idle, duration: 0.3}}
-  - {{signal: step, bias: 5, size: 1, hold: 0.06, count: {steps}}}
-  - {{signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 20}}
-  - {{signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: {noise}}}
-  - {{signal: triangle, slope: {slope}}}
-  - {{signal: idle, duration: 0.3}}
-"""
 
 # -- what a child measures: (size, folder) -> seconds, number of samples -----------------------
 
@@ -99,70 +77,6 @@ def stream(size: float, folder: Path) -> Measure:
     return time.perf_counter() - start, round(size) * v.size
 
 
-def labelled(times: float) -> Record:
-    """Return the identification record with noise, steps and triangle so many times as long."""
-    text = PROGRAM.format(steps=2 * round(8 * times), noise=5 * times, slope=6 / times)
-    stage = load_stage(find_config('paper', 'stage'))
-    return simulate(stage, parse_program(text).build(RATE), np.random.default_rng(0))
-
-
-def identifying(size: float, folder: Path) -> Measure:
-    """Identify by the three steps; the record of 15.5 s has everything as it is shipped."""
-    identify(labelled(0.5))
-    record = labelled(size / 15.5)
-    start = time.perf_counter()
-    identify(record)
-    return time.perf_counter() - start, record.n
-
-
-def to_diagnose(size: float, seed: int = 1) -> Record:
-    """Return the answer of a stage with an effect to the diagnosis programme, over and over."""
-    from truths import make_stage, programme
-
-    _, v, labels = programme('diagnosis', seed)
-    n = round(size * RATE)
-    count = -(-n // v.size)
-    segments = [
-        (
-            label if not k else f'{label}{"" if ":" in label else ":"}r{k}',
-            a + k * v.size,
-            b + k * v.size,
-        )
-        for k in range(count)
-        for label, a, b in labels
-    ]
-    v = np.tile(v, count)[:n]
-    stage = make_stage(EFFECT, SIZE, seed, noise='white')
-    y = stage.respond(np.arange(n) / RATE, v, changed=True, channels=None)
-    kept = tuple(Segment(label, a, min(b, n)) for label, a, b in segments if a < n)
-    return Record((Piece(v, y, RATE, segments=kept),), 'diagnosis')
-
-
-def base_model(folder: Path, seed: int = 1) -> StageModel:
-    """Return the model of the stage that is diagnosed, identified before the effect."""
-    from truths import make_stage
-
-    path = folder / 'base.yaml'
-    if not path.exists():
-        stage = make_stage(EFFECT, SIZE, seed, noise='white')
-        sequence = load_program(find_config('identification', 'program')).build(RATE)
-        t = np.arange(sequence.n) / RATE
-        y = stage.respond(t, sequence.v, changed=False, channels=None)
-        piece = Piece(sequence.v, y, RATE, segments=tuple(sequence.segments))
-        save_model(identify(Record((piece,), 'identification')).model, path)
-    return load_model(path)
-
-
-def diagnosing(size: float, folder: Path) -> Measure:
-    """Diagnose with the whole catalogue."""
-    model = base_model(folder)
-    diagnose(model, to_diagnose(17.0), DiagnosisSettings(effects=(EFFECT,)))
-    record = to_diagnose(size)
-    start = time.perf_counter()
-    diagnose(model, record, DiagnosisSettings())
-    return time.perf_counter() - start, record.n
-
-
 def nothing(size: float, folder: Path) -> Measure:
     """Import all, and predict a little: the memory that is there before any record."""
     paper().stream().process(np.zeros(10))
@@ -174,19 +88,8 @@ MEASURES: dict[str, Callable[[float, Path], Measure]] = {
     'predict': predict,
     'stream': stream,
     **BAG_MEASURES,
-    'identify': identifying,
-    'diagnose': diagnosing,
+    **FIT_MEASURES,
 }
-
-
-def peak_memory() -> float:
-    """Return the peak resident memory of this process [MiB]."""
-    try:
-        # ru_maxrss would count what the parent had before this program was loaded
-        status = Path('/proc/self/status').read_text(encoding='utf-8')
-        return int(status.partition('VmHWM:')[2].split()[0]) / 1024.0
-    except (OSError, ValueError, IndexError):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def measured(kind: str, size: float, folder: Path) -> tuple[float, float, float]:
@@ -276,7 +179,7 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
         ),
         'identify': (
             'Identification, the three steps',
-            (15.5,) if quick else (15.5, 31, 62, 124),
+            (15.5,) if quick else (15.5, 31, 62, 124, hour),
         ),
         'diagnose': (
             f'Diagnosis, {len(catalogue())} candidates',
@@ -296,6 +199,7 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
         if kind == 'predict_bag':
             for path in folder.glob('bag_*'):
                 shutil.rmtree(path)
+    text += [beginnings(quick, folder), '']
     intro = (
         f'At {RATE / 1000:g} kHz, each length in a process of its own. The exponent is the slope '
         'of log time over log length through the '

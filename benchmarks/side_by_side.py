@@ -25,12 +25,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+import resource
 import time
 from typing import Any
 
 import numpy as np
 
-__all__ = ['Turn', 'markdown', 'ratio', 'seconds', 'take_turns', 'version_of', 'versions']
+__all__ = [
+    'Turn',
+    'markdown',
+    'peak_memory',
+    'ratio',
+    'seconds',
+    'take_turns',
+    'version_of',
+    'versions',
+]
 
 
 @dataclass
@@ -105,6 +116,16 @@ def seconds(t: float) -> str:
 def ratio(x: float) -> str:
     """Return a ratio with a sensible number of digits."""
     return f'{x:.0f}' if x >= 100 else f'{x:.3g}'
+
+
+def peak_memory() -> float:
+    """Return the peak resident memory of this process [MiB]."""
+    try:
+        # ru_maxrss would count what the parent had before this program was loaded
+        status = Path('/proc/self/status').read_text(encoding='utf-8')
+        return int(status.partition('VmHWM:')[2].split()[0]) / 1024.0
+    except (OSError, ValueError, IndexError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

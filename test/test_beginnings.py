@@ -85,7 +85,7 @@ def test_errors_on_both_sides_are_those_of_the_prediction(monkeypatch, window):
 def test_a_change_behind_what_was_used_is_said():
     same, changed = record_of(20_000), record_of(20_000, wrong=0.02, since=12_000)
     text = said_of(PAPER, PAPER, [same], beginnings([same], 5000))
-    assert text.startswith('5,000 of 20,000 samples were used, the first 0.25 s of 1 s')
+    assert text.startswith('5,000 of 20,000 samples were searched, the first 0.25 s of 1 s')
     assert 'changes later' not in text
     text = said_of(PAPER, PAPER, [changed], beginnings([changed], 5000))
     assert text.endswith('something changes later: give that part as a record of its own')

@@ -24,6 +24,8 @@ import sys
 
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
+from piezo_ident.diagnosis import rows as rows_module
+from piezo_ident.diagnosis import simulator as simulator_module
 from piezo_ident.diagnosis.fit import base_at, base_thresholds, fit_base, fit_jointly
 from piezo_ident.diagnosis.gain import gram_of, held_out_errors
 from piezo_ident.diagnosis.rows import make_rows
@@ -116,7 +118,7 @@ def test_of_a_long_record_the_beginning_is_used_and_the_rest_is_the_check(truths
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     before, after = unseen_errors(result, unseen)
     assert after < before / 3
-    (said,) = [w for w in result.warnings if 'samples were used' in w]
+    (said,) = [w for w in result.warnings if 'samples were searched' in w]
     assert 'changes later' not in said
     assert sum(part.piece.n for part in result.residuals) == record.n * 2 // 3
 
@@ -255,6 +257,28 @@ def test_columns_near_the_optimum_are_derivatives(truths):
     np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-9)
     fitted = fit_jointly(simulator, state, base)
     assert fitted.mean_square < 1e-6
+
+
+@pytest.mark.parametrize('m', [12, 30, 49])
+def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
+    model, record, _ = measured('creep', 0.3, 1)
+    monkeypatch.setattr(rows_module, 'MOST_ROWS', record.n // m + 1)
+    rows = make_rows(model, [record])
+    assert rows.m == m
+    assert rows.n == record.n // m
+
+
+@pytest.mark.parametrize('window', [1, 100, 5003])
+def test_windows_change_nothing(truths, monkeypatch, window):
+    model, record, _ = measured('creep', 0.3, 1)
+    simulator = Simulator(model, make_rows(model, [Record((record.pieces[0].cut(0, 20_000),))]))
+    added = Added('creep', ({'gain': [0.01, 0.02], 'time_constant': [0.1, 1.0]},))
+    state = State(model.hysteresis, np.zeros(1), (added,))
+    whole = simulator.remember(state)
+    monkeypatch.setattr(simulator_module, 'WINDOW', window)
+    assert simulator.run(state).tobytes() == whole.tobytes()
+    (full,) = simulator.full(state)
+    assert full.size == 20_000
 
 
 def test_what_is_kept_from_the_run_before_changes_nothing(truths):

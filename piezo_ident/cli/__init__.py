@@ -283,7 +283,7 @@ def _build_parser() -> _Parser:
         type=_whole,
         default=6_000_000,
         metavar='N',
-        help='to be used of the beginnings of records; the rest is a check (default: 6000000)',
+        help='to be searched, the beginnings of the records (default: 6000000)',
     )
     p.add_argument('--seed', type=_whole, default=0, help='of what is drawn (default: 0)')
 

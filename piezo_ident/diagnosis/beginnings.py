@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Long records are diagnosed from their beginnings, and what follows is the check.
+Of long records the beginnings are searched, and what follows is the check.
 
 A diagnosis holds about 500 bytes a sample, so an hour at 20 kHz would take more memory than a
 computer of the lab has.  Sections spread over the record will not do: creep and hysteresis come
@@ -43,13 +43,14 @@ WORSE = 2.0
 @dataclass(frozen=True)
 class Rest:
     """
-    Free-run errors of a model on what was used and on what was not, % of stroke.
+    Free-run errors of a model on what was used, on what was not, and on all, % of stroke.
 
     ``100 rms(y - y_hat) / (max y - min y)``; the offset of each record is that of what was used.
     """
 
     used: float
     unused: float
+    all: float
 
 
 def beginnings(records: Sequence[Record], most: int) -> list[Record]:
@@ -113,9 +114,9 @@ def rest_of(model: StageModel, records: Sequence[Record], used: Sequence[Record]
         offset = total[0] / max(n[0], 1.0)
         totals += squares - 2.0 * offset * total + n * offset**2
         counts += n
+    totals, counts = np.append(totals, totals.sum()), np.append(counts, counts.sum())
     rms = np.sqrt(np.maximum(totals, 0.0) / np.maximum(counts, 1.0))
-    used_percent, unused_percent = 100.0 * rms / stroke
-    return Rest(float(used_percent), float(unused_percent))
+    return Rest(*(100.0 * rms / stroke).tolist())
 
 
 def said_of(
@@ -126,9 +127,9 @@ def said_of(
     n, of = (sum(r.n for r in some) for some in (used, records))
     seconds, whole = (sum(r.duration for r in some) for some in (used, records))
     text = (
-        f'{n:,} of {of:,} samples were used, the first {seconds:.4g} s of {whole:.4g} s '
+        f'{n:,} of {of:,} samples were searched, the first {seconds:.4g} s of {whole:.4g} s '
         f'(--most-samples): on the rest the model errs by {before.unused:.3g} % of stroke as '
-        f'given and by {after.unused:.3g} % refined, on what was used by {after.used:.3g} %'
+        f'given and by {after.unused:.3g} % refined, on what was searched by {after.used:.3g} %'
     )
     if after.unused > max(WORSE * after.used, SMALLEST):
         text += '; something changes later: give that part as a record of its own'

@@ -44,6 +44,7 @@ from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
+from piezo_ident.diagnosis.whole import fitted_to_all
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.errors import IdentificationError
 from piezo_ident.model import StageModel
@@ -124,6 +125,8 @@ def diagnose(
     if not taken:
         fitted = base
     findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
+    if taken and records != whole:
+        fitted = fitted_to_all(simulator, fitted, whole, records, frequencies, progress)
     progress('verdict', 0.0)
     result = assemble(
         simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings

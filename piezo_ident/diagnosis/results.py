@@ -60,7 +60,7 @@ class DiagnosisSettings:
     most_effects : int
         Effects that are added at most.
     most_samples : int
-        Samples of the records that are used at most: their beginnings, about 500 bytes each.
+        Samples that are searched at most, the beginnings of the records: about 500 bytes each.
     seed : int
         For everything that is drawn by chance.
 

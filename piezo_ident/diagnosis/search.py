@@ -22,19 +22,19 @@ of the same colour would gain sets the bar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
-from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted, ITERATIONS
 from piezo_ident.diagnosis.gain import gram_of
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
 from piezo_ident.errors import ModelError
 
-__all__ = ['Contender', 'Round', 'Tick', 'drop_needless', 'polished', 'search_round']
+__all__ = ['Contender', 'Round', 'Tick', 'afresh', 'drop_needless', 'polished', 'search_round']
 
 #: called with the share of the round that is done; may raise `Cancelled`
 Tick = Callable[[float], None]
@@ -252,26 +252,10 @@ def polished(
         Lines in the residual [Hz].
     tick : callable
     """
-    rows = simulator.rows
-    nothing = np.zeros((rows.n, 0))
-    for i, own in enumerate(fitted.state.effects):
-        others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        state = replace(fitted.state, effects=others)
-        rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
-        now = simulator.remember(rest.state)
-        M, prior = rest.J[:, rest.free], rest.prior[rest.free]
-        base = (M, gram_of(rows, M, rest.e), prior)
-        view = view_of(simulator, lines)
-        trials = list(score_trials(simulator, [own.effect], view, base, rest.e, now, nothing))
-        trials.sort(key=lambda s: float(s.errors.sum()))
-        for start in trials[:STARTS]:
-            effects = list(others)
-            effects.insert(i, started(rows, start))
-            state = replace(rest.state, effects=tuple(effects))
-            with contextlib.suppress(ModelError):
-                fresh = fit_jointly(simulator, state, fitted.base, tick=tick)
-                if fresh.mean_square < fitted.mean_square:
-                    fitted = fresh
+    for i in range(len(fitted.state.effects)):
+        for fresh in afresh(simulator, fitted, i, lines, tick):
+            if fresh.mean_square < fitted.mean_square:
+                fitted = fresh
     for _ in range(PASSES):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
@@ -279,3 +263,43 @@ def polished(
             break
         fitted = fresh
     return fitted
+
+
+def afresh(
+    simulator: Simulator,
+    fitted: Fitted,
+    i: int,
+    lines: Sequence[float],
+    tick: Callable[[], None],
+    iterations: int = ITERATIONS,
+) -> Iterator[Fitted]:
+    """
+    Yield fits in which one effect starts anew, from its best trials beside the others.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    fitted : Fitted
+    i : int
+        Place of the effect.
+    lines : sequence of float
+        Lines in the residual [Hz].
+    tick : callable
+    iterations : int, optional
+        Of each fit.
+    """
+    rows, own = simulator.rows, fitted.state.effects[i]
+    others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+    state = replace(fitted.state, effects=others)
+    rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
+    now = simulator.remember(rest.state)
+    M, prior = rest.J[:, rest.free], rest.prior[rest.free]
+    base = (M, gram_of(rows, M, rest.e), prior)
+    view, nothing = view_of(simulator, lines), np.zeros((rows.n, 0))
+    trials = list(score_trials(simulator, [own.effect], view, base, rest.e, now, nothing))
+    trials.sort(key=lambda s: float(s.errors.sum()))
+    for start in trials[:STARTS]:
+        effects = [*others[:i], started(rows, start), *others[i:]]
+        state = replace(rest.state, effects=tuple(effects))
+        with contextlib.suppress(ModelError):
+            yield fit_jointly(simulator, state, fitted.base, iterations=iterations, tick=tick)

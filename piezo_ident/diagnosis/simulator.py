@@ -22,7 +22,7 @@ the run before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -30,15 +30,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.block import Block, Operator
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import means, Rows
 from piezo_ident.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.model import EffectSetting, StageModel
 from piezo_ident.play import play_columns
 
-__all__ = ['Added', 'Simulator', 'State', 'retuned']
+__all__ = ['WINDOW', 'Added', 'Simulator', 'State', 'retuned']
 
+#: samples that pass the chain at once, about
+WINDOW = 1_000_000
 #: corner frequencies of the relaxations that a retuned G may show [Hz]
 RELAXATIONS = (15.0, 100.0)
 
@@ -158,19 +160,46 @@ class Simulator:
 
     def run(self, state: State) -> NDArray[np.float64]:
         """Return the predicted rows; shape (n,)."""
-        return self.rows.of(self._signals(state, keep=False)) + state.offsets[self.rows.of_record]
+        found = [
+            np.concatenate([means(x, self.rows.m) for x in self.windows(state, i)])[keep]
+            for i, keep in enumerate(self.rows.keep)
+        ]
+        return np.concatenate(found) + state.offsets[self.rows.of_record]
 
     def full(self, state: State) -> list[NDArray[np.float64]]:
         """Return the prediction of each run at the full rate, normalised."""
         return [
-            x + state.offsets[k]
-            for x, k in zip(self._signals(state, keep=False), self.rows.record, strict=True)
+            np.concatenate(list(self.windows(state, i))) + state.offsets[k]
+            for i, k in enumerate(self.rows.record)
         ]
+
+    def windows(self, state: State, run_index: int) -> Iterator[NDArray[np.float64]]:
+        """Yield the prediction of a run without its offset, whole rows at a time."""
+        run = self.rows.runs[run_index]
+        operators = self._operators(state, run_index)
+        self._rest(operators, run.u)
+        size = max(1, WINDOW // self.rows.m) * self.rows.m
+        for start in range(0, run.u.size, size):
+            cut = slice(start, start + size)
+            block = Block(
+                t=run.piece.time(start, start + size),
+                v=run.u[cut],
+                x=run.u[cut],
+                channels={name: c[cut] for name, c in run.piece.channels.items()},
+            )
+            for operator in operators:
+                block = operator.process(block)
+            yield block.x
 
     def remember(self, state: State) -> NDArray[np.float64]:
         """Return the predicted rows, and keep what runs between the links for `added`."""
         self._state = state
-        return self.rows.of(self._signals(state, keep=True)) + state.offsets[self.rows.of_record]
+        return self.rows.of(self._kept_signals(state)) + state.offsets[self.rows.of_record]
+
+    def forget(self) -> None:
+        """Give back what `remember` keeps."""
+        self._state = None
+        self._inputs = []
 
     def added(self, effect: Added) -> NDArray[np.float64]:
         """Return the predicted rows of the remembered state with one more effect in its slot."""
@@ -215,10 +244,9 @@ class Simulator:
         for operator in operators:
             x0 = operator.reset(u0, x0)
 
-    def _signals(self, state: State, *, keep: bool) -> list[NDArray[np.float64]]:
+    def _kept_signals(self, state: State) -> list[NDArray[np.float64]]:
         signals = []
-        if keep:
-            self._inputs = []
+        self._inputs = []
         for i, run in enumerate(self.rows.runs):
             operators = self._operators(state, i)
             self._rest(operators, run.u)
@@ -227,8 +255,7 @@ class Simulator:
             for operator in operators:
                 inputs.append(block)
                 block = operator.process(block)
-            if keep:
-                self._inputs.append([*inputs, block])
+            self._inputs.append([*inputs, block])
             signals.append(block.x)
         return signals
 
