@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.data_checks import line_error, misspelt
+from piezo_ident.data_checks import misspelt
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import Cancelled, IdentificationError
 from piezo_ident.hysteresis_fit import (
@@ -39,10 +39,11 @@ from piezo_ident.hysteresis_fit import (
     fit_hysteresis,
     HysteresisFit,
 )
-from piezo_ident.memory import fit_memory, start_memory
-from piezo_ident.metrics import fit_percent, FORMULA, percent_of_stroke
+from piezo_ident.memory import fit_memory
+from piezo_ident.metrics import FORMULA
 from piezo_ident.model import Scaling, StageModel
-from piezo_ident.record import Piece, Record
+from piezo_ident.record import Record
+from piezo_ident.remarks import remark_on_range, remarks_on_errors, remarks_on_fit
 from piezo_ident.results import (
     DelayResult,
     DynamicsResult,
@@ -55,18 +56,14 @@ from piezo_ident.results import (
     Steps,
 )
 from piezo_ident.runs import noise_floor, prepare, Run
+from piezo_ident.segment_errors import errors_of, key_of, Memories
 from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
 from piezo_ident.threshold_choice import choose_thresholds
 from piezo_ident.unlabelled import joint_fit
 import scipy
 from scipy.optimize import OptimizeResult
 
-__all__ = ['errors_of', 'identify']
-
-#: change of G within the excited band below which the band is too narrow to know G by
-HARDLY = 0.1
-#: measured and modelled small-signal gain may differ by this share before it is said
-SLOPE_TOLERANCE = 0.05
+__all__ = ['identify']
 
 
 def identify(
@@ -111,7 +108,7 @@ def identify(
     else:
         found = _unlabelled(runs, rate, scaling, settings, progress)
     model, delay, dynamics, fit, rows, said, missing, memories = found
-    warnings += [*said, *_check(delay, dynamics, fit, floor, scaling), *_unseen(dynamics, model)]
+    warnings += [*said, *remarks_on_fit(model, delay, dynamics, fit, floor)]
     wrong = misspelt([label for record in records for label in record.labels])
     if wrong:
         warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
@@ -130,12 +127,11 @@ def identify(
         settings=settings,
         memories=memories,
     )
-    result = replace(result, warnings=(*result.warnings, *_judged(result, data.pieces)))
+    result = replace(result, warnings=(*result.warnings, *remarks_on_errors(result, data.pieces)))
     story = _story(result, [record.name for record in records])
     return replace(result, model=replace(model, identification=story))
 
 
-Memories = dict[tuple[str, float], NDArray[np.float64]]
 Found = tuple[
     StageModel,
     DelayResult,
@@ -313,7 +309,7 @@ def _unlabelled(
     span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
     model = replace(model, scaling=replace(model.scaling, range=span))
     # the start of these very thresholds; the rule carried over from other ones is an approximation
-    memories = {_key(run): fit_memory(model, piece.cut(0, n_fit))}
+    memories = {key_of(run): fit_memory(model, piece.cut(0, n_fit))}
     masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
     for other in runs:
         fitted = np.zeros(other.piece.n, dtype=bool)
@@ -321,7 +317,7 @@ def _unlabelled(
             fitted[:n_fit] = True
         masks.append((fitted, np.zeros(other.piece.n, dtype=bool)))
     rows = errors_of(model, runs, masks, memories)
-    reach = _other_range(run, n_fit, scaling)
+    reach = remark_on_range(run, n_fit, scaling)
     said = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
         f'together on the first {n_fit / rate:.4g} s of {run.record}'
@@ -346,155 +342,11 @@ def _unlabelled(
     return model, joint.delay, joint.dynamics, result, rows, said, missing, memories
 
 
-def _other_range(run: Run, n_fit: int, scaling: Scaling) -> str:
-    """Return what to say when the held-out part leaves the voltages of the fitted one."""
-    fitted, held = run.u[:n_fit], run.u[n_fit:]
-    if held.min() > fitted.min() - 0.01 and held.max() < fitted.max() + 0.01:
-        return ''
-    spans = [
-        f'{scaling.v0 + scaling.V * u.min():.3g} .. {scaling.v0 + scaling.V * u.max():.3g} V'
-        for u in (fitted, held)
-    ]
-    return (
-        f'the fitted part covers {spans[0]}, the held-out part {spans[1]}: its error is partly '
-        'one of extrapolation'
-    )
-
-
 def _model(
     rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
 ) -> StageModel:
     moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
     return StageModel(rate, moved, fit.hysteresis, G, delay)
-
-
-def _judged(result: Identification, pieces: Sequence[Piece]) -> list[str]:
-    """Return what the errors themselves say about the trust that they deserve."""
-    said = []
-    chosen, held = result.error('selection'), result.error('held out')
-    error = held if np.isfinite(held) else chosen
-    line = line_error(pieces)
-    if np.isfinite(error) and error > 0.5 * line:
-        said.append(
-            f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
-            f'{line:.3g} %: it explains little of these data'
-        )
-    easy = [
-        row.percent
-        for row in result.errors
-        if row.data == 'held out' and row.segment.partition(':')[0] in ('idle', 'ramp')
-    ]
-    if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
-        said.append(
-            f'where the stage only rests or is moved over, the model errs by up to '
-            f'{max(easy):.3g} % of stroke, more than the {chosen:.3g} % on what chose it: the '
-            'stage does something that the model lacks; judge it on a record of another kind'
-        )
-    return said
-
-
-def _key(run: Run) -> tuple[str, float]:
-    return run.record, run.piece.start_time
-
-
-def errors_of(
-    model: StageModel,
-    runs: Sequence[Run],
-    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
-    memories: Memories | None = None,
-) -> list[ErrorRow]:
-    """
-    Return the free-run error of every segment, split into what was fitted and what was not.
-
-    Parameters
-    ----------
-    model : StageModel
-    runs : sequence of Run
-    masks : sequence of (fitted, selection)
-        For each run, the samples that were fitted and those that only chose between models.
-    memories : dict, optional
-        Memory at the start of a run, by record name and start time; that of other runs which do
-        not start at rest is estimated.
-    """
-    static = model.without_dynamics()
-    rows = []
-    for run, (fitted, selection) in zip(runs, masks, strict=True):
-        memory = (memories or {}).get(_key(run))
-        if memory is None:
-            memory = start_memory(model, run.piece)
-        y = run.piece.y
-        y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
-        stroke = float(np.ptp(y))
-        names = [(s.label, s.start, s.stop) for s in run.piece.segments]
-        for label, start, stop in names or [('', 0, run.piece.n)]:
-            part = np.zeros(run.piece.n, dtype=bool)
-            part[start:stop] = run.sound[start:stop]
-            for data, mask in (
-                ('fitted', part & fitted),
-                ('selection', part & selection),
-                ('held out', part & ~fitted & ~selection),
-            ):
-                if not mask.any():
-                    continue
-                rows.append(
-                    ErrorRow(
-                        record=run.record,
-                        segment=label,
-                        percent=percent_of_stroke(y[mask], y_hat[mask], stroke),
-                        static_percent=percent_of_stroke(y[mask], y_static[mask], stroke),
-                        fit=fit_percent(y[mask], y_hat[mask]),
-                        n=int(mask.sum()),
-                        data=data,
-                    )
-                )
-    return rows
-
-
-def _check(
-    delay: DelayResult,
-    dynamics: DynamicsResult,
-    fit: HysteresisFit,
-    floor: float | None,
-    scaling: Scaling,
-) -> list[str]:
-    said = []
-    if delay.agree is False and delay.step is not None:
-        said.append(
-            f'steps say a delay of {delay.step.samples} samples, the ARX loss says {delay.scan}; '
-            f'{"the steps were" if delay.source == "steps" else "the loss was"} followed'
-        )
-    measured, modelled = dynamics.slope_measured, dynamics.slope_model
-    if np.isfinite(measured) and abs(measured / modelled - 1.0) > SLOPE_TOLERANCE:
-        said.append(
-            f'the small-signal gain of the noise, {measured:.3g}, is not the slope of H at its '
-            f'bias, {modelled:.3g} (normalised)'
-        )
-    if floor is not None and floor > 0.01 * abs(scaling.Y):
-        said.append(f'the sensor noise is {100 * floor / abs(scaling.Y):.2g} % of stroke')
-    if fit.swarm is not None and fit.swarm_loss is not None:
-        excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0 else 0.0
-        if excess > 0.01:
-            said.append(
-                f'before polishing the swarm was {excess:.2g} of the loss above the optimum; '
-                'more iterations would bring it closer'
-            )
-    return said
-
-
-def _unseen(dynamics: DynamicsResult, model: StageModel) -> list[str]:
-    """Say when the excitation ends where G has hardly begun to act."""
-    # a band that ends near half the sampling rate leaves nothing to see
-    if not dynamics.band < 0.2 * model.sample_rate:
-        return []
-    G = model.dynamics.response([dynamics.band], model.sample_rate)[0]
-    change = float(np.abs(G - 1.0))
-    if change > HARDLY:
-        return []
-    return [
-        f'the noise drives the stage up to {dynamics.band:.3g} Hz, where G is within '
-        f'{100 * change:.2g} % of its static gain: what it does beyond is not known; record noise '
-        'up to higher frequencies'
-    ]
 
 
 def _story(result: Identification, names: list[str]) -> dict[str, Any]:
