@@ -45,13 +45,13 @@ def record_of(*lengths, name='long', wrong=0.0, since=0):
 
 def test_short_records_come_back_as_they_are():
     records = [record_of(3000), record_of(2000)]
-    assert beginnings(records, 5000) == records
+    assert beginnings(PAPER, records, 5000) == records
 
 
 @pytest.mark.parametrize('most', [1, 999, 1000, 1001, 3000, 4321, 6999])
 def test_beginnings_are_beginnings_in_proportion(most):
     records = [record_of(1000, 2000, 1000), record_of(3000)]
-    found = beginnings(records, most)
+    found = beginnings(PAPER, records, most)
     assert sum(r.n for r in found) <= max(most, len(records))
     for whole, part in zip(records, found, strict=True):
         assert part.name == whole.name
@@ -73,7 +73,7 @@ def test_errors_on_both_sides_are_those_of_the_prediction(monkeypatch, window):
     errors = predict_record(PAPER, record).whole
     assert whole.used == pytest.approx(errors.percent_without_offset, rel=1e-6)
     assert whole.unused == 0.0
-    (part,) = beginnings([record], 2500)
+    (part,) = beginnings(PAPER, [record], 2500)
     y_hat = np.concatenate(predict_record(PAPER, record).prediction.pieces)
     e = np.concatenate([p.y for p in record]) - y_hat
     e -= e[: part.n].mean()
@@ -84,16 +84,28 @@ def test_errors_on_both_sides_are_those_of_the_prediction(monkeypatch, window):
 
 def test_a_change_behind_what_was_used_is_said():
     same, changed = record_of(20_000), record_of(20_000, wrong=0.02, since=12_000)
-    text = said_of(PAPER, PAPER, [same], beginnings([same], 5000))
+    text = said_of(PAPER, PAPER, [same], beginnings(PAPER, [same], 5000), 'fitted')
     assert text.startswith('5,000 of 20,000 samples were searched, the first 0.25 s of 1 s')
     assert 'changes later' not in text
-    text = said_of(PAPER, PAPER, [changed], beginnings([changed], 5000))
+    text = said_of(PAPER, PAPER, [changed], beginnings(PAPER, [changed], 5000), 'fitted')
     assert text.endswith('something changes later: give that part as a record of its own')
+
+
+def test_pieces_of_another_rate_take_no_share():
+    fast = record_of(30_000).pieces[0]
+    fast = Piece(fast.v, fast.y, 100_000.0)
+    good = record_of(3000).pieces[0]
+    (found,) = beginnings(PAPER, [Record((fast, good), 'both')], 1000)
+    assert [(p.n, p.sample_rate) for p in found] == [(1000, RATE)]
+    records = [Record((fast,), 'fast'), Record((good,), 'good')]
+    (found,) = beginnings(PAPER, records, 1000)
+    assert found.name == 'good'
+    assert rest_of(PAPER, records, [found]).all < 0.01
 
 
 def test_two_records_with_offsets_of_their_own():
     a, b = record_of(4000, name='a'), record_of(4000, name='b')
     moved = Piece(b.pieces[0].v, b.pieces[0].y + 1e-6, RATE)
     both = [a, Record((moved,), 'b')]
-    found = rest_of(PAPER, both, beginnings(both, 4000))
+    found = rest_of(PAPER, both, beginnings(PAPER, both, 4000))
     assert found.used < 0.01 and found.unused < 0.01

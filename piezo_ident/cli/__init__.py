@@ -281,9 +281,9 @@ def _build_parser() -> _Parser:
     p.add_argument(
         '--most-samples',
         type=_whole,
-        default=6_000_000,
+        default=2_400_000,
         metavar='N',
-        help='to be searched, the beginnings of the records (default: 6000000)',
+        help='to be searched, the beginnings of the records (default: 2400000)',
     )
     p.add_argument('--seed', type=_whole, default=0, help='of what is drawn (default: 0)')
 

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from piezo_ident.diagnosis.errors_of import errors_of, held_out_residual
+from piezo_ident.diagnosis.errors_of import errors_of, held_out_residual, row_noise
 from piezo_ident.diagnosis.fit import Fitted
 from piezo_ident.diagnosis.results import (
     Diagnosis,
@@ -40,6 +40,7 @@ from piezo_ident.diagnosis.verdict import (
     SMALLEST,
     untestable_of,
 )
+from piezo_ident.diagnosis.whole import Whole
 from piezo_ident.effects import find_effect
 from piezo_ident.model import StageModel
 from piezo_ident.residual.faults import FaultSearch
@@ -71,6 +72,9 @@ def assemble(
     noise: float,
     faults: FaultSearch,
     settings: DiagnosisSettings,
+    *,
+    fits: Whole | None = None,
+    is_long: bool = False,
 ) -> Diagnosis:
     """
     Return the diagnosis.
@@ -90,28 +94,44 @@ def assemble(
         Mean square of the noise of a row.
     faults : FaultSearch
     settings : DiagnosisSettings
+    fits : Whole, optional
+        Fits to whole records, of which all the rest is about the beginnings: errors, parameters
+        and model are theirs, shares and pictures those of the beginnings.
+    is_long : bool, optional
+        Whether the records are longer than what the rest is about.
     """
     rows, model = simulator.rows, simulator.model
     span = abs(model.scaling.Y)
     rms = None if not floor.known else max(floor.rms or 0.0, faults.quantum / np.sqrt(12.0))
-    # what single samples have more of noise than rows
-    lost = 0.0 if rms is None else max((rms / span) ** 2 - noise, 0.0)
     e_given = rows.x - simulator.run(given)
-    before = errors_of(rows, e_given, lost)
-    refit = errors_of(rows, held_out_residual(rows, base), lost)
-    after = errors_of(rows, held_out_residual(rows, fitted), lost)
+    judged = fits or Whole(simulator, e_given, base, fitted)
+    # what single samples have more of noise than rows
+    of_row = row_noise(floor, faults, judged.simulator.rows.m, span)
+    lost = 0.0 if rms is None else max((rms / span) ** 2 - of_row, 0.0)
+    before, refit, after = (
+        errors_of(judged.simulator.rows, e, lost)
+        for e in (
+            judged.e,
+            held_out_residual(judged.simulator.rows, judged.base),
+            held_out_residual(judged.simulator.rows, judged.fitted),
+        )
+    )
     lasting = [name for name in findings.effects if not find_effect(name).time_driven]
     worth = WORTH_IN_DOUBT if findings.verdict == 'unexplained' else WORTH_REFIT
     if not findings.effects and (
-        refit.overall > (1.0 - worth) * before.overall or not refit_holds(rows, e_given, base)
+        is_long
+        or refit.overall > (1.0 - worth) * before.overall
+        or not refit_holds(rows, e_given, base)
     ):
+        # nor does a beginning know how H goes on
         state, refined, after = given, model, before
     elif findings.effects and not lasting:
         # H was refitted beside a drift that another record will not repeat
         state = fitted.state
         refined = _refined(simulator, replace(given, effects=_silenced(state.effects)), findings)
     else:
-        state, refined = fitted.state, _refined(simulator, fitted.state, findings)
+        state = judged.fitted.state
+        refined = _refined(judged.simulator, state, findings)
     full = [simulator.full(s) for s in (given, base.state, state)]
     residuals = tuple(
         Residual(
@@ -124,10 +144,10 @@ def assemble(
         )
         for i, run in enumerate(rows.runs)
     )
-    effects = _effects(rows, base, fitted, taken, findings, noise)
+    effects = _effects(rows, base, fitted, taken, findings, noise, judged)
     smallest = _smallest(rows, base, rounds)
     rest = replace(findings.unexplained, description=_rest(findings, smallest, rows.passes))
-    warnings = _warnings(fitted.state, findings, lasting, floor)
+    warnings = _warnings(state, findings, lasting, floor)
     result = Diagnosis(
         verdict=findings.verdict,
         sentence='',
@@ -200,10 +220,11 @@ def _effects(
     taken: Sequence[Round],
     findings: Findings,
     noise: float,
+    judged: Whole,
 ) -> tuple[FoundEffect, ...]:
     explainable = max(base.mean_square - noise, 1e-300)
-    std = _deviations(rows, fitted)
-    longest = int(np.bincount(rows.of_record).argmax())
+    std = _deviations(judged.simulator.rows, judged.fitted)
+    longest = int(np.bincount(judged.simulator.rows.of_record).argmax())
     found = []
     level = base.mean_square
     for i, name in enumerate(findings.effects):
@@ -211,7 +232,7 @@ def _effects(
         after = (fitted if last else taken[i].contenders[0].fitted).mean_square
         gain = max(level - after, 0.0)
         level = after
-        added = fitted.state.effects[i]
+        added = judged.fitted.state.effects[i]
         parameters = {}
         for p in added.effect.parameters:
             value = added.values[longest][p.name]

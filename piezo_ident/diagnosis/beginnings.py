@@ -15,24 +15,25 @@
 """
 Of long records the beginnings are searched, and what follows is the check.
 
-A diagnosis holds about 500 bytes a sample, so an hour at 20 kHz would take more memory than a
+A search holds about 500 bytes a sample, so an hour at 20 kHz would take more memory than a
 computer of the lab has.  Sections spread over the record will not do: creep and hysteresis come
-out of what was before a section, and only a beginning has nothing before it.  A free run over the
-rest takes no memory to speak of, and shows whether what was found goes on to hold.
+out of what was before a section, and only a beginning has nothing before it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.diagnosis.verdict import SMALLEST
+from piezo_ident.effects import find_effect
 from piezo_ident.memory import memories_of
 from piezo_ident.model import StageModel
-from piezo_ident.record import Record
+from piezo_ident.record import Piece, Record
+from piezo_ident.runs import same_rate
 
-__all__ = ['Rest', 'beginnings', 'rest_of', 'said_of']
+__all__ = ['Rest', 'beginnings', 'rest_of', 'said_of', 'share_of']
 
 #: samples that are predicted at once
 WINDOW = 1_000_000
@@ -43,9 +44,10 @@ WORSE = 2.0
 @dataclass(frozen=True)
 class Rest:
     """
-    Free-run errors of a model on what was used, on what was not, and on all, % of stroke.
+    Free-run errors of a model on what was searched, on what was not, and on all, % of stroke.
 
-    ``100 rms(y - y_hat) / (max y - min y)``; the offset of each record is that of what was used.
+    ``100 rms(y - y_hat) / (max y - min y)``; the offset of each record is that of what was
+    searched.
     """
 
     used: float
@@ -53,33 +55,50 @@ class Rest:
     all: float
 
 
-def beginnings(records: Sequence[Record], most: int) -> list[Record]:
+def beginnings(model: StageModel, records: Sequence[Record], most: int) -> list[Record]:
     """
     Return the beginnings of records, in proportion to their lengths.
 
     Parameters
     ----------
+    model : StageModel
+        Pieces of another sampling rate are left out.
     records : sequence of Record
     most : int
         Samples of all beginnings together; records that have no more come back as they are.
     """
-    total = sum(record.n for record in records)
+    found = [(record, [p for p in record if _fits(model, p)]) for record in records]
+    total = sum(p.n for _, pieces in found for p in pieces)
     if total <= most:
         return list(records)
-    return [_beginning(record, max(1, record.n * most // total)) for record in records]
+    cut = []
+    for record, pieces in found:
+        begun = _begun(pieces, max(1, sum(p.n for p in pieces) * most // total))
+        if begun:
+            cut.append(Record(tuple(begun), record.name, record.faults))
+    return cut
 
 
-def _beginning(record: Record, n: int) -> Record:
-    pieces = []
-    for piece in record:
-        pieces.append(piece if piece.n <= n else piece.cut(0, n))
-        n -= pieces[-1].n
-        if n == 0:
+def _fits(model: StageModel, piece: Piece) -> bool:
+    return same_rate(piece.sample_rate, model.sample_rate)
+
+
+def _begun(pieces: Sequence[Piece], n: int) -> list[Piece]:
+    begun: list[Piece] = []
+    for piece in pieces:
+        if n <= 0:
             break
-    return Record(tuple(pieces), record.name, record.faults)
+        begun.append(piece if piece.n <= n else piece.cut(0, n))
+        n -= begun[-1].n
+    return begun
 
 
-def rest_of(model: StageModel, records: Sequence[Record], used: Sequence[Record]) -> Rest:
+def rest_of(
+    model: StageModel,
+    records: Sequence[Record],
+    used: Sequence[Record],
+    tick: Callable[[], None] = lambda: None,
+) -> Rest:
     """
     Return the errors of a model before and behind the ends of the beginnings.
 
@@ -88,21 +107,28 @@ def rest_of(model: StageModel, records: Sequence[Record], used: Sequence[Record]
     model : StageModel
     records, used : sequence of Record
         Whole records, and their beginnings.
+    tick : callable, optional
+        Called window by window; may raise `piezo_ident.errors.Cancelled`.
+
+    Raises
+    ------
+    ModelError
+        When an effect of the model cannot run on a piece.
     """
-    stroke = max(r.stroke for r in records)
+    begun = {record.name: record.n for record in used}
+    stroke = max(record.stroke for record in records)
     # number, sum and sum of squares of y - y_hat, of what was used and what was not
-    totals = np.zeros(2)
-    counts = np.zeros(2)
-    for record, beginning in zip(records, used, strict=True):
+    totals, counts = np.zeros(2), np.zeros(2)
+    for record in records:
         sums = np.zeros((2, 3))
-        left = beginning.n
+        left = begun.get(record.name, 0)
         for piece, memory in zip(record, memories_of(model, record), strict=True):
-            if not model.takes(piece):
-                left -= piece.n
+            if not _fits(model, piece):
                 continue
             stream = model.stream(memory)
             start = 0
             while start < piece.n:
+                tick()
                 # a window lies on one side of the end
                 stop = min(start + WINDOW, piece.n, start + left if left > 0 else piece.n)
                 part = piece.cut(start, stop)
@@ -111,7 +137,7 @@ def rest_of(model: StageModel, records: Sequence[Record], used: Sequence[Record]
                 left -= stop - start
                 start = stop
         n, total, squares = sums.T
-        offset = total[0] / max(n[0], 1.0)
+        offset = (total[0] if n[0] else total.sum()) / max(n[0] or n.sum(), 1.0)
         totals += squares - 2.0 * offset * total + n * offset**2
         counts += n
     totals, counts = np.append(totals, totals.sum()), np.append(counts, counts.sum())
@@ -120,17 +146,49 @@ def rest_of(model: StageModel, records: Sequence[Record], used: Sequence[Record]
 
 
 def said_of(
-    given: StageModel, refined: StageModel, records: Sequence[Record], used: Sequence[Record]
+    given: StageModel,
+    refined: StageModel,
+    records: Sequence[Record],
+    used: Sequence[Record],
+    fitted: str,
+    tick: Callable[[], None] = lambda: None,
 ) -> str:
-    """Return what a reader has to know of samples that were not used."""
-    before, after = (rest_of(model, records, used) for model in (given, refined))
-    n, of = (sum(r.n for r in some) for some in (used, records))
-    seconds, whole = (sum(r.duration for r in some) for some in (used, records))
+    """
+    Return what a reader has to know of samples that were not searched.
+
+    Parameters
+    ----------
+    given, refined : StageModel
+    records, used : sequence of Record
+        Whole records, and their beginnings.
+    fitted : str
+        How what was found was fitted.
+    tick : callable, optional
+        See `rest_of`.
+
+    Raises
+    ------
+    ModelError
+        When an effect of a model cannot run on a piece.
+    """
+    before, after = (rest_of(model, records, used, tick) for model in (given, refined))
     text = (
-        f'{n:,} of {of:,} samples were searched, the first {seconds:.4g} s of {whole:.4g} s '
-        f'(--most-samples): on the rest the model errs by {before.unused:.3g} % of stroke as '
-        f'given and by {after.unused:.3g} % refined, on what was searched by {after.used:.3g} %'
+        f'{share_of(records, used)}; {fitted}; on the rest the model errs by {before.unused:.3g} '
+        f'% of stroke as given and by {after.unused:.3g} % refined, on what was searched by '
+        f'{after.used:.3g} %'
     )
-    if after.unused > max(WORSE * after.used, SMALLEST):
+    # what follows time is switched off in the refined model
+    driven = [s.name for s in refined.effects if find_effect(s.name).time_driven]
+    if after.unused > max(WORSE * after.used, SMALLEST) and not driven:
         text += '; something changes later: give that part as a record of its own'
     return text
+
+
+def share_of(records: Sequence[Record], used: Sequence[Record]) -> str:
+    """Return how much of the records was searched."""
+    n, of = (sum(r.n for r in some) for some in (used, records))
+    seconds, whole = (sum(r.duration for r in some) for some in (used, records))
+    return (
+        f'{n:,} of {of:,} samples were searched, the first {seconds:.4g} s of {whole:.4g} s '
+        '(--most-samples)'
+    )

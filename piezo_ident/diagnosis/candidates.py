@@ -107,6 +107,8 @@ def view_of(simulator: Simulator, lines: Sequence[float] = ()) -> View:
 def _highest_frequency(u: NDArray[np.float64], rate: float) -> float:
     """Return the frequency below which all but a millionth of the moving power lies."""
     du = np.diff(u)
+    if du.size == 0:
+        return 0.0
     size = min(du.size, 1 << 17)
     power = np.zeros(size // 2 + 1)
     for start in range(0, du.size - size + 1, size):

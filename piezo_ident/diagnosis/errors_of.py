@@ -22,9 +22,11 @@ from piezo_ident.diagnosis.fit import Fitted
 from piezo_ident.diagnosis.gain import gram_of, solve
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.residual.faults import FaultSearch
+from piezo_ident.residual.floor import NoiseFloor
 from piezo_ident.validation import sine_frequency
 
-__all__ = ['errors_of', 'held_out_residual']
+__all__ = ['errors_of', 'held_out_residual', 'row_noise']
 
 
 def held_out_residual(rows: Rows, fitted: Fitted) -> NDArray[np.float64]:
@@ -86,3 +88,11 @@ def errors_of(rows: Rows, e: NDArray[np.float64], noise: float = 0.0) -> Errors:
     for frequency in sorted(frequencies):
         by_frequency[f'{frequency:g}'] = percent(np.concatenate(frequencies[frequency]))
     return Errors(percent(e), by_segment, by_frequency)
+
+
+def row_noise(floor: NoiseFloor, faults: FaultSearch, m: int, span: float) -> float:
+    """Return the mean square of the noise of a row, normalised by the span [m]."""
+    rms = floor.at(m) or 0.0
+    # a reading that rests on one step of the converter hides its rounding
+    rounding = faults.quantum / np.sqrt(12.0 * m)
+    return float(max(rms, rounding) / span) ** 2

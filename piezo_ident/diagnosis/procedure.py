@@ -31,7 +31,8 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.diagnosis.assemble import assemble, PASSES
-from piezo_ident.diagnosis.beginnings import beginnings, said_of
+from piezo_ident.diagnosis.beginnings import beginnings, said_of, share_of
+from piezo_ident.diagnosis.errors_of import row_noise
 from piezo_ident.diagnosis.fit import (
     base_thresholds,
     fit_base,
@@ -44,16 +45,17 @@ from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
-from piezo_ident.diagnosis.whole import fitted_to_all
+from piezo_ident.diagnosis.whole import fitted_to_all, Whole
 from piezo_ident.effects import catalogue, find_effect
-from piezo_ident.errors import IdentificationError
+from piezo_ident.errors import IdentificationError, ModelError
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
-from piezo_ident.residual.faults import FaultSearch, find_faults
-from piezo_ident.residual.floor import noise_floor, NoiseFloor
+from piezo_ident.residual.faults import find_faults
+from piezo_ident.residual.floor import noise_floor
 from piezo_ident.residual.lines import find_lines, without_lines
 from piezo_ident.residual.stretches import ResidualPart, stretches_of
 from piezo_ident.results import Progress, silent
+from piezo_ident.runs import same_rate
 
 __all__ = ['diagnose']
 
@@ -97,8 +99,24 @@ def diagnose(
         When the records carry nothing to judge.
     """
     settings = settings or DiagnosisSettings()
-    whole = [records] if isinstance(records, Record) else list(records)
-    records = beginnings(whole, settings.most_samples)
+    records = [records] if isinstance(records, Record) else list(records)
+    used = beginnings(model, records, settings.most_samples)
+    if used == records:
+        return _diagnosed(model, records, records, settings, progress)
+    try:
+        return _diagnosed(model, records, used, settings, progress)
+    except IdentificationError as error:
+        raise IdentificationError(f'{error} ({share_of(records, used)})') from None
+
+
+def _diagnosed(
+    model: StageModel,
+    whole: Sequence[Record],
+    records: Sequence[Record],
+    settings: DiagnosisSettings,
+    progress: Progress,
+) -> Diagnosis:
+    """Return the diagnosis of whole records from their beginnings."""
     progress('residual', 0.0)
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
@@ -109,7 +127,7 @@ def diagnose(
         )
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    base = _base(simulator, given)
+    base = _base(simulator, given, _swing(model, whole))
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
     lines = find_lines(parts, stretches).lines
@@ -125,18 +143,68 @@ def diagnose(
     if not taken:
         fitted = base
     findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
-    if taken and records != whole:
-        fitted = fitted_to_all(simulator, fitted, whole, records, frequencies, progress)
+    fits: Whole | None = None
+    is_long = records != whole
+    how = 'nothing was fitted to the rest'
+    if is_long and findings.effects and not _is_driven(findings.effects):
+        try:
+            fits = fitted_to_all(
+                simulator, given, base, fitted, whole, records, frequencies, progress
+            )
+            how = 'what was found was fitted to ' + ('all of them' if fits else 'these alone')
+        except (IdentificationError, ModelError, np.linalg.LinAlgError) as error:
+            how = f'what was found could not be fitted to the rest ({error})'
     progress('verdict', 0.0)
     result = assemble(
-        simulator, given, base, fitted, rounds, taken, findings, floor, noise, faults, settings
+        simulator,
+        given,
+        base,
+        fitted,
+        rounds,
+        taken,
+        findings,
+        floor,
+        noise,
+        faults,
+        settings,
+        fits=fits,
+        is_long=is_long,
     )
-    if records != whole:
-        progress('verdict', 0.5)
-        said = said_of(model, result.model, whole, records)
+    if is_long:
+        said = _said(model, result.model, whole, records, how, progress)
         result = replace(result, warnings=(*result.warnings, said))
     progress('verdict', 1.0)
     return result
+
+
+def _is_driven(effects: Sequence[str]) -> bool:
+    """Return whether an effect follows time, so that it is another one later."""
+    return any(find_effect(name).time_driven for name in effects)
+
+
+def _said(
+    given: StageModel,
+    refined: StageModel,
+    records: Sequence[Record],
+    used: Sequence[Record],
+    how: str,
+    progress: Progress,
+) -> str:
+    try:
+        return said_of(given, refined, records, used, how, lambda: progress('verdict', 0.5))
+    except ModelError as error:
+        return f'{share_of(records, used)}; {how}; the rest cannot be predicted: {error}'
+
+
+def _swing(model: StageModel, records: Sequence[Record]) -> float:
+    """Return the largest range of a piece, normalised: later ones need their thresholds too."""
+    spans = [
+        float(np.ptp(p.v))
+        for record in records
+        for p in record
+        if same_rate(p.sample_rate, model.sample_rate)
+    ]
+    return max(spans, default=0.0) / abs(model.scaling.V)
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
@@ -148,21 +216,12 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
     ]
 
 
-def _base(simulator: Simulator, given: State) -> Fitted:
+def _base(simulator: Simulator, given: State, swing: float) -> Fitted:
     """Return the base model refitted on a fine grid of thresholds."""
-    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     if swing == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
     state, columns = fit_base(simulator, given, base_thresholds(swing))
     return fit_jointly(simulator, state, columns)
-
-
-def row_noise(floor: NoiseFloor, faults: FaultSearch, m: int, span: float) -> float:
-    """Return the mean square of the noise of a row, normalised by the span [m]."""
-    rms = floor.at(m) or 0.0
-    # a reading that rests on one step of the converter hides its rounding
-    rounding = faults.quantum / np.sqrt(12.0 * m)
-    return float(max(rms, rounding) / span) ** 2
 
 
 class _Search:

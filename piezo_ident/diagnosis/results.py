@@ -73,7 +73,7 @@ class DiagnosisSettings:
     effects: tuple[str, ...] | None = None
     without: tuple[str, ...] = ()
     most_effects: int = 4
-    most_samples: int = 6_000_000
+    most_samples: int = 2_400_000
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -172,8 +172,7 @@ def make_rows(
     ]
     samples = sum(int(known.sum()) for known in use)
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
-    # a mean of ones may be off one by its rounding
-    keep = tuple(means(known.astype(np.float64), m) > 1.0 - 0.5 / m for known in use)
+    keep = tuple(np.all(known[: known.size // m * m].reshape(-1, m), axis=1) for known in use)
     kept = sum(int(k.sum()) for k in keep)
     if kept < 500:
         raise IdentificationError(

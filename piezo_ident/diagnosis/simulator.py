@@ -37,7 +37,7 @@ from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.model import EffectSetting, StageModel
 from piezo_ident.play import play_columns
 
-__all__ = ['WINDOW', 'Added', 'Simulator', 'State', 'retuned']
+__all__ = ['Added', 'Simulator', 'State', 'retuned']
 
 #: samples that pass the chain at once, about
 WINDOW = 1_000_000

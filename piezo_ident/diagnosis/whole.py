@@ -16,13 +16,14 @@
 """
 Effects that were found in the beginnings of long records, fitted to whole records.
 
-What creeps for an hour does not show in its first minutes.  The search is over; a few dozen runs
-over everything are left, window by window, and nothing is kept from one to the next.
+What creeps for an hour does not show in its first minutes.  The search is over; some hundred runs
+over everything are left, window by window, and no signal is kept from one to the next.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +31,19 @@ from piezo_ident.diagnosis.beginnings import rest_of
 from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import make_rows, Rows
 from piezo_ident.diagnosis.search import afresh
-from piezo_ident.diagnosis.simulator import Simulator, State, WINDOW
+from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.effects import Effect
+from piezo_ident.errors import IdentificationError
 from piezo_ident.model import StageModel
 from piezo_ident.record import Record
 from piezo_ident.results import Progress
 
-__all__ = ['fitted_to_all']
+__all__ = ['Whole', 'fitted_to_all']
 
 #: iterations of each fit: a run over an hour takes seconds
 ITERATIONS = 2
+#: a row is left out where it leaves both neighbours by so many times what others mostly do
+OUT = 10.0
 #: runs over everything after which half of the work passes for done
 HALF = 100
 
@@ -47,13 +51,13 @@ HALF = 100
 class _Frugal(Simulator):
     """A simulator that keeps nothing from run to run, and says how far it is."""
 
-    def __init__(self, model: StageModel, rows: Rows, tick: Callable[[], None]) -> None:
+    def __init__(self, model: StageModel, rows: Rows, tick: Callable[[int], None]) -> None:
         super().__init__(model, rows)
         self._tick = tick
 
     def windows(self, state: State, run_index: int) -> Iterator[NDArray[np.float64]]:
         for x in super().windows(state, run_index):
-            self._tick()
+            self._tick(x.size)
             yield x
 
     def remember(self, state: State) -> NDArray[np.float64]:
@@ -64,51 +68,108 @@ class _Frugal(Simulator):
         return self.run(state)
 
 
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """
+    Fits to whole records.
+
+    Attributes
+    ----------
+    simulator : Simulator
+        Of the whole records.
+    e : ndarray, shape (n,)
+        Residual of the rows under the model as given, normalised.
+    base, fitted : Fitted
+        Without the effects, and with them.
+    """
+
+    simulator: Simulator
+    e: NDArray[np.float64]
+    base: Fitted
+    fitted: Fitted
+
+
 def fitted_to_all(
     simulator: Simulator,
+    given: State,
+    base: Fitted,
     fitted: Fitted,
     records: Sequence[Record],
     used: Sequence[Record],
     lines: Sequence[float],
     progress: Progress,
-) -> Fitted:
+) -> Whole | None:
     """
-    Return the fit to whole records, as it does on their beginnings.
+    Return fits to whole records, None where they predict these records no better.
 
     Parameters
     ----------
     simulator : Simulator
         Of the beginnings; it forgets what it has kept.
-    fitted : Fitted
-        To the beginnings; it comes back where it predicts the whole records no worse.
+    given : State
+        The model as it was given.
+    base, fitted : Fitted
+        To the beginnings, without effects and with them.
     records, used : sequence of Record
         Whole records, and their beginnings.
     lines : sequence of float
         Lines in the residual [Hz].
     progress : callable
+
+    Raises
+    ------
+    IdentificationError, ModelError
+        When the whole records cannot be fitted though their beginnings can.
     """
     simulator.forget()
-    rows = make_rows(simulator.model, records)
-    if rows.names != simulator.rows.names:
-        return fitted
-    done = 0.0
-    step = 1.0 / HALF / max(1.0, sum(run.u.size for run in rows.runs) / WINDOW)
+    model, done = simulator.model, 0.0
+    total = sum(record.n for record in records)
 
-    def tick() -> None:
+    def tick(n: int) -> None:
         nonlocal done
-        done += step
+        done += n / total / HALF
         progress('whole records', 1.0 - 0.5**done)
 
-    whole = _Frugal(simulator.model, rows, tick)
-    found = fit_jointly(whole, fitted.state, base_at(whole, fitted.state), iterations=ITERATIONS)
+    rows = make_rows(model, records)
+    if rows.names != simulator.rows.names:
+        raise IdentificationError('some records only begin behind their beginnings')
+    bad = _standing_out(rows, _Frugal(model, rows, tick).run(fitted.state))
+    if any(out.any() for out in bad):
+        rows = make_rows(model, records, bad)
+    whole = _Frugal(model, rows, tick)
+    e = rows.x - whole.run(given)
+    without = _fit(whole, base.state)
+    found = _fit(whole, fitted.state)
     for i in range(len(found.state.effects)):
         for fresh in afresh(whole, found, i, lines, lambda: None, ITERATIONS):
             if fresh.mean_square < found.mean_square:
                 found = fresh
     # rows of an hour are long: what is fast must not have been bent by them
-    models = [simulator.model_of(state) for state in (fitted.state, found.state)]
-    before, after = (rest_of(model, records, used).all for model in models)
-    if after >= before:
-        return fitted
-    at = base_at(simulator, found.state)
-    return fit_jointly(simulator, found.state, at, iterations=0)
+    before, after = (
+        rest_of(simulator.model_of(state), records, used, lambda: tick(0)).all
+        for state in (fitted.state, found.state)
+    )
+    return Whole(whole, e, without, found) if after < before else None
+
+
+def _fit(simulator: Simulator, state: State) -> Fitted:
+    return fit_jointly(simulator, state, base_at(simulator, state), iterations=ITERATIONS)
+
+
+def _standing_out(rows: Rows, prediction: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
+    """Return for each run the samples of rows that stand out from both of their neighbours."""
+    e = rows.x - prediction
+    padded = np.concatenate([e[:1], e, e[-1:]])
+    jump = np.abs(e - np.median([padded[:-2], e, padded[2:]], axis=0))
+    jumps = jump[jump > 0.0]
+    wrong = jump > OUT * max(np.quantile(jumps, 0.95), 1e-300) if jumps.size else jump > np.inf
+    bad, first = [], 0
+    for run, keep in zip(rows.runs, rows.keep, strict=True):
+        of_rows = np.zeros(keep.size, dtype=bool)
+        count = int(keep.sum())
+        of_rows[keep] = wrong[first : first + count]
+        first += count
+        samples = np.zeros(run.u.size, dtype=bool)
+        samples[: keep.size * rows.m] = np.repeat(of_rows, rows.m)
+        bad.append(samples)
+    return bad

@@ -30,7 +30,7 @@ from typing import Any
 
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.flow import FlowControl
-from piezo_ident.nodes.taps import Aside, topics_problem
+from piezo_ident.nodes.taps import Aside, between_turns, topics_problem
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray
@@ -137,11 +137,15 @@ class Answers:
             pause(LOOK)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Listen no more; from any thread."""
         with self._lock:
             ears, self._ears = self._ears, {}
+
+        def destroy() -> None:
             for subscription in ears.values():
                 self._node.destroy_subscription(subscription)
+
+        between_turns(self._node, destroy)
 
 
 def _ignore(_: object) -> None:

@@ -50,6 +50,7 @@ from piezo_ident.errors import ConfigError, PiezoIdentError
 from piezo_ident.guard import Guard, GuardSettings
 from piezo_ident.nodes.answers import Answers, answers_problem
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.taps import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.pacing import BlockClock
 from piezo_ident.program import load_program, parse_program, Program, Sequence
@@ -286,8 +287,7 @@ class ExcitationNode(LabNode):
                     f'{what} after {limit:g} s; start the stage, or set subscribers or wait_limit'
                 )
             self._sleep(playing, time.monotonic() + 0.02)
-        if self.executor is not None:
-            self.executor.create_task(self._close_ears)
+        between_turns(self, self._close_ears)
         self._sleep(playing, time.monotonic() + SETTLE)
 
     def _await_ears(self, playing: Playing) -> None:

@@ -200,7 +200,6 @@ class RecorderNode(LabNode):
         finally:
             recording.failure, recording.size = failure, writer.size
             recording.end.set()
-            taps.close()
             recording.over.set()
             if failure:
                 writer.abort()
@@ -209,6 +208,7 @@ class RecorderNode(LabNode):
                 parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
                 about = f'{writer.messages} messages in {writer.path}{parts}'
                 self._report('done', about, progress=100.0)
+            taps.close()
 
     def _record(self, recording: Recording, taps: Taps, writer: PartWriter) -> None:
         flushed = time.monotonic()

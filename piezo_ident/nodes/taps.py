@@ -20,7 +20,7 @@ They are not spun by the executor, which would take 0.3 ms a message.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 import importlib
 import threading
@@ -45,7 +45,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-__all__ = ['Aside', 'Taps', 'message_class', 'topics_problem']
+__all__ = ['Aside', 'Taps', 'between_turns', 'message_class', 'topics_problem']
 
 #: messages that a subscription keeps until it is emptied: five seconds of blocks
 DEPTH = 1000
@@ -64,6 +64,24 @@ class Aside(CallbackGroup):
 
     def ending_execution(self, entity: Any) -> None:
         """Do nothing."""
+
+
+def between_turns(node: Node, work: Callable[[], None]) -> None:
+    """
+    Do something with the entities of a node between two turns of its executor; from any thread.
+
+    One that goes while the executor gathers what to wait for breaks it.
+
+    Parameters
+    ----------
+    node : Node
+    work : callable
+        Called at once where nobody spins the node.
+    """
+    if node.executor is None:
+        work()
+    else:
+        node.executor.create_task(work)
 
 
 def message_class(name: str) -> Any:
@@ -172,12 +190,7 @@ class Taps:
     def close(self) -> None:
         """Take back all subscriptions; from any thread."""
         self._closed = True
-        executor = self._node.executor
-        if executor is None:
-            self._destroy_all()
-        else:
-            # one that goes while the executor gathers what to wait for breaks it
-            executor.create_task(self._destroy_all)
+        between_turns(self._node, self._destroy_all)
 
     def _destroy_all(self) -> None:
         with self._lock:

@@ -52,6 +52,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from piezo_ident.nodes.interfaces import STATES
+from piezo_ident.nodes.taps import between_turns
 from piezo_ident.nodes.wire import from_message, LATCHED, QUESTIONS, STREAM, to_message
 from piezo_ident.wire_format import Samples
 from processes import alive, best_of_three, Handle, in_time, Late, LIMIT, take_domain
@@ -494,8 +495,7 @@ class Graph:
 
     def forget(self, entity: Publisher | Subscription) -> None:
         """Take back a publisher or a subscription, between two turns of the observer."""
-        # rclpy's executor ends when an entity goes while it gathers what to wait for
-        gone = threading.Event()
+        topic, gone = entity.topic_name, threading.Event()
 
         def destroy() -> None:
             if isinstance(entity, Publisher):
@@ -504,5 +504,5 @@ class Graph:
                 self.node.destroy_subscription(entity)
             gone.set()
 
-        self._executor.create_task(destroy)
-        self.wait(gone.is_set, f'{entity.topic_name} to be forgotten')
+        between_turns(self.node, destroy)
+        self.wait(gone.is_set, f'{topic} to be forgotten')
