@@ -103,10 +103,16 @@ def _joined(pieces: list[Piece]) -> Bridged:
     measured = np.zeros(n, dtype=bool)
     for start, piece in zip(starts, pieces, strict=True):
         measured[start : start + piece.n] = True
-    places, all_places = np.flatnonzero(measured), np.arange(n)
 
     def fill(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        return np.interp(all_places, places, np.concatenate(parts))
+        whole = np.empty(n)
+        for start, part in zip(starts, parts, strict=True):
+            whole[start : start + part.size] = part
+        for (start, part), (stop, after) in itertools.pairwise(zip(starts, parts, strict=True)):
+            end = start + part.size
+            slope = (after[0] - part[-1]) / (stop - end + 1)
+            whole[end:stop] = slope * np.arange(1, stop - end + 1) + part[-1]
+        return whole
 
     sound = measured.copy()
     settle = max(1, round(SETTLING * first.sample_rate))

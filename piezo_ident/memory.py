@@ -36,6 +36,8 @@ from scipy.optimize import lsq_linear
 
 __all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'memories_of', 'start_memory']
 
+#: samples that are looked at together for where the start is forgotten
+WINDOW = 1 << 18
 #: pull towards the memory of a stage that came down to zero, as a share of the data's weight
 PULL = 1e-4
 
@@ -53,8 +55,17 @@ def forgotten(u: NDArray[np.float64], share: float = 0.98, span: float | None = 
     span : float, optional
         That range, where `u` is the beginning of the record alone.
     """
-    swept = np.maximum.accumulate(u) - np.minimum.accumulate(u)
-    return int(np.argmax(swept >= share * (swept[-1] if span is None else span)))
+    goal = share * (float(np.ptp(u)) if span is None else span)
+    low = high = u[0]
+    for start in range(0, u.size, WINDOW):
+        part = u[start : start + WINDOW]
+        top = np.maximum(np.maximum.accumulate(part), high)
+        bottom = np.minimum(np.minimum.accumulate(part), low)
+        swept = top - bottom >= goal
+        if swept.any():
+            return start + int(np.argmax(swept))
+        low, high = bottom[-1], top[-1]
+    return 0
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:

@@ -70,6 +70,20 @@ def test_pieces_join_on_the_clock_and_segments_go_on():
     assert joined.sound.sum() == 100 - 5
 
 
+def test_gaps_are_straight_lines():
+    rng = np.random.default_rng(5)
+    piece = Piece(rng.standard_normal(4000), 1e-6 * rng.standard_normal(4000), 100.0)
+    lost = rng.random(4000) < 0.005
+    lost[[0, -1]] = False
+    lost[100:140] = True
+    (joined,) = bridged(with_losses(piece, lost))
+    k = np.arange(4000)
+    for name in ('v', 'y'):
+        expected = np.interp(k, k[~lost], getattr(piece, name)[~lost])
+        np.testing.assert_allclose(getattr(joined.piece, name), expected, rtol=0, atol=1e-15)
+    assert joined.filled == lost.sum()
+
+
 def test_what_does_not_connect_stays_apart():
     one = Piece(np.arange(50.0), np.arange(50.0), 100.0, 0.0)
     far = Piece(np.arange(50.0), np.arange(50.0), 100.0, 5.0)

@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident import memory as memory_module
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.memory import fit_memory, forgotten, is_at_rest, start_memory
 from piezo_ident.play import play_columns
@@ -96,6 +97,15 @@ def test_forgotten_is_the_first_sweep_over_the_range():
     assert forgotten(np.arange(101.0)) == 98
     assert forgotten(np.arange(101.0), share=0.5) == 50
     assert forgotten(np.array([2.0])) == 0
+
+
+@pytest.mark.parametrize('window', [1, 7, 1000])
+@pytest.mark.parametrize('span', [None, 10.0, 1e6])
+def test_windows_do_not_move_where_the_start_is_forgotten(monkeypatch, window, span):
+    monkeypatch.setattr(memory_module, 'WINDOW', window)
+    u = np.cumsum(np.random.default_rng(3).standard_normal(500))
+    swept = np.maximum.accumulate(u) - np.minimum.accumulate(u)
+    assert forgotten(u, 0.9, span) == np.argmax(swept >= 0.9 * (np.ptp(u) if not span else span))
 
 
 @settings(deadline=None)
