@@ -112,15 +112,36 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
     assert after < before / 3
 
 
-def test_of_a_long_record_the_beginning_is_used_and_the_rest_is_the_check(truths):
+@pytest.mark.parametrize('dropouts', [0, 60])
+def test_of_a_long_record_the_beginning_is_searched_and_all_is_fitted(truths, dropouts):
     model, record, unseen = measured('creep', 0.3, 1)
-    result = diagnose(model, record, DiagnosisSettings(most_samples=record.n * 2 // 3))
+    (piece,) = record
+    most = record.n * 2 // 3
+    y = piece.y.copy()
+    lost = np.random.default_rng(4).integers(most, piece.n, dropouts)
+    y[lost] = y.min()
+    record = Record((Piece(piece.v, y, RATE, segments=piece.segments),), 'long')
+    result = diagnose(model, record, DiagnosisSettings(most_samples=most))
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     before, after = unseen_errors(result, unseen)
-    assert after < before / 3
+    assert after < before / 10
     (said,) = [w for w in result.warnings if 'samples were searched' in w]
-    assert 'changes later' not in said
-    assert sum(part.piece.n for part in result.residuals) == record.n * 2 // 3
+    assert sum(part.piece.n for part in result.residuals) == most
+    if dropouts:
+        # they bend nothing, and are not passed over in silence
+        assert said.endswith('something changes later: give that part as a record of its own')
+    else:
+        assert 'fitted to all of them' in said and 'changes later' not in said
+        # errors are those of the model that comes back, over all
+        for percent, one in ((result.before.overall, model), (result.after.overall, result.model)):
+            whole = predict_record(one, record).whole.percent
+            assert percent == pytest.approx(whole, rel=0.25)
+
+
+def test_what_is_asked_for_is_there_behind_the_beginning(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
+        diagnose(model, record, DiagnosisSettings(most_samples=1000))
 
 
 def test_effect_outside_the_catalogue_stays_unexplained(truths):
