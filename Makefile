@@ -41,7 +41,7 @@ test-graph: .venv/.test
 test-jazzy: .venv-jazzy/.test
 	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
 
-# side by side with the peers, in an environment of their own: about twenty minutes; QUICK=1
+# side by side with the peers, in an environment of their own: three quarters of an hour; QUICK=1
 # for a short version, which goes to build/
 bench: .venv-bench/.bench
 	.venv-bench/bin/python benchmarks/run_all.py \

@@ -33,7 +33,6 @@ from collections.abc import Callable, Sequence
 import json
 from pathlib import Path
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -47,7 +46,7 @@ from piezo_ident.effects import catalogue
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.hysteresis_fit import Excerpt, factorise, fit_hysteresis
 from piezo_ident.model import StageModel
-from side_by_side import markdown, peak_memory, seconds, take_turns, versions
+from side_by_side import last_line, markdown, peak_memory, seconds, take_turns, versions
 
 #: points at the large end through which the exponent is drawn
 LARGE_END = 3
@@ -95,11 +94,7 @@ MEASURES: dict[str, Callable[[float, Path], Measure]] = {
 def measured(kind: str, size: float, folder: Path) -> tuple[float, float, float]:
     """Return time [s], samples and peak memory [MiB] of a measure in a process of its own."""
     command = [sys.executable, str(Path(__file__).resolve()), '--measure', kind, f'{size:g}']
-    done = subprocess.run([*command, str(folder)], capture_output=True, text=True)
-    if done.returncode:
-        said = done.stderr.strip().splitlines() or ['no reason given']
-        raise RuntimeError(f'{kind} of {size:g} s failed: {said[-1]}')
-    took, n, peak = json.loads(done.stdout.splitlines()[-1])
+    took, n, peak = json.loads(last_line(f'{kind} of {size:g} s', [*command, str(folder)]))
     return took, n, peak
 
 

@@ -27,7 +27,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from collections.abc import Callable
 import json
 from pathlib import Path
-import subprocess
 import sys
 import time
 
@@ -43,7 +42,7 @@ from piezo_ident.program import load_program, parse_program
 from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import load_stage, simulate
-from side_by_side import markdown, peak_memory, seconds
+from side_by_side import last_line, markdown, peak_memory, seconds
 
 __all__ = ['EFFECT', 'FIT_MEASURES', 'base_model', 'beginnings', 'labelled', 'to_diagnose']
 
@@ -161,15 +160,10 @@ def beginnings(quick: bool, folder: Path) -> str:
     rows = []
     for size, used in [(20, 17), (20, 20)] if quick else pairs:
         here = [sys.executable, str(Path(__file__).resolve())]
-        for what in ('--answer', '--beginning'):
-            done = subprocess.run(
-                [*here, what, f'{size:g}', f'{used:g}', str(folder)],
-                capture_output=True,
-                text=True,
-            )
-            if done.returncode:
-                raise RuntimeError(done.stderr.strip().splitlines()[-1])
-        rows.append([f'{size:g} s', f'{used:g} s', *json.loads(done.stdout.splitlines()[-1])])
+        sizes = [f'{size:g}', f'{used:g}', str(folder)]
+        last_line('the answer', [*here, '--answer', *sizes])
+        cells = last_line(f'diagnosis of {size:g} s', [*here, '--beginning', *sizes])
+        rows.append([f'{size:g} s', f'{used:g} s', *json.loads(cells)])
     heads = (
         'record',
         'searched',

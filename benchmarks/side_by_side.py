@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 import resource
+import subprocess
 import time
 from typing import Any
 
@@ -34,6 +35,7 @@ import numpy as np
 
 __all__ = [
     'Turn',
+    'last_line',
     'markdown',
     'peak_memory',
     'ratio',
@@ -116,6 +118,22 @@ def seconds(t: float) -> str:
 def ratio(x: float) -> str:
     """Return a ratio with a sensible number of digits."""
     return f'{x:.0f}' if x >= 100 else f'{x:.3g}'
+
+
+def last_line(what: str, command: Sequence[str]) -> str:
+    """
+    Run a program, whose memory is its own, and return the last line that it prints.
+
+    Raises
+    ------
+    RuntimeError
+        When it fails, with the last line of what it said.
+    """
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f'exit code {done.returncode}']
+        raise RuntimeError(f'{what} failed: {said[-1]}')
+    return (done.stdout.splitlines() or [''])[-1]
 
 
 def peak_memory() -> float:
