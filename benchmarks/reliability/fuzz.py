@@ -59,9 +59,9 @@ SECONDS, MEGABYTES, LONGEST = 10, 2048, 40_000
 WATCHED = [
     f'piezo_ident.{x}'
     for x in (
-        'bag_check', 'bag_io', 'bag_recovery', 'effects.base', 'mat_read', 'mcap_scan',
-        'model_io', 'ordering', 'program', 'record_io', 'sampling', 'signals', 'simulation',
-        'table_io', 'wire_format', 'yaml_io',
+        'bag_check', 'bag_io', 'bag_recovery', 'bag_samples', 'effects.base', 'long_bag',
+        'mat_read', 'mcap_scan', 'model_io', 'ordering', 'outlining', 'program', 'record_io',
+        'sampling', 'signals', 'simulation', 'table_io', 'windows', 'wire_format', 'yaml_io',
     )
 ]  # fmt: skip
 

@@ -36,6 +36,8 @@ from piezo_ident.bag_io import MESSAGE_TYPE, typestore
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.join import join
+from piezo_ident.long_bag import read_long_bag
+from piezo_ident.long_record import LongRecord
 from piezo_ident.model import EffectSetting
 from piezo_ident.model_io import model_from_dict, parse_yaml
 from piezo_ident.program import parse_program
@@ -130,7 +132,18 @@ def _file(suffix: str, data: bytes, folder: Path | None) -> None:
     if suffix in ('.mcap', '.db3'):
         with suppress(PiezoIdentError):
             read_record(path)
+        with suppress(PiezoIdentError):
+            _look_through(path)
     read_record(path, recover=True)
+
+
+def _look_through(path: Path) -> None:
+    """Read a bag window by window, as a long one."""
+    found = read_long_bag(path, window=10)
+    if isinstance(found, LongRecord):
+        for _, parts in found.parts(lambda step, share: None):
+            for _ in parts:
+                pass
 
 
 def csv(data: bytes, folder: Path | None = None) -> None:
