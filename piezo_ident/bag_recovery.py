@@ -166,7 +166,8 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
     end = 0 if empty else reader.end_time - 1
     # rosbags takes over from the metadata whatever stands there
     texts = [text for c in reader.connections for text in (c.topic, c.msgtype)]
-    if not all(isinstance(x, str) for x in texts) or {type(start), type(end)} != {int}:
+    numbers = {type(x) for x in (start, end, *(c.msgcount for c in reader.connections))}
+    if not all(isinstance(x, str) for x in texts) or numbers != {int}:
         raise DataError(f'{path}: damaged or unfinished bag (metadata of wrong types); mend it')
     return Bag(path, reader.connections, messages, start, end)
 

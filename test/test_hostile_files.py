@@ -178,6 +178,18 @@ BOMBS = {
 }
 
 
+@pytest.mark.parametrize('count', [[], 'many', {}, None, 1.5])
+def test_counts_of_another_type_in_metadata(tmp_path, count):
+    bag = tmp_path / 'bag'
+    write_record(example(), bag)
+    data = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    topics = data['rosbag2_bagfile_information']['topics_with_message_count']
+    topics[0]['message_count'] = count
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(data))
+    with pytest.raises(DataError, match='damaged'):
+        read_record(bag)
+
+
 @pytest.mark.parametrize('bomb', BOMBS)
 def test_yaml_bombs(tmp_path, bomb):
     path = tmp_path / 'x.yaml'
