@@ -37,8 +37,6 @@ __all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
-#: directions of G that the data hold by less than this share of the best are left as they are
-RANK = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,15 +213,7 @@ def output_error(
         if fall < tol or loss == 0.0:
             break
         H, g = problem.normal(model)
-    H, g = problem.normal(model)
-    # one whole step leaves next to nothing of the way here, so that rounding does not show
-    size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
-    step = np.linalg.lstsq(H / np.outer(size, size), g / size, rcond=RANK)[0] / size
-    trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
-    if trial.radius < RADIUS:
-        new, new_offsets = problem.loss(trial)
-        if new <= loss:
-            model, loss, offsets = trial, new, new_offsets
+    H, _ = problem.normal(model)
     covariance = np.asarray(
         loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
     )
