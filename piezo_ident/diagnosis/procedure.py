@@ -127,7 +127,8 @@ def _diagnosed(
         )
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    base = _base(simulator, given, _swing(model, whole))
+    is_long = records != whole
+    base = _base(simulator, given, _swing(model, whole) if is_long else 0.0)
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
     lines = find_lines(parts, stretches).lines
@@ -144,7 +145,6 @@ def _diagnosed(
         fitted = base
     findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
     fits: Whole | None = None
-    is_long = records != whole
     how = 'nothing was fitted to the rest'
     if is_long and findings.effects and not _is_driven(findings.effects):
         try:
@@ -216,8 +216,10 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
     ]
 
 
-def _base(simulator: Simulator, given: State, swing: float) -> Fitted:
-    """Return the base model refitted on a fine grid of thresholds."""
+def _base(simulator: Simulator, given: State, least: float) -> Fitted:
+    """Return the base model refitted on a fine grid of thresholds, over a swing at least."""
+    # a run may be wider than the pieces that it joins over gaps
+    swing = max(least, *(float(np.ptp(run.u)) for run in simulator.rows.runs))
     if swing == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
     state, columns = fit_base(simulator, given, base_thresholds(swing))

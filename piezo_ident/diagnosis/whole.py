@@ -12,7 +12,6 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """
 Effects that were found in the beginnings of long records, fitted to whole records.
 
