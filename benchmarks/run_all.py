@@ -74,7 +74,7 @@ LIBRARIES = (
     'pyarrow',
 )
 #: longest that one benchmark may take [s]
-LIMIT = 1800.0
+LIMIT = 3600.0
 
 
 @dataclass(frozen=True)
