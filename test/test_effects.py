@@ -134,6 +134,32 @@ def test_rest_is_rest(name):
             assert x[0] == pytest.approx(rest, abs=1e-15)
 
 
+def numbers_of(state):
+    """Yield every number that an effect holds, in itself or in what it is made of."""
+    if isinstance(state, np.ndarray | float):
+        yield from np.ravel(state)
+    elif isinstance(state, list | tuple):
+        for part in state:
+            yield from numbers_of(part)
+    elif hasattr(state, '__dict__'):
+        yield from numbers_of(list(vars(state).values()))
+
+
+@pytest.mark.parametrize('name', EVERY)
+def test_what_dies_away_at_rest_becomes_zero(name):
+    # a number near the end of its range would cost a hundred times the time of another
+    values = VISIBLE[name] | ({'time_constant': [1e-3, 2e-3]} if name == 'creep' else {})
+    effect = find_effect(name)(FS, values, H)
+    u = np.concatenate([signal() / 10, np.zeros(200_000)])
+    effect.reset(0.0, 0.0)
+    # some bounds of parameters are that small
+    before = set(numbers_of(effect))
+    channels = {'other_axis': np.concatenate([other(4000), np.zeros(200_000)])}
+    effect.process(Block(np.arange(u.size) / FS, u, u, channels))
+    small = {x for x in numbers_of(effect) if 0.0 < abs(x) < 1e-200}
+    assert not small - before
+
+
 @pytest.mark.parametrize('name', EVERY)
 def test_reset_forgets_everything(name):
     u, effect = signal() / 10, find_effect(name)(FS, VISIBLE[name], H)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from piezo_ident.block import Block, Slot
 from piezo_ident.effects.base import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.kernel import kernel
+from piezo_ident.kernel import alive, kernel
 
 __all__ = ['AmplifierLag']
 
@@ -33,7 +33,7 @@ def _follow(x: NDArray[np.float64], pole: float, state: float) -> NDArray[np.flo
     out = np.empty(x.size)
     y, share = state, 1.0 - pole
     for k in range(x.size):
-        y += share * (x[k] - y)
+        y = alive(y + share * (x[k] - y))
         out[k] = y
     return out
 

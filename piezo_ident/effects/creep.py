@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from piezo_ident.block import Block, Slot
 from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.kernel import kernel
+from piezo_ident.kernel import alive, kernel
 
 __all__ = ['Creep']
 
@@ -42,7 +42,7 @@ def _crept(
         w = 0.0
         for i in range(c.size):
             s = state[i]
-            s += share[i] * (x - s)
+            s = alive(s + share[i] * (x - s))
             state[i] = s
             w += c[i] * s
         out[k] = x + w

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from piezo_ident.block import Block, Slot
 from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
 from piezo_ident.hysteresis import HysteresisOperator
-from piezo_ident.kernel import kernel
+from piezo_ident.kernel import alive, kernel
 
 __all__ = ['RateDependentHysteresis']
 
@@ -76,7 +76,7 @@ def _low_pass(
     speed = np.empty(v.size)
     last, s = state[0], state[1]
     for k in range(v.size):
-        s = pole * s + (1.0 - pole) * (v[k] - last) * rate
+        s = alive(pole * s + (1.0 - pole) * (v[k] - last) * rate)
         last = v[k]
         speed[k] = s
     state[0], state[1] = last, s

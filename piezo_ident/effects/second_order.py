@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import ModelError
-from piezo_ident.kernel import kernel
+from piezo_ident.kernel import alive, kernel
 
 __all__ = ['Section', 'slope_of_mode']
 
@@ -37,7 +37,7 @@ def _run(
         d = x[k] - last
         last = x[k]
         y = n0 * d + s0
-        s0 = n1 * d - a1 * y + s1
+        s0 = alive(n1 * d - a1 * y + s1)
         s1 = -a2 * y
         out[k] = y
     state[0], state[1], state[2] = last, s0, s1
