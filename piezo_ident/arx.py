@@ -35,6 +35,7 @@ from piezo_ident.errors import IdentificationError
 from piezo_ident.lagged import lag_products
 from piezo_ident.least_squares import ROWS, triangular_factor
 from scipy import signal
+from scipy.linalg import solve_triangular
 
 __all__ = [
     'ArxFactor',
@@ -46,6 +47,9 @@ __all__ = [
     'scan_orders',
     'stabilised',
 ]
+
+#: what is left of a column of unit length, once those before it are taken off, must be more
+INDEPENDENT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,33 @@ class ArxFactor:
         theta = x.copy()
         theta[:na] *= -1.0
         return theta, loss
+
+    def fits(self, na: int, nb_max: int, d: int) -> list[tuple[NDArray[np.float64], float]]:
+        """
+        Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
+
+        Returns
+        -------
+        list of (theta, loss)
+            As from `fit`, which is asked where the data do not tell the columns apart.
+        """
+        columns = [*range(na), *range(self.na_max + d, self.na_max + d + nb_max)]
+        A = self.R[:, columns]
+        scale = np.linalg.norm(A, axis=0)
+        scale[scale == 0.0] = 1.0
+        both = np.column_stack([A / scale, self.R[:, -1]])
+        R = np.asarray(np.linalg.qr(both, mode='r'))
+        left = np.square(R[:, -1])
+        size = np.abs(np.diag(R))
+        found = []
+        for p in range(na + 1, na + nb_max + 1):
+            if size[:p].min() < INDEPENDENT:
+                found.append(self.fit(na, p - na, d))
+                continue
+            theta = solve_triangular(R[:p, :p], R[:p, -1], check_finite=False) / scale[:p]
+            theta[:na] *= -1.0
+            found.append((theta, float(np.sum(left[p:])) / self.n))
+        return found
 
 
 def arx_factor(
@@ -201,8 +232,8 @@ def scan_orders(
     models = []
     for na in range(1, shape[0] + 1):
         row = []
-        for nb in range(1, shape[1] + 1):
-            theta, loss[na - 1, nb - 1] = factor.fit(na, nb, d)
+        for nb, (theta, one_step) in enumerate(factor.fits(na, nb_max, d), 1):
+            loss[na - 1, nb - 1] = one_step
             model = Dynamics(a=theta[:na], b=theta[na:])
             row.append(model)
             if model.is_stable:

@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.block import Block
 from piezo_ident.core_loops import coefficients, recursion
 from piezo_ident.errors import ModelError
+from piezo_ident.kernel import kernel
 from piezo_ident.record import frozen_array
 
 __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
@@ -92,7 +93,7 @@ class Dynamics:
     @property
     def is_stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
-        return self.radius < 1.0
+        return _is_stable(self.a)
 
     def memory(self, share: float) -> int:
         """Return after how many samples its slowest pole has fallen to a share of its start."""
@@ -207,6 +208,22 @@ def filter_arx(
     y[:n_y] = x[0] * _static_gain(b, a) if at_rest else 0.0
     recursion(*coefficients(b, a), w, y)
     return y[n_y:]
+
+
+@kernel
+def _is_stable(a: NDArray[np.float64]) -> bool:
+    # Schur and Cohn: A has all roots within the circle if, and only if, its last coefficient is
+    # smaller than one and the same is true of the polynomial that is one shorter
+    a = a.copy()
+    for n in range(a.size, 0, -1):
+        last = a[n - 1]
+        if not abs(last) < 1.0:
+            return False
+        share = 1.0 / (1.0 - last * last)
+        for i in range(n // 2):
+            k = n - 2 - i
+            a[i], a[k] = share * (a[i] - last * a[k]), share * (a[k] - last * a[i])
+    return True
 
 
 def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:

@@ -24,8 +24,8 @@ from scipy.optimize import lsq_linear
 
 __all__ = ['bounded_least_squares', 'residual_inflation', 'triangular_factor']
 
-#: rows that are factorised at once
-ROWS = 4096
+#: rows that are factorised at once: a block of some dozen columns stays in the cache
+ROWS = 1024
 
 
 def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@
 """Step 2: every order from one factor, mirrored poles, instruments against output noise."""
 
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import A, B
 from piezo_ident.arx import (
     arx_factor,
@@ -58,6 +58,26 @@ def test_orders_from_one_factor_are_lstsq_on_the_plain_matrix(na, nb, d):
     expected, (rest,), *_ = np.linalg.lstsq(phi, y[k], rcond=None)
     assert_allclose(theta, expected, rtol=1e-8, atol=1e-10)
     assert loss == pytest.approx(rest / k.size, rel=1e-8)
+
+
+@pytest.mark.parametrize(('na', 'd'), [(1, 0), (3, 2), (6, 3)])
+def test_all_numerators_at_once_are_each_alone(na, d):
+    u, y = data(PAPER, 3, 900, noise=0.1)
+    factor = arx_factor(u, y, 6, 10)
+    for nb, (theta, loss) in enumerate(factor.fits(na, 6, d), 1):
+        expected, least = factor.fit(na, nb, d)
+        assert_allclose(theta, expected, rtol=1e-8, atol=1e-10)
+        assert loss == pytest.approx(least, rel=1e-8)
+
+
+def test_columns_that_cannot_be_told_apart_share_what_they_explain():
+    # a square wave of long holds: each lag of it is the one before but for a few samples of none
+    u = np.repeat([1.0, -1.0], 450)
+    factor = arx_factor(np.zeros(900), u, 3, 4)
+    for nb, (theta, loss) in enumerate(factor.fits(2, 4, 0), 1):
+        expected, least = factor.fit(2, nb, 0)
+        assert_array_equal(theta, expected)
+        assert loss == least
 
 
 @pytest.mark.parametrize('d', [0, 3, 7])

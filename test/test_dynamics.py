@@ -24,6 +24,7 @@ from paper_stage import A, B
 from piezo_ident.block import Block
 from piezo_ident.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator, filter_arx
 from piezo_ident.errors import ModelError
+from piezo_ident.kernel import STILL
 import pytest
 from scipy import signal
 
@@ -157,6 +158,42 @@ def test_poles_and_stability():
     assert not Dynamics([-1.0], [1.0]).is_stable
     assert Dynamics([-0.999], [1.0]).is_stable
     assert not Dynamics([-2.0], [1.0]).is_stable
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_stability_is_that_of_the_poles(seed):
+    rng = np.random.default_rng(seed)
+    for n in range(1, 16):
+        angle, pairs = rng.uniform(0, np.pi, n // 2), rng.uniform(0.6, 1.01, n // 2)
+        poles = np.concatenate([pairs * np.exp(1j * angle), pairs * np.exp(-1j * angle)])
+        poles = np.concatenate([poles, rng.uniform(-1, 1, n % 2)])
+        G = Dynamics(np.real(np.poly(poles))[1:], [1.0])
+        assert G.is_stable == (G.radius < 1.0)
+        assert_array_equal(G.a, np.real(np.poly(poles))[1:])
+
+
+@pytest.mark.parametrize('a', [[-1.0], [0.0, 1.0], [-2.0, 1.0], [0.5, -1.5]])
+def test_a_pole_on_the_circle_is_not_stable(a):
+    assert not Dynamics(a, [1.0]).is_stable
+
+
+@pytest.mark.parametrize('cut', [1, 2, 3, 500, 20_001])
+def test_what_has_died_away_is_zero_wherever_the_stream_is_cut(cut):
+    x = np.zeros(40_000)
+    x[:50] = np.random.default_rng(0).standard_normal(50)
+    x[30_000] = 1.0
+    whole = filter_arx(PAPER.a, PAPER.b, x, at_rest=False)
+    size = np.abs(whole[whole != 0.0])
+    assert size.min() >= STILL
+    assert np.count_nonzero(whole[20_000:30_000]) == 0
+    operator = DynamicsOperator(PAPER)
+    parts = [Block(np.zeros(part.size), part, part) for part in np.split(x, [cut, 29_999])]
+    assert_array_equal(np.concatenate([operator.process(part).x for part in parts]), whole)
+
+
+def test_no_number_stays_no_number():
+    y = filter_arx(PAPER.a, PAPER.b, np.array([1.0, np.nan, *np.zeros(20)]), at_rest=False)
+    assert np.isnan(y[1:]).all()
 
 
 @pytest.mark.parametrize('b', [[0.0], [1.0, -1.0]])
