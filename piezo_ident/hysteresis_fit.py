@@ -38,7 +38,7 @@ from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.kernel import kernel
 from piezo_ident.lagged import stretches_of
 from piezo_ident.least_squares import bounded_least_squares, triangular_factor
-from piezo_ident.play import initial_memory, play_columns
+from piezo_ident.play import initial_memory, play_columns, weighted_plays
 from piezo_ident.swarm import particle_swarm, Quadratic
 from scipy.optimize import Bounds, OptimizeResult
 
@@ -195,12 +195,14 @@ def factorise(
             begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
             begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
             stretches -= begin
+            before, u = excerpt.u[:begin], excerpt.u[begin:end]
+            memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
             for j in range(m + 2):
                 if j < m:
-                    raw = play_columns(excerpt.u, thresholds[j : j + 1], memory[j : j + 1])[0]
+                    raw = play_columns(u, thresholds[j : j + 1], memory[j : j + 1])[0]
                 else:
-                    raw = excerpt.u ** (3 if j == m else 1)
-                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw[begin:end]))
+                    raw = u * u * u if j == m else u
+                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw))
                 _bin(filtered, stretches, row, block[k + j])
             _bin(np.array(excerpt.x[begin:end]), stretches, row, block[-1])
             yield block.T

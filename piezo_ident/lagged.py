@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.kernel import kernel
 
-__all__ = ['lag_products', 'stretches_of']
+__all__ = ['lag_products', 'lag_sums', 'stretches_of']
 
 #: samples whose products are summed while they are in the cache
 STRETCH = 1024
@@ -47,7 +47,21 @@ def _products(
     for start in range(0, n, STRETCH):
         size = min(STRETCH, n - start)
         a = x[x_at + start : x_at + start + size]
-        for j in range(out.size):
+        fours = out.size // 4 * 4
+        # four lags share one reading of the signal that has none
+        for j in range(0, fours, 4):
+            b = z[z_at + start - j - 3 : z_at + start - j + size]
+            t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+            for k in range(size):
+                t0 += a[k] * b[k + 3]
+                t1 += a[k] * b[k + 2]
+                t2 += a[k] * b[k + 1]
+                t3 += a[k] * b[k]
+            out[j] += t0
+            out[j + 1] += t1
+            out[j + 2] += t2
+            out[j + 3] += t3
+        for j in range(fours, out.size):
             b = z[z_at + start - j : z_at + start - j + size]
             total = 0.0
             for k in range(size):
@@ -84,7 +98,10 @@ def lag_products(
     S = np.empty((n_x, n_z))
     row, column = np.empty(n_z), np.empty(n_x)
     _products(x, z, x_at, z_at, n, row)
-    _products(z, x, z_at, x_at, n, column)
+    if n_x == n_z and x_at == z_at and x.ctypes.data == z.ctypes.data:
+        column[:] = row
+    else:
+        _products(z, x, z_at, x_at, n, column)
     S[0, :] = row
     S[:, 0] = column
     for i in range(n_x - 1):
@@ -93,6 +110,26 @@ def lag_products(
             last = x[x_at + n - 1 - i] * z[z_at + n - 1 - j]
             S[i + 1, j + 1] = S[i, j] + (first - last)
     return S
+
+
+def lag_sums(x: NDArray[np.float64], at: int, n: int, lags: int) -> NDArray[np.float64]:
+    """
+    Return ``sum_{k=s}^{e-1} x(k-i)`` for the lags i = 0 .. lags - 1.
+
+    Parameters
+    ----------
+    x : ndarray, shape (any,)
+    at : int
+        Where the n samples begin; at least as many samples as there are lags come before.
+    n, lags : int
+
+    Returns
+    -------
+    ndarray, shape (lags,)
+    """
+    back = np.arange(1, lags)
+    moved = np.cumsum(x[at - back] - x[at + n - back])
+    return float(np.sum(x[at : at + n])) + np.concatenate([[0.0], moved])
 
 
 def stretches_of(use: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.dynamics import Dynamics, filter_arx
-from piezo_ident.lagged import lag_products, stretches_of
+from piezo_ident.lagged import lag_products, lag_sums, stretches_of
 
 __all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
 
@@ -84,16 +84,26 @@ class OutputErrorFit:
     improved: bool
 
 
+Stretches = list[tuple[int, int]]
+
+
+def _mean(x: NDArray[np.float64], stretches: Stretches) -> float:
+    total = sum(float(np.sum(x[start:stop])) for start, stop in stretches)
+    return total / sum(stop - start for start, stop in stretches)
+
+
 def _past(
-    x: NDArray[np.float64], use: NDArray[np.bool_], count: int, sign: float = 1.0
+    x: NDArray[np.float64], stretches: Stretches, count: int, negative: bool = False
 ) -> NDArray[np.float64]:
     # before the record the stage was at rest; a constant has no part in what is eliminated with
     # the offsets, and without it the sums lose no digits
-    level = float(x[use].mean())
+    level = _mean(x, stretches)
     past = np.empty(count + x.size)
-    past[:count] = x[0] - level
-    np.subtract(x, level, out=past[count:])
-    past *= sign
+    if negative:
+        np.subtract(level, x, out=past[count:])
+    else:
+        np.subtract(x, level, out=past[count:])
+    past[:count] = past[count]
     return past
 
 
@@ -104,43 +114,47 @@ class _Problem:
         self.stretches, self.na, self.nb = stretches, na, nb
         self.n = int(sum(s.use.sum() for s in stretches))
         self.used = [stretches_of(s.use) for s in stretches]
-        self.ones = np.ones(max(s.use.size for s in stretches))
 
-    def loss(self, model: Dynamics) -> tuple[float, NDArray[np.float64]]:
-        total, offsets = 0.0, []
-        for s in self.stretches:
+    def errors(self, model: Dynamics) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+        """Return what the free run leaves of each stretch, without its mean, and the means."""
+        found, offsets = [], []
+        for s, used in zip(self.stretches, self.used, strict=True):
             e = filter_arx(model.a, model.b, s.w)
             np.subtract(s.y, e, out=e)
-            e = e[s.use]
-            offsets.append(float(e.mean()))
+            offsets.append(_mean(e, used))
             e -= offsets[-1]
-            np.square(e, out=e)
-            total += float(np.sum(e))
-        return total / self.n, np.array(offsets)
+            found.append(e)
+        return found, np.array(offsets)
 
-    def normal(self, model: Dynamics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def loss(self, errors: Sequence[NDArray[np.float64]]) -> float:
+        total = 0.0
+        for e, used in zip(errors, self.used, strict=True):
+            total += sum(float(np.sum(np.square(e[start:stop]))) for start, stop in used)
+        return total / self.n
+
+    def normal(
+        self, model: Dynamics, errors: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         na, p = self.na, self.na + self.nb
         H, g = np.zeros((p, p)), np.zeros(p)
         one = np.ones(1)
-        for s, stretches in zip(self.stretches, self.used, strict=True):
-            e = filter_arx(model.a, model.b, s.w)
+        for s, e, used in zip(self.stretches, errors, self.used, strict=True):
             # what is y(k-1), y(k-2), ... and w(k), w(k-1), ... to the products
             groups = []
             if na:
-                y_f = _past(filter_arx(model.a, one, e), s.use, p, -1.0)
+                # the simulated output but for a constant, which `_past` takes out
+                y_f = _past(filter_arx(model.a, one, s.y - e), used, p, negative=True)
                 groups.append((y_f, p - 1, slice(0, na), na))
-            w_f = _past(filter_arx(model.a, one, s.w), s.use, p)
+            w_f = _past(filter_arx(model.a, one, s.w), used, p)
             groups.append((w_f, p, slice(na, p), p - na))
-            np.subtract(s.y, e, out=e)
-            e -= e[s.use].mean()
             sums, n = np.zeros(p), 0
-            for start, stop in stretches:
+            for start, stop in used:
                 n += stop - start
                 here = stop - start
                 for x, x_at, rows, n_x in groups:
                     at = start + x_at
                     g[rows] += lag_products(x, e, at, start, here, n_x, 1)[:, 0]
-                    sums[rows] += lag_products(x, self.ones, at, 0, here, n_x, 1)[:, 0]
+                    sums[rows] += lag_sums(x, at, here, n_x)
                     for z, z_at, columns, n_z in groups:
                         if columns.start >= rows.start:
                             H[rows, columns] += lag_products(
@@ -153,7 +167,8 @@ class _Problem:
 
 def simulation_error(stretches: Sequence[Stretch], model: Dynamics) -> float:
     """Return the rms of the free-run error, an offset taken out of each stretch."""
-    return float(np.sqrt(_Problem(stretches, model.a.size, model.b.size).loss(model)[0]))
+    problem = _Problem(stretches, model.a.size, model.b.size)
+    return float(np.sqrt(problem.loss(problem.errors(model)[0])))
 
 
 def output_error(
@@ -185,10 +200,10 @@ def output_error(
     na, nb = start.a.size, start.b.size
     problem = _Problem(stretches, na, nb)
     model = start
-    loss, offsets = problem.loss(model)
-    first_loss = loss
+    errors, offsets = problem.errors(model)
+    loss = first_loss = problem.loss(errors)
     damping, iterations = 1e-3, 0
-    H, g = problem.normal(model)
+    H, g = problem.normal(model, errors)
     while iterations < maxiter:
         iterations += 1
         if tick is not None:
@@ -200,7 +215,8 @@ def output_error(
             step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
             trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
             if trial.radius < RADIUS:
-                new, new_offsets = problem.loss(trial)
+                new_errors, new_offsets = problem.errors(trial)
+                new = problem.loss(new_errors)
                 if new < loss:
                     accepted = True
                     break
@@ -208,12 +224,12 @@ def output_error(
         if not accepted:
             break
         fall = 1.0 - new / loss
-        model, loss, offsets = trial, new, new_offsets
+        model, loss, errors, offsets = trial, new, new_errors, new_offsets
         damping = max(damping / 10.0, 1e-12)
         if fall < tol or loss == 0.0:
             break
-        H, g = problem.normal(model)
-    H, _ = problem.normal(model)
+        H, g = problem.normal(model, errors)
+    H, _ = problem.normal(model, errors)
     covariance = np.asarray(
         loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
     )

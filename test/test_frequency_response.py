@@ -16,8 +16,9 @@
 
 import numpy as np
 from piezo_ident.dynamics import Dynamics, filter_arx
-from piezo_ident.frequency_response import frequency_response
+from piezo_ident.frequency_response import _straightened, frequency_response
 import pytest
+from scipy import signal
 
 FS = 20_000.0
 # a resonance at 2 kHz with 5 % damping
@@ -79,3 +80,8 @@ def test_silence_is_no_division_by_zero():
 def test_a_few_samples_will_do():
     some = np.random.default_rng(0).standard_normal(20)
     assert frequency_response(some, some, FS).frequency.size > 0
+
+
+def test_trends_are_taken_away_as_scipy_does():
+    x = np.random.default_rng(4).standard_normal((3, 2, 64)) + np.linspace(2, 5, 64)
+    assert np.abs(_straightened(x) - signal.detrend(x)).max() < 1e-12

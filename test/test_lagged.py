@@ -18,8 +18,8 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from numpy.testing import assert_allclose
-from piezo_ident.lagged import lag_products, STRETCH, stretches_of
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.lagged import lag_products, lag_sums, STRETCH, stretches_of
 import pytest
 
 
@@ -66,3 +66,19 @@ def test_products_over_many_stretches_of_the_cache():
 )
 def test_stretches(use, found):
     assert stretches_of(np.array(use, dtype=bool)) == found
+
+
+def test_a_signal_with_itself_is_that_with_its_copy():
+    x = np.random.default_rng(1).standard_normal(300)
+    for lags in (1, 3, 4, 7, 8, 11):
+        same = lag_products(x, x, 20, 20, 250, lags, lags)
+        assert_array_equal(same, lag_products(x, x.copy(), 20, 20, 250, lags, lags))
+        # not the same lags of it
+        other = lag_products(x, x, 20, 21, 250, lags, lags)
+        assert_array_equal(other, lag_products(x, x.copy(), 20, 21, 250, lags, lags))
+
+
+@pytest.mark.parametrize(('n', 'lags'), [(1, 1), (5, 3), (400, 12)])
+def test_sums_are_those_of_the_matrix_of_lags(n, lags):
+    x = np.random.default_rng(2).standard_normal(13 + n)
+    assert_allclose(lag_sums(x, 13, n, lags), matrix(x, 13, n, lags).sum(axis=1), atol=1e-12)

@@ -38,7 +38,7 @@ def test_gradient_against_finite_differences(na, nb):
     use = np.ones(400, dtype=bool)
     use[:37] = use[200:230] = False
     problem = _Problem([Stretch(some.w, some.y, use), stretch(3, 200)], na, nb)
-    _, g = problem.normal(model)
+    _, g = problem.normal(model, problem.errors(model)[0])
     theta = np.concatenate([model.a, model.b])
     numerical = []
     for i in range(na + nb):
@@ -46,7 +46,9 @@ def test_gradient_against_finite_differences(na, nb):
         plus, minus = theta.copy(), theta.copy()
         plus[i] += h
         minus[i] -= h
-        up, down = (problem.loss(Dynamics(t[:na], t[na:]))[0] for t in (plus, minus))
+        up, down = (
+            problem.loss(problem.errors(Dynamics(t[:na], t[na:]))[0]) for t in (plus, minus)
+        )
         numerical.append((up - down) / (2 * h) * problem.n)
     # the loss is the mean of squares, g half of minus its gradient times n
     assert_allclose(-2 * g, numerical, rtol=1e-5, atol=1e-4)
@@ -82,7 +84,8 @@ def test_never_unstable_and_never_worse(seed):
     some = Stretch(w, wild, np.ones(800, dtype=bool))
     fit = output_error([some], start)
     assert fit.dynamics.radius < RADIUS
-    before = _Problem([some], 2, 2).loss(start)[0]
+    problem = _Problem([some], 2, 2)
+    before = problem.loss(problem.errors(start)[0])
     assert fit.rms**2 <= before * (1 + 1e-12)
     assert np.all(np.isfinite(fit.covariance))
 
