@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.kernel import alive, kernel, ordered_kernel, STILL
 
-__all__ = ['advance', 'coefficients', 'recursion', 'sum_of_plays']
+__all__ = ['advance', 'coefficients', 'dies_away', 'recursion', 'sum_of_plays']
 
 #: samples whose sums stay in the cache
 STRETCH = 1024
@@ -181,21 +181,44 @@ def _backward(a: NDArray[np.float64], y: NDArray[np.float64], count: int, size: 
             y1 -= a[FOUR * i + ONE] * past
             y2 -= a[FOUR * i + TWO] * past
             y3 -= a[FOUR * i + THREE] * past
-        x1 = y1 - a1 * y0
-        x2 = (y2 - a2 * y0) - a1 * x1
-        x3 = ((y3 - a3 * y0) - a2 * x1) - a1 * x2
-        if abs(y0) < STILL or abs(x1) < STILL or abs(x2) < STILL or abs(x3) < STILL:
-            # the same with each that has died away set to zero before the next
-            y0 = alive(y0)
-            x1 = alive(y1 - a1 * y0)
-            x2 = alive((y2 - a2 * y0) - a1 * x1)
-            x3 = alive(((y3 - a3 * y0) - a2 * x1) - a1 * x2)
+        y1 -= a1 * y0
+        y2 -= a2 * y0
+        y3 -= a3 * y0
+        y2 -= a1 * y1
+        y3 -= a2 * y1
+        y3 -= a1 * y2
         y[k + na] = y0
-        y[k + na + ONE] = x1
-        y[k + na + TWO] = x2
-        y[k + na + THREE] = x3
+        y[k + na + ONE] = y1
+        y[k + na + TWO] = y2
+        y[k + na + THREE] = y3
     for one in range(whole, n):
         k = np.uintp(one)
+        y0 = y[k + na]
+        for earlier in range(na):
+            i = np.uintp(earlier)
+            y0 -= a[FOUR * i] * y[k + i]
+        y[k + na] = y0
+
+
+@ordered_kernel
+def dies_away(y: NDArray[np.float64], start: int, n: int) -> bool:
+    """Return whether some of n outputs ought to be zero, and are not."""
+    # counted, not looked for: that runs in vector lanes
+    count = 0
+    for k in range(start, start + n):
+        x = y[np.uintp(k)]
+        count += (abs(x) < STILL) & (x != 0.0)
+    return count > 0
+
+
+@ordered_kernel
+def _backward_to_rest(
+    a: NDArray[np.float64], y: NDArray[np.float64], count: int, size: int
+) -> None:
+    # the sums of `_backward`, one after the other; what has died away is zero to the next
+    na = np.uintp(count)
+    for sample in range(size):
+        k = np.uintp(sample)
         y0 = y[k + na]
         for earlier in range(na):
             i = np.uintp(earlier)
@@ -226,8 +249,12 @@ def recursion(
     n = y.size - past_y
     for start in range(0, n, STRETCH):
         size = min(STRETCH, n - start)
-        _forward(b, w[start : start + past_w + size], y[start:], past_y, size)
-        _backward(a, y[start:], past_y, size)
+        new_w, new_y = w[start : start + past_w + size], y[start:]
+        _forward(b, new_w, new_y, past_y, size)
+        _backward(a, new_y, past_y, size)
+        if dies_away(new_y, past_y, size):
+            _forward(b, new_w, new_y, past_y, size)
+            _backward_to_rest(a, new_y, past_y, size)
 
 
 @ordered_kernel

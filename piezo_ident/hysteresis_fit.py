@@ -27,18 +27,19 @@ matrix is all that the swarm needs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import IdentificationError
+from piezo_ident.filtered_plays import filtered_plays
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.kernel import kernel
 from piezo_ident.lagged import stretches_of
 from piezo_ident.least_squares import bounded_least_squares, triangular_factor
-from piezo_ident.play import initial_memory, play_columns, weighted_plays
+from piezo_ident.play import initial_memory, weighted_plays
 from piezo_ident.swarm import particle_swarm, Quadratic
 from scipy.optimize import Bounds, OptimizeResult
 
@@ -183,6 +184,9 @@ def factorise(
         k is the number of excerpts.
     """
     k, m = len(excerpts), thresholds.size
+    # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
+    part = np.array([1.0 - delay.fraction, delay.fraction])
+    G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
 
     def rows() -> Iterator[NDArray[np.float64]]:
         for i, excerpt in enumerate(excerpts):
@@ -197,13 +201,12 @@ def factorise(
             stretches -= begin
             before, u = excerpt.u[:begin], excerpt.u[begin:end]
             memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
-            for j in range(m + 2):
-                if j < m:
-                    raw = play_columns(u, thresholds[j : j + 1], memory[j : j + 1])[0]
-                else:
-                    raw = u * u * u if j == m else u
-                filtered = filter_arx(dynamics.a, dynamics.b, delay.apply(raw))
-                _bin(filtered, stretches, row, block[k + j])
+            u = Delay(delay.samples).apply(u)
+            # the play at r = 0 is the voltage itself
+            some, linear = np.append(thresholds, 0.0), np.append(memory, u[0])
+            columns = filtered_plays(u, some, linear, G, stretches, row)
+            block[k : k + m], block[k + m + 1] = columns[:-1], columns[-1]
+            block[k + m] = filtered_plays(u**3, some[-1:], linear[-1:] ** 3, G, stretches, row)
             _bin(np.array(excerpt.x[begin:end]), stretches, row, block[-1])
             yield block.T
 
