@@ -44,17 +44,20 @@ import numpy as np
 from piezo_ident.block import Block
 from piezo_ident.core_loops import coefficients, recursion, sum_of_plays
 from piezo_ident.dynamics import Dynamics, filter_arx
+from piezo_ident.filtered_plays import filtered_plays
 from piezo_ident.fused import STRETCH
 from piezo_ident.identification import identify
 from piezo_ident.model import StageModel
 from piezo_ident.output_error import _Problem, Stretch
-from piezo_ident.play import weighted_plays
+from piezo_ident.play import play_columns, weighted_plays
 from piezo_ident.record import Piece
 from piezo_ident.shipped import find_config
 from piezo_ident.simulation import load_stage
 from side_by_side import markdown, ratio, seconds, take_turns, versions
 
 RUNS = 5
+#: samples that a row of step 3 averages
+ROW = 12
 
 #: stage, function, and the caller that it is counted under; None counts all calls
 STAGES: tuple[tuple[str, str, str | None], ...] = (
@@ -177,6 +180,14 @@ def normal_by_matrix(w: np.ndarray, y: np.ndarray, model: Dynamics) -> np.ndarra
     return np.column_stack([J @ J.T, J @ (e - e.mean())])
 
 
+def columns_by_themselves(u: np.ndarray, r: np.ndarray, G: Dynamics) -> np.ndarray:
+    """Return the columns of step 3, each played, filtered and averaged as a whole."""
+    played = (play_columns(u, [width])[0] for width in r)
+    filtered = (filter_arx(G.a, G.b, column) for column in played)
+    n = u.size // ROW * ROW
+    return np.array([y[:n].reshape(-1, ROW).sum(axis=1) / np.sqrt(ROW) for y in filtered])
+
+
 def measures(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     """Return the table of what was done, each against the straightforward way."""
     h, g, v = model.hysteresis, model.dynamics, voltage(model, n)
@@ -187,6 +198,8 @@ def measures(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     y = filter_arx(g.a, g.b, w)
     problem = _Problem([Stretch(w, y, np.ones(n, dtype=bool))], g.a.size, g.b.size)
     b = np.append(g.b, 0.0)
+    still = np.zeros(n)
+    still[:100] = 1.0
 
     def one_by_one() -> None:
         chain, s = model.chain(), model.scaling
@@ -207,13 +220,21 @@ def measures(model: StageModel, n: int, runs: int) -> tuple[str, str]:
             lambda: transposed_form(b, g.a, u, np.zeros(g.a.size), out),
             lambda: filter_arx(g.a, g.b, u),
         ),
+        'G at rest: what has died away is zero': (
+            lambda: transposed_form(b, g.a, still, np.zeros(g.a.size), out),
+            lambda: filter_arx(g.a, g.b, still),
+        ),
+        f'step 3: {zero.size} columns, four at a time from the voltage to the rows': (
+            lambda: columns_by_themselves(u, h.thresholds, g),
+            lambda: filtered_plays(u, h.thresholds, zero, g, np.array([[0, n]]), ROW),
+        ),
         f'stream in blocks of {BLOCK}: H, G, delay and scaling in one kernel': (
             one_by_one,
             lambda: in_blocks(model.stream().process, v),
         ),
         'output error: products of lags from their first row': (
             lambda: normal_by_matrix(w, y, start),
-            lambda: problem.normal(start),
+            lambda: problem.normal(start, problem.errors(start)[0]),
         ),
     }
     works: Works = {}

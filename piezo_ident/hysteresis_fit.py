@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+import functools
 from typing import Any, Literal
 
 import numpy as np
@@ -92,7 +93,7 @@ class Excerpt:
             return initial_memory(float(self.u[0]), thresholds)
         return self.memory(thresholds)
 
-    @property
+    @functools.cached_property
     def row(self) -> int:
         """Samples that one row of the fit may average."""
         if not self.use.any():

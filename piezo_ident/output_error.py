@@ -203,11 +203,11 @@ def output_error(
     errors, offsets = problem.errors(model)
     loss = first_loss = problem.loss(errors)
     damping, iterations = 1e-3, 0
-    H, g = problem.normal(model, errors)
     while iterations < maxiter:
         iterations += 1
         if tick is not None:
             tick()
+        H, g = problem.normal(model, errors)
         diagonal = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         scaled = H / np.outer(diagonal, diagonal)
         accepted = False
@@ -228,7 +228,6 @@ def output_error(
         damping = max(damping / 10.0, 1e-12)
         if fall < tol or loss == 0.0:
             break
-        H, g = problem.normal(model, errors)
     H, _ = problem.normal(model, errors)
     covariance = np.asarray(
         loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
