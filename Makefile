@@ -41,8 +41,8 @@ test-graph: .venv/.test
 test-jazzy: .venv-jazzy/.test
 	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
 
-# side by side with the peers, in an environment of their own: three quarters of an hour; QUICK=1
-# for a short version, which goes to build/
+# side by side with the peers, in an environment of their own: forty minutes to over an hour;
+# QUICK=1 for a short version, which goes to build/
 bench: .venv-bench/.bench
 	.venv-bench/bin/python benchmarks/run_all.py \
 		$(if $(QUICK),--quick --out build/benchmarks.md,--out docs/benchmarks.md)

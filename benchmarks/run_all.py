@@ -74,7 +74,7 @@ LIBRARIES = (
     'pyarrow',
 )
 #: longest that one benchmark may take [s]
-LIMIT = 3600.0
+LIMIT = 7200.0
 
 
 @dataclass(frozen=True)
