@@ -72,6 +72,15 @@ class ArxFactor:
     na_max: int
     n_lags: int
 
+    def _columns(
+        self, na: int, nb: int, d: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        # those of an order, and their lengths
+        A = self.R[:, [*range(na), *range(self.na_max + d, self.na_max + d + nb)]]
+        scale = np.linalg.norm(A, axis=0)
+        scale[scale == 0.0] = 1.0
+        return A, scale
+
     def fit(self, na: int, nb: int, d: int) -> tuple[NDArray[np.float64], float]:
         """
         Solve one order by least squares.
@@ -83,10 +92,7 @@ class ArxFactor:
         loss : float
             Mean square of the one-step prediction error.
         """
-        columns = [*range(na), *range(self.na_max + d, self.na_max + d + nb)]
-        A, y = self.R[:, columns], self.R[:, -1]
-        scale = np.linalg.norm(A, axis=0)
-        scale[scale == 0.0] = 1.0
+        (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
         x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
         loss = float(np.sum((y - A @ x) ** 2)) / self.n
         theta = x.copy()
@@ -102,10 +108,7 @@ class ArxFactor:
         list of (theta, loss)
             As from `fit`, which is asked where the data do not tell the columns apart.
         """
-        columns = [*range(na), *range(self.na_max + d, self.na_max + d + nb_max)]
-        A = self.R[:, columns]
-        scale = np.linalg.norm(A, axis=0)
-        scale[scale == 0.0] = 1.0
+        A, scale = self._columns(na, nb_max, d)
         both = np.column_stack([A / scale, self.R[:, -1]])
         R = np.asarray(np.linalg.qr(both, mode='r'))
         left = np.square(R[:, -1])

@@ -56,5 +56,8 @@ def alive(x: float) -> float:
 
     For the state of a filter: where its input rests, it falls until the digits of a number run
     out, and from there on each operation takes a processor a hundred times as long.
+
+    It is compiled into each loop that calls it, and loops are kept on disk until their own file
+    changes: whoever changes it has to empty their caches.
     """
     return 0.0 if abs(x) < STILL else x
