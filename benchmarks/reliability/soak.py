@@ -48,7 +48,7 @@ sys.path.insert(0, str(HERE.parent))
 from piezo_ident.bag_recovery import opened_bag
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.starter import Nodes
-from rows import crowd, write_rows
+from rows import processors, shares, write_rows
 
 __all__ = ['Observer', 'Soak', 'soak']
 
@@ -256,6 +256,9 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         nodes.start('excitation', parameters={'subscribers': 5, 'rate_factor': factor})
         observer = Observer(client)
         try:
+            # a node that runs for the first time compiles its kernels before it says anything
+            for name in NODES:
+                client.wait(lambda name=name: client.status(name), 120.0, name, nodes.check)
             _ask(client, 'recorder/start')
             _until(nodes, client, 'recorder', ('recording',), 30.0)
             left, samples = seconds, 0
@@ -397,12 +400,15 @@ def main() -> int:
     os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     folder = Path(tempfile.mkdtemp(prefix='piezo_ident_soak_', dir=args.folder))
+    before = processors()
     try:
         found = soak(args.seconds, args.factor, args.part, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+    load = shares(before, processors())
     for line in found.lines():
         print(line)
+    print(load)
     growth = ', '.join(
         f'{name} {k:+.1f} ± {error:.1f}' for name, (_, _, k, error) in found.memory.items()
     )
@@ -414,7 +420,7 @@ def main() -> int:
             {
                 'what': f'the whole graph at 20 kHz for {found.seconds / 60:g} min {pace}, '
                 'recording in parts',
-                'how_often': f'1 run, {found.samples:,} samples{crowd()}',
+                'how_often': f'1 run, {found.samples:,} samples, {load}',
                 'result': f'{lost}; memory in MB/h: {growth}; sample clock '
                 f'{1e6 * found.drift:+.1f} ± {1e6 * found.drift_error:.1f} µs/s against that of '
                 f'the machine; {found.late} blocks late; {found.parts} parts',
