@@ -108,6 +108,25 @@ class Ledger:
             entries.append(entry)
         return entries
 
+    @property
+    def exists(self) -> bool:
+        """Whether the folder has been begun, by this run or an earlier one."""
+        return self.path.exists()
+
+    def begin(self) -> None:
+        """
+        Make the file, by which the folder is known as one of results.
+
+        Raises
+        ------
+        DataError
+            When it cannot be written.
+        """
+        try:
+            self.path.touch()
+        except OSError as error:
+            raise self._unwritable(error) from None
+
     def done(self, record: str, key: str) -> Row | None:
         """Return the row of a record that was good under the same key, None otherwise."""
         entry = self._entries.get(record)
@@ -132,11 +151,14 @@ class Ledger:
                 # file names need not be Unicode
                 file.write(f'{json.dumps(asdict(entry))}\n'.encode('utf-8', 'replace'))
         except OSError as error:
-            raise DataError(
-                f'{self.path}: cannot be written ({error.strerror or error}); choose a folder '
-                'with room and the right to write'
-            ) from None
+            raise self._unwritable(error) from None
         self._entries[row.record] = entry
+
+    def _unwritable(self, error: OSError) -> DataError:
+        return DataError(
+            f'{self.path}: cannot be written ({error.strerror or error}); choose a folder with '
+            'room and the right to write'
+        )
 
     def _size_of_whole_lines(self) -> int:
         # the last one of a run that was killed may be half written

@@ -219,7 +219,7 @@ def test_interrupted_it_keeps_what_is_done_and_goes_on(capsys, records, result, 
         text=True,
     )
     try:
-        while process.poll() is None and not (out / LEDGER).exists():
+        while process.poll() is None and not ((out / LEDGER).exists() and lines(out)):
             time.sleep(0.01)
         # as a terminal does: to all of them
         os.killpg(process.pid, signal.SIGINT)
@@ -283,6 +283,44 @@ def test_places_that_will_not_do(capsys, records, result, tmp_path):
     assert 'both called stage_1' in refused(capsys, 'identify', *both, '--each', tmp_path / 'o')
     argv = ['diagnose', result, records, '--each', result]
     assert 'identify --each found' in refused(capsys, *argv)
+
+
+def test_no_input_and_nothing_foreign_is_written_over(capsys, records, tmp_path):
+    record, model = tmp_path / 'in' / 'a.npz', tmp_path / 'models' / 'a.yaml'
+    record.parent.mkdir()
+    model.parent.mkdir()
+    shutil.copyfile(records / 'stage_1.npz', record)
+    save_model(base_model(), model)
+    kept = model.read_bytes()
+    out = tmp_path / 'out'
+    # the model that is asked about, its folder, and what holds that
+    for given in (model, model.parent, tmp_path):
+        err = refused(capsys, 'diagnose', given, record, '--each', tmp_path)
+        assert 'is an input, or holds one' in err
+    # a shell's glob names files, and not their folder
+    assert 'where the records are' in refused(capsys, 'identify', record, '--each', record.parent)
+    # a record that stands where its report would
+    bag = out / 'reports' / 'run'
+    bag.mkdir(parents=True)
+    shutil.copyfile(record, bag / 'run.npz')
+    argv = ['identify', bag / 'run.npz', '--each', out, '--reports']
+    assert 'is an input, or holds one' in refused(capsys, *argv)
+    # somebody's own file under the name of a model
+    (out / 'models').mkdir()
+    (out / 'models' / 'a.yaml').write_text('mine')
+    assert 'is there already' in refused(capsys, 'identify', record, '--each', out)
+    assert (out / 'models' / 'a.yaml').read_text() == 'mine'
+    assert model.read_bytes() == kept
+    assert (bag / 'run.npz').is_file()
+
+
+def test_the_folder_one_is_in_has_a_name(capsys, records, tmp_path, monkeypatch):
+    here = tmp_path / 'mine'
+    here.mkdir()
+    (here / 'metadata.yaml').write_text('no bag')
+    monkeypatch.chdir(here)
+    refused(capsys, 'identify', '.', '--each', tmp_path / 'out', '--reports')
+    assert [row['record'] for row in table(tmp_path / 'out')] == ['mine']
 
 
 def test_reports(capsys, records, tmp_path):

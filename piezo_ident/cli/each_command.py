@@ -29,7 +29,7 @@ from typing import Any
 
 from piezo_ident.batch import Diagnose, failed, fingerprint, Identify, Outcome, Reading, Row
 from piezo_ident.batch_table import columns_of, unit_of, write_tables
-from piezo_ident.cli.common import check_limits, expand
+from piezo_ident.cli.common import check_bag_options, check_limits, expand
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_folder
@@ -81,7 +81,7 @@ def identify_each(args: argparse.Namespace, settings: Settings, console: Console
     reading = _reading(args)
     jobs = [
         Identify(name, path, reading, settings, identification_files if args.reports else None)
-        for name, path in _named(expand(args.records))
+        for name, path in _named(_records(args))
     ]
     _each(args, jobs, 'identified', console)
 
@@ -93,7 +93,7 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     reading = _reading(args)
     find = _models(args.model_file)
     jobs = []
-    for name, path in _named(expand(args.records)):
+    for name, path in _named(_records(args)):
         model, text = find(name)
         jobs.append(
             Diagnose(
@@ -107,6 +107,12 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
             )
         )
     _each(args, jobs, 'diagnosed', console)
+
+
+def _records(args: argparse.Namespace) -> list[Path]:
+    paths = expand(args.records)
+    check_bag_options(paths, args)
+    return paths
 
 
 def _reading(args: argparse.Namespace) -> Reading:
@@ -123,7 +129,9 @@ def _named(paths: Sequence[Path]) -> list[tuple[str, str]]:
     """Return name and place of records; the workers may have another working directory."""
     found: dict[str, Path] = {}
     for path in paths:
-        name = path.name if path.is_dir() else path.stem
+        # of '.' too, and of a link as it is called
+        place = Path(os.path.abspath(path))
+        name = place.name if path.is_dir() else place.stem
         if name in found:
             raise ConfigError(
                 f'{found[name]} and {path} are both called {name}; rename one, or give them in '
@@ -133,14 +141,18 @@ def _named(paths: Sequence[Path]) -> list[tuple[str, str]]:
     return [(name, os.path.abspath(path)) for name, path in found.items()]
 
 
+def _folder_of_models(path: Path) -> Path:
+    """Return a folder of models, or the one in what identify --each wrote."""
+    return path / 'models' if (path / 'models').is_dir() else path
+
+
 def _models(path: Path) -> Callable[[str], tuple[str, str]]:
     """Return what finds the model of a record, as its name and its text."""
     if not path.is_dir():
         # one for all; read here, so that what is wrong with it is said once
         text = model_to_yaml(load_model(path))
         return lambda name: (path.name, text)
-    # what identify --each wrote, or its folder of models
-    folder = path / 'models' if (path / 'models').is_dir() else path
+    folder = _folder_of_models(path)
 
     def find(name: str) -> tuple[str, str]:
         file = folder / f'{name}.yaml'
@@ -163,15 +175,19 @@ class _Folder:
 
     path: Path
 
+    @property
+    def models(self) -> Path:
+        return self.path / 'models'
+
     def model(self, name: str) -> Path:
-        return self.path / 'models' / f'{name}.yaml'
+        return self.models / f'{name}.yaml'
 
     def report(self, name: str) -> Path:
         return self.path / 'reports' / name
 
     def make(self) -> None:
         try:
-            (self.path / 'models').mkdir(parents=True, exist_ok=True)
+            self.models.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise _unwritable(self.path, error) from None
 
@@ -213,8 +229,9 @@ def _unwritable(path: Path, error: OSError) -> DataError:
 def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Console) -> None:
     folder = _Folder(args.each)
     check_folder(folder.path)
-    _refuse_inputs(folder.path, [*args.records, *(Path(job.path) for job in jobs)])
     ledger = Ledger(folder.path, args.verb)
+    _refuse_inputs(folder.path, [*args.records, *(Path(job.path) for job in jobs)])
+    _refuse_targets(folder, jobs, getattr(args, 'model_file', None), ledger.exists)
     keys = [_key(job) for job in jobs]
     rows: dict[int, Row] = {}
     for i, (job, key) in enumerate(zip(jobs, keys, strict=True)):
@@ -223,6 +240,7 @@ def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Con
             rows[i] = row
     kept = len(rows)
     folder.make()
+    ledger.begin()
     todo = [i for i in range(len(jobs)) if i not in rows]
     try:
         with console.progress() as progress:
@@ -266,10 +284,35 @@ def _run(jobs: Sequence[Job], places: Places, tick: Callable[[], None]) -> Any:
     return run_all(jobs, places, lost, tick)
 
 
-def _refuse_inputs(out: Path, inputs: Sequence[Path]) -> None:
+def _refuse_inputs(out: Path, records: Sequence[Path]) -> None:
     # its table would be taken for a record the next time
-    if out.exists() and any(p.exists() and p.samefile(out) for p in inputs):
+    place = out.resolve()
+    if any(place in (path.resolve(), path.resolve().parent) for path in records):
         raise ConfigError(f'{out}: is where the records are; choose another folder for --each')
+
+
+def _refuse_targets(
+    folder: _Folder, jobs: Sequence[Job], model: Path | None, is_ours: bool
+) -> None:
+    """Refuse to put results where an input stands, or what no earlier run has put there."""
+    inputs = {Path(job.path).resolve() for job in jobs}
+    if model is not None and model.is_dir():
+        given = _folder_of_models(model).resolve()
+        inputs |= {given / f'{job.name}.yaml' for job in jobs}
+    elif model is not None:
+        inputs.add(model.resolve())
+    inside = {above for path in inputs for above in (path, *path.parents)}
+    for job in jobs:
+        for target in (folder.model(job.name), folder.report(job.name)):
+            if target.resolve() in inside:
+                raise ConfigError(
+                    f'{target}: is an input, or holds one; choose another folder for --each'
+                )
+            if target.exists() and not is_ours:
+                raise ConfigError(
+                    f'{target}: is there already, and not of an earlier --each; choose another '
+                    'folder'
+                )
 
 
 def _key(job: Job) -> str:
