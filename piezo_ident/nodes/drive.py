@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 import time
 from typing import Any
 
@@ -217,27 +218,37 @@ class Drive:
 
     def _playing(self) -> None:
         now, streams = time.monotonic(), self._streams()
-        if streams.voltage_time != self._seen.voltage_time:
+        if _moved(streams.voltage_time, self._seen.voltage_time):
             self._sign = now
+        heard = streams.voltage != self._first.voltage
+        # while nothing has come both times are NaN, and more may be under way
         behind = streams.displacement_time != streams.voltage_time
-        if streams.displacement_time != self._seen.displacement_time or not behind:
+        gone_on = _moved(streams.displacement_time, self._seen.displacement_time)
+        if gone_on or not behind or not heard:
             self._stage_sign = now
         self._seen = streams
-        started = self._active or streams.voltage != self._first.voltage
+        started = self._active or heard
         if started and self._state == 'done':
             self._done = self._done or now
             if not behind or now - self._done > _TAIL:
                 self._end(None)
         elif started and self._state in _RESTING:
             self._end(f'the excitation ended early ({self._state}): {self._message}')
-        elif behind and streams.voltage and now - self._stage_sign > self._limit:
+        elif behind and heard and now - self._stage_sign > self._limit:
+            at = streams.displacement_time
+            since = 'with none at all' if math.isnan(at) else f'since t = {at:.6g} s'
             self._end(
-                f'the stage has given no displacement for {self._limit:g} s, since t = '
-                f'{streams.displacement_time:.6g} s; is it running?'
+                f'the stage has given no displacement for {self._limit:g} s, {since}; is it '
+                'running?'
             )
         elif self._silent():
             said = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
             self._end(f'no sign of the excitation for {self._limit:g} s{said}')
+
+
+def _moved(time: float, before: float) -> bool:
+    """Return whether a stream has come further; both are NaN while there is none."""
+    return time != before and not (math.isnan(time) and math.isnan(before))
 
 
 def _nothing(*_: object) -> None:

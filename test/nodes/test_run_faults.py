@@ -160,6 +160,36 @@ def test_a_stage_that_stops_answering_in_a_run(lab):
     assert len(lab.texts('model')) == models
 
 
+def test_an_excitation_that_is_killed_before_its_first_block(lab):
+    excitation = lab.handle('excitation')
+    assert lab.set('identifier', 'excitation_limit', 2.0)[0]
+    # so that it waits for somebody who never comes
+    assert lab.set('excitation', 'subscribers', 9)[0]
+    seen = run(lab, HIGH)
+    lab.wait(lambda: lab.status('excitation')['state'] == 'waiting', 'the excitation to wait')
+    excitation.kill()
+    try:
+        assert 'no sign of the excitation for 2 s' in ended(lab, seen, 'failed')
+    finally:
+        lab.restart(excitation)
+        assert lab.set('identifier', 'excitation_limit', 20.0)[0]
+
+
+def test_a_stage_that_never_answers(lab):
+    stage = lab.handle('stage')
+    assert lab.set('identifier', 'excitation_limit', 2.0)[0]
+    seen = run(lab, HIGH)
+    # before the first block
+    stage.send(signal.SIGSTOP)
+    try:
+        reason = ended(lab, seen, 'failed')
+        assert 'the stage has given no displacement for 2 s' in reason
+    finally:
+        stage.send(signal.SIGCONT)
+    assert lab.set('identifier', 'excitation_limit', 20.0)[0]
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'the stage at rest')
+
+
 def test_an_identifier_that_is_killed_in_a_run(lab):
     models, applied = len(lab.texts('model')), lab.collect('applied_voltage')
     run(lab, HIGH)
