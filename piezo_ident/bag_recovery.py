@@ -118,8 +118,14 @@ def opened_bag(path: str | Path) -> Iterator[Bag]:
         it too, for damage that shows itself later.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        is_there = path.exists()
+    except OSError as error:
+        raise DataError(f'{path}: cannot be read ({error.strerror or error})') from None
+    if not is_there:
         raise DataError(f'{path}: does not exist; check the name')
+    if path.is_file() and path.suffix != path.suffix.lower():
+        raise DataError(f'{path}: a bag is known by .mcap or .db3 in small letters; rename it')
     with ExitStack() as stack:
         with damage_as_data_error(path):
             bag = _recovered(path, stack) if is_unfinished(path) else _finished(path, stack)

@@ -116,9 +116,9 @@ class BagWriter:
         path = Path(os.path.abspath(path))
         for number in range(NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
-            if place.exists() or place.is_symlink():
-                continue
             try:
+                if place.exists() or place.is_symlink():
+                    continue
                 writer = Writer(place, version=9, storage_plugin=STORAGES[self._storage])
                 writer.open()
             except WriterError:
@@ -362,16 +362,16 @@ class LossCount:
     2
     """
 
-    #: a larger gap is another publisher, joined late
+    #: among several publishers a larger gap is another one, joined late
     GAP = 1000
 
     def __init__(self) -> None:
         self.lost = 0
         self._last: list[int] = []
 
-    def note(self, number: int) -> None:
-        """Take note of the number that a publisher gave a message."""
-        before = [n for n in self._last if number - self.GAP <= n < number]
+    def note(self, number: int, *, alone: bool = False) -> None:
+        """Take note of the number that a publisher, the same and only one if `alone`, gave."""
+        before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)
             return

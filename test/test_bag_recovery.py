@@ -501,6 +501,14 @@ def test_both_ways_of_reading_agree(tmp_path):
             assert (bag.start, bag.end) == (10**18, 10**18 + 39 * 5_000_000 + 100_000)
 
 
+def test_a_name_that_no_disk_takes_is_refused(tmp_path):
+    with (
+        pytest.raises(DataError, match=r'cannot be read|does not exist'),
+        opened_bag(tmp_path / ('x' * 300)),
+    ):
+        pass
+
+
 def test_lost_messages_are_counted():
     losses = LossCount()
     for number in (1, 2, 3, 7, 8):
@@ -510,3 +518,6 @@ def test_lost_messages_are_counted():
     for number in (1, 2, 90000, 90001):
         losses.note(number)
     assert losses.lost == 3
+    # of one that is known to be the same a long silence is a loss
+    losses.note(95001, alone=True)
+    assert losses.lost == 3 + 4999

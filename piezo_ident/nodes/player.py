@@ -191,13 +191,15 @@ class PlayerNode(LabNode):
                 f'stopped after {replay.messages} of {replay.total} messages',
                 progress=replay.progress,
             )
-        except PiezoIdentError as error:
+        # nobody would hear of a thread that ends by itself
+        except Exception as error:  # noqa: BLE001
+            reason = str(error) if isinstance(error, PiezoIdentError) else repr(error)
             if not replay.ready.is_set():
-                replay.refusal = str(error)
-                self._report('refused', str(error), ERROR)
+                replay.refusal = reason
+                self._report('refused', reason, ERROR)
             else:
-                replay.failure = str(error)
-                self._report('failed', str(error), ERROR, replay.progress)
+                replay.failure = reason
+                self._report('failed', reason, ERROR, replay.progress)
         finally:
             replay.ready.set()
 

@@ -183,10 +183,10 @@ class RecorderNode(LabNode):
                 },
                 self.values['max_bag_size'],
             )
-        except PiezoIdentError as error:
-            recording.failure = str(error)
-            recording.over.set()
-            recording.opened.set()
+        # nobody would hear of a thread that ends by itself
+        except Exception as error:  # noqa: BLE001
+            known = isinstance(error, PiezoIdentError)
+            self._give_up(recording, taps, str(error) if known else repr(error))
             return
         recording.path = str(writer.path)
         recording.opened.set()
@@ -209,6 +209,16 @@ class RecorderNode(LabNode):
                 about = f'{writer.messages} messages in {writer.path}{parts}'
                 self._report('done', about, progress=100.0)
             taps.close()
+
+    def _give_up(self, recording: Recording, taps: Taps, reason: str) -> None:
+        recording.failure = reason
+        recording.end.set()
+        recording.over.set()
+        recording.opened.set()
+        taps.close()
+        # the call that asked for it has been answered by then
+        if time.monotonic() - recording.started > PATIENCE:
+            self._report('failed', reason, ERROR)
 
     def _record(self, recording: Recording, taps: Taps, writer: PartWriter) -> None:
         flushed = time.monotonic()

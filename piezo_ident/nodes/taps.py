@@ -145,6 +145,9 @@ class Tap:
     losses: LossCount = field(default_factory=LossCount)
     taken: int = 0
     problem: str = ''
+    #: who publishes, and whether it has been one and the same at the last two looks
+    publishers: frozenset[bytes] = frozenset()
+    is_single: bool = False
 
 
 class Taps:
@@ -203,6 +206,9 @@ class Taps:
         found = [
             i for i in self._node.get_publishers_info_by_topic(tap.topic) if '/' in i.topic_type
         ]
+        publishers = frozenset(bytes(i.endpoint_gid) for i in found)
+        tap.is_single = len(publishers) == 1 and publishers == tap.publishers
+        tap.publishers = publishers
         if not found:
             if tap.request is not None:
                 return tap.request
@@ -265,7 +271,8 @@ class Taps:
                         break
                     raw, info = found
                     tap.taken += 1
-                    tap.losses.note(info['publication_sequence_number'] or 0)
+                    number = info['publication_sequence_number'] or 0
+                    tap.losses.note(number, alone=tap.is_single)
                     messages.append((info['received_timestamp'] or time.time_ns(), tap.topic, raw))
         messages.sort(key=lambda m: m[0])
         return messages

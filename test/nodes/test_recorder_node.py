@@ -147,10 +147,11 @@ def test_record_stop_and_refusals(tmp_path):
         g.wait(lambda: g.status('a/recorder')['state'] == 'done', 'closed bag')
         # a place that cannot be
         (tmp_path / 'file').write_text('')
-        assert g.set('a/recorder', 'output', str(tmp_path / 'file' / 'bag'))[0]
-        ok, message = g.call('a/recorder/start')
-        assert not ok
-        assert 'cannot be written' in message
+        for place in (tmp_path / 'file' / 'bag', tmp_path / ('x' * 300)):
+            assert g.set('a/recorder', 'output', str(place))[0]
+            ok, message = g.call('a/recorder/start')
+            assert not ok
+            assert 'cannot be written' in message
         g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), 'diagnostics')
     got = contents(tmp_path / 'bag')
     assert arrays(got['/a/voltage']) == [v for v, _ in source.messages]
