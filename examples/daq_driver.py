@@ -19,7 +19,7 @@ import sys
 import time
 
 import numpy as np
-from piezo_ident.errors import DataError
+from piezo_ident.errors import DataError, PiezoIdentError
 from piezo_ident.follower import Follower, Kind
 from piezo_ident.guard import Guard, GuardSettings
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
@@ -41,18 +41,35 @@ class Driver(LabNode):
     """Publishes what the amplifier got and what the stage did, block by block."""
 
     executable = 'stage'  # whose name, parameters and config/stage.yaml it takes over
+    drives = True  # so it is at rest before any other node of its process ends
 
     def __init__(self) -> None:
         super().__init__()
-        settings = GuardSettings(*(self.values[name] for name in LIMITS), RATE)
-        Guard(settings).process([np.nan])  # compiles what the first block would wait for
-        self.guard = Guard(settings)
+        self.guard = Guard(self._settings(self.values))
+        Guard(self.guard.settings).process([np.nan])  # compiles what blocks would wait for
         self.follower = Follower(RATE, self.values['silence'])
         self.tick, self.heard = 0, time.monotonic()
         self.y = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
         self.applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
         self.v = self.create_subscription(Float64MultiArray, 'voltage', self._on_block, STREAM)
         self.create_timer(PERIOD, self._on_timer)
+
+    def _settings(self, values: dict) -> GuardSettings:
+        return GuardSettings(*(values[name] for name in LIMITS), RATE)
+
+    def refuse(self, name: str, value: object) -> str | None:
+        """Refuse limits that are crossed; somebody may set them while the stage moves."""
+        try:
+            if name in LIMITS and set(LIMITS) <= set(self.wanted):
+                self._settings(self.wanted)
+        except PiezoIdentError as error:
+            return str(error)
+        return None
+
+    def apply(self, changed: dict) -> None:
+        """Take new limits over at the next sample."""
+        self.guard.settings = self._settings(self.values)
+        self.follower.longest_gap = self.values['silence']
 
     def _on_block(self, message: Float64MultiArray, info: dict) -> None:
         number = info.get('publication_sequence_number')
@@ -88,7 +105,8 @@ class Driver(LabNode):
                 self.report_status('ramping', 0.0, 'no voltage: ramping to rest', WARN)
 
     def close(self) -> None:
-        """Be at rest before the node ends."""
+        """Be at rest within a second: a slow ramp that is under way gives way to this one."""
+        self.guard = Guard(self.guard.settings, self.guard.applied)
         while not self.guard.is_at_rest:
             self._move(self.guard.idle(round(PERIOD * RATE), 0.7), 'ramp:stop')
             time.sleep(PERIOD)

@@ -71,6 +71,8 @@ class LabNode(Node):
     """
 
     executable: str
+    #: whether it holds the voltage of an amplifier
+    drives: bool = False
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
@@ -224,6 +226,10 @@ class LabNode(Node):
                 response.message, response.success = handler(), True
             except PiezoIdentError as error:
                 response.message, response.success = str(error), False
+            # who asks gets an answer, whatever it was
+            except Exception as error:  # noqa: BLE001
+                _report(self, error)
+                response.message, response.success = f'failed: {error!r}', False
             return response
 
         self.create_service(Trigger, f'~/{name}', answer, qos_profile=QUESTIONS)
@@ -265,7 +271,7 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
     Parameters
     ----------
     makes : sequence of callable
-        Make one node each; closed in the reverse order.
+        Make one node each; closed in the reverse order, what holds the drive first.
     argv : sequence of str, optional
         Arguments for ROS.
 
@@ -310,9 +316,14 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
         sys.stderr.write(f'piezo_ident: error: {error}\n')
         return 2
     finally:
+        # nobody spins for the stage any more: it is not to wait at 9 V for the others to end
+        nodes.sort(key=lambda node: node.drives)
         for node in reversed(nodes):
-            node.close()
-            node.await_listeners()
+            try:
+                node.close()
+                node.await_listeners()
+            except Exception as error:  # noqa: BLE001
+                _report(node, error)
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown(timeout_sec=0.5)

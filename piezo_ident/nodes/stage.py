@@ -95,6 +95,7 @@ class StageNode(LabNode):
     """Simulates a stage on the topics of a real one."""
 
     executable = 'stage'
+    drives = True
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -255,7 +256,7 @@ class StageNode(LabNode):
     def _on_ramp(self) -> None:
         now = round((time.monotonic() - self._ramp_begin) * self.sample_rate)
         # after a pause of this process the ramp goes on where it was, it does not catch up
-        due = min(now - self._ramped, round(5 * RAMP_PERIOD * self.sample_rate))
+        due = min(now - self._ramped, max(1, round(5 * RAMP_PERIOD * self.sample_rate)))
         self._ramped = now
         if due > 0:
             self._move(self._guard.idle(due), 'ramp:silence')

@@ -125,6 +125,14 @@ def test_silence_and_what_comes_after_it(lab):
     assert joined[:16_000][-1] == 5.0
 
 
+def test_limits_hold_from_the_moment_they_are_set(lab):
+    applied = lab.collect('applied_voltage')
+    assert not lab.set('stage', 'voltage_low', 20.0)[0]
+    assert lab.set('stage', 'voltage_high', 5.0)[0]
+    send(lab, [9.0] * 160)
+    assert column(applied).max() == 5.0
+
+
 def test_a_second_publisher_is_refused(lab):
     y = lab.collect('displacement')
     lab.start('excitation', {'program': PROGRAM.replace('0.4', '120'), 'subscribers': 1})
