@@ -225,11 +225,14 @@ class _Watch:
         """Take note of a block."""
         n = t.size
         first, last = (float(t[0]), float(t[-1])) if n else (self.last, self.last)
-        if n > 1 and last > first:
+        if n > 1 and 0.0 < last - first < np.inf:
             self.period = (last - first) / (n - 1)
         seconds = n * self.period if np.isfinite(self.period) else 0.0
         step = first - self.last
-        if np.isnan(self.begin):
+        if not np.isfinite(first):
+            # where it lies nobody knows; the record will say so
+            pass
+        elif np.isnan(self.begin):
             self.begin = first
         elif step > 1.5 * self.period:
             self.lost += round(step / self.period) - 1

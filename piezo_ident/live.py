@@ -291,6 +291,12 @@ class Predictor:
             )
         elif fault == NOT_UNIFORM:
             self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
+        elif t.size == 1 and np.isnan(self._period):
+            self.problem = (
+                f'the block at t = {t[0]:.6g} s is one sample, which tells no sampling rate; it '
+                'is left out'
+            )
+            return False
         return bool(fault == FINE)
 
     def _start(self, t: NDArray[np.float64], period: float) -> None:

@@ -260,7 +260,7 @@ class LiveError:
         if self._parts and t[0] <= self._parts[-1][1]:
             self.clear()
         self._parts.append((float(t[0]), float(t[-1]), e.size, float(e @ e)))
-        while self._parts[-1][1] - self._parts[0][0] > self.window:
+        while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
             self._parts.popleft()
 
     @property

@@ -298,3 +298,14 @@ def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
     # the newest part is what is left
     assert lone.last_time('voltage') == 499 / RATE
     assert lone.snapshot().streams['voltage'].times[-1] == 499 / RATE
+
+
+@pytest.mark.parametrize('time', [np.inf, -np.inf, np.nan])
+def test_times_that_are_none_break_nothing(monkeypatch, time):
+    monkeypatch.setattr('piezo_ident.capture.MOST_BLOCKS', 100)
+    capture = Capture()
+    for k in range(300):
+        t = np.full(100, time) if k % 2 else np.arange(100 * k, 100 * (k + 1)) / RATE
+        capture.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
+    assert capture.n <= 101 * 100
+    assert capture.last_time('voltage') == (100 * 299 - 1) / RATE

@@ -228,6 +228,24 @@ def block(first, n, value=0.0):
     return Samples(np.arange(first, first + n) / RATE, np.full(n, value), 'sine:50Hz')
 
 
+def test_a_block_of_one_sample_does_not_set_the_rate():
+    predictor = Predictor()
+    predictor.set_model(model())
+    v = drive(1000)
+    assert predictor.process(cut(v, 1)[0]) is None
+    assert 'tells no sampling rate' in predictor.problem
+    assert predictor.process(cut(v[1:], 100, start=1)[0]) is not None
+    # behind others its rate is known
+    assert predictor.process(cut(v[101:], 1, start=101)[0]).t.size == 1
+
+
+def test_a_stretch_longer_than_the_window_is_the_window():
+    error = LiveError(0.01)
+    for k in (0, 400, 800):
+        error.add(np.arange(k, k + 400) / RATE, np.full(400, 2e-9))
+        assert error.rms == pytest.approx(2e-9)
+
+
 @pytest.mark.parametrize('measured_first', [True, False])
 def test_streams_match_whichever_comes_first(measured_first):
     matcher = Matcher()
@@ -347,6 +365,7 @@ def test_a_clock_faster_than_any_card_is_left_out_and_blocks_are_bounded(monkeyp
     t = 1e-9 * np.arange(100)
     assert predictor.process(Samples(t, np.zeros(100))) is None
     assert 'not uniform' in predictor.problem
-    for k in range(200):
+    predictor.process(Samples(np.arange(2) / 20_000.0, np.zeros(2)))
+    for k in range(2, 200):
         predictor.process(Samples(np.array([k / 20_000.0]), np.zeros(1)))
     assert len(predictor._recent) == 50

@@ -198,8 +198,12 @@ class IdentifierNode(LabNode):
     def _listening(self) -> str:
         return f'{self._kept()} captured' if self._capture.keys else 'ready'
 
+    def _is_busy(self) -> bool:
+        # the first values of parameters come before anything else is there
+        return hasattr(self, '_drive') and (self._drive.running or self._worker.busy)
+
     def _refuse_when_busy(self) -> None:
-        if self._drive.running or self._worker.busy:
+        if self._is_busy():
             raise PiezoIdentError(f'busy: {self._doing}; wait for its end, or call ~/cancel')
 
     def refuse(self, name: str, value: Any) -> str | None:
@@ -214,6 +218,8 @@ class IdentifierNode(LabNode):
         if name.endswith('program') and not value.strip():
             return f'{name} must not be empty; name a programme, a path, or write YAML'
         if name == 'model' and value:
+            if self._is_busy():
+                return f'busy: {self._doing}; set the model when that has ended, or call ~/cancel'
             try:
                 self._files = {value: load_model(value)}
             except PiezoIdentError as error:

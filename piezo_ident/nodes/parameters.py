@@ -73,7 +73,7 @@ def _rate() -> Declaration:
 EXCITATION = (
     _rate(),
     Declaration('program', 'identification', 'programme to play: a name, a path, or YAML text'),
-    Declaration('block_size', 100, 'samples in a block', '1', 1, 100_000),
+    Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
         'rate_factor',
         1.0,

@@ -215,7 +215,7 @@ def test_stop_ramps_to_rest_and_goes_on_with_t(lab):
         ('voltage_low', 20.0, 'crossed'),
         ('rest', -1.0, 'outside the voltage limits'),
         ('ramp_slew', 0.0, ''),
-        ('block_size', 0, ''),
+        ('block_size', 1, ''),
         ('in_flight', 100, ''),
         ('sample_rate', 1000.0, ''),
         ('block_size', 'many', ''),
