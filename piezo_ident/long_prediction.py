@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from piezo_ident.bridging import follows
 from piezo_ident.errors import ModelError
 from piezo_ident.long_record import LongRecord, NeedsWhole, Outline, Progress
-from piezo_ident.memory import fit_memory, forgotten, is_at_rest
+from piezo_ident.memory import fit_memory, forgotten, is_at_rest, SHARE, Sweep, sweeps_of
 from piezo_ident.model import Prediction, StageModel, Stream
 from piezo_ident.play import weighted_plays
 from piezo_ident.prediction import DIVERGES, RecordErrors, RecordPrediction, start_warning
@@ -35,8 +35,6 @@ __all__ = ['predict_long']
 
 #: samples of a piece that are kept to estimate its start from
 MOST = 4_000_000
-#: share of its range that a piece must sweep to forget its start
-SHARE = 0.98
 
 Vector = NDArray[np.float64]
 
@@ -92,12 +90,11 @@ class _Errors:
 
 @dataclass
 class _Run:
-    """A piece under way: the model's stream, its plays, and where its start is forgotten."""
+    """A piece under way: the model's stream, its plays, and whether its start was estimated."""
 
     stream: Stream
     plays: Vector | None
     is_estimated: bool
-    forgotten: int
 
 
 def predict_long(
@@ -137,7 +134,9 @@ def predict_long(
     outside = 0
     last: Piece | None = None
     plays: Vector | None = None
-    for outline, parts in record.parts(progress):
+    sweep: Sweep | None = None
+    sweeps = sweeps_of(record.pieces, [(p.v.low, p.v.high) for p in record])
+    for (outline, parts), own in zip(record.parts(progress), sweeps, strict=True):
         first = next(parts)
         try:
             model.check_rate(first)
@@ -146,29 +145,26 @@ def predict_long(
         connects = last is not None and follows(last, first) is not None
         held = [first]
         if connects:
-            run = _Run(model.stream(plays), plays, False, 0)
+            run = _Run(model.stream(plays), plays, False)
         else:
             run, held = _started(model, outline, first, parts)
+            sweep = own if run.is_estimated else None
         estimated.append(run.is_estimated)
-        done = 0
         for part in itertools.chain(held, parts):
             y_hat = run.stream.follow(part)
             if not np.all(np.isfinite(y_hat)):
                 raise ModelError(f'{record.name}: {DIVERGES}')
             whole.add(part.y, y_hat)
-            late = max(0, run.forgotten - done)
+            late = sweep.before(part.v) if sweep else 0
             after.add(part.y[late:], y_hat[late:])
             outside += model.outside(part.v)
             if len(record.pieces) > 1:
                 run.plays = _moved(model, part, run.plays)
             add(part, y_hat)
-            done += part.n
             last = part
         plays = run.plays
     warnings = [start_warning(model, record.name, estimated)] if any(estimated) else []
-    if outside:
-        share = outside / record.n
-        warnings.append(model.outside_warning(record.name, share, record.voltage_range))
+    warnings += model.range_warnings(record.name, outside / record.n, record.voltage_range)
     return RecordPrediction(
         prediction=Prediction((), tuple(warnings)),
         estimated=tuple(estimated),
@@ -182,7 +178,7 @@ def _started(
 ) -> tuple[_Run, list[Piece]]:
     """Return the run of a piece that follows no other, and the parts that this took."""
     if is_at_rest(model, first):
-        return _Run(model.stream(), None, False, 0), [first]
+        return _Run(model.stream(), None, False), [first]
     held = [first]
     low, high = np.inf, -np.inf
     # as far as the piece needs to sweep its range
@@ -202,9 +198,7 @@ def _started(
     )
     start = forgotten(early.v, SHARE, outline.v.span)
     memory = fit_memory(model, early, max(start, 10))
-    # a voltage that rests forgets nothing
-    behind = start if outline.v.span > 0.0 else outline.n
-    return _Run(model.stream(memory), memory, True, behind), held
+    return _Run(model.stream(memory), memory, True), held
 
 
 def _moved(model: StageModel, part: Piece, plays: Vector | None) -> Vector:

@@ -25,24 +25,69 @@ squares on the early part of a record.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.bridging import follows
 from piezo_ident.dynamics import filter_arx
+from piezo_ident.long_record import Outline
 from piezo_ident.model import StageModel
 from piezo_ident.play import weighted_plays
 from piezo_ident.record import Piece, Record
 from scipy.optimize import lsq_linear
 
-__all__ = ['fit_memory', 'forgotten', 'is_at_rest', 'memories_of', 'start_memory']
+__all__ = [
+    'SHARE',
+    'Sweep',
+    'fit_memory',
+    'forgotten',
+    'is_at_rest',
+    'memories_of',
+    'start_memory',
+    'sweeps_of',
+]
 
+#: share of its range that a run must sweep to forget its start
+SHARE = 0.98
 #: samples that are looked at together for where the start is forgotten
 WINDOW = 1 << 18
 #: pull towards the memory of a stage that came down to zero, as a share of the data's weight
 PULL = 1e-4
 
 
-def forgotten(u: NDArray[np.float64], share: float = 0.98, span: float | None = None) -> int:
+class Sweep:
+    """
+    How far a run has swept the range after which its start is forgotten.
+
+    Parameters
+    ----------
+    goal : float
+        What has to be swept, in the unit of the voltage.
+    """
+
+    def __init__(self, goal: float) -> None:
+        self._goal = goal
+        self._low, self._high = np.inf, -np.inf
+        self.is_done = False
+
+    def before(self, u: NDArray[np.float64]) -> int:
+        """Return how many of the next samples come before the start is forgotten."""
+        if self.is_done:
+            return 0
+        for start in range(0, u.size, WINDOW):
+            part = u[start : start + WINDOW]
+            top = np.maximum(np.maximum.accumulate(part), self._high)
+            bottom = np.minimum(np.minimum.accumulate(part), self._low)
+            swept = top - bottom >= self._goal
+            if swept.any():
+                self.is_done = True
+                return start + int(np.argmax(swept))
+            self._low, self._high = float(bottom[-1]), float(top[-1])
+        return int(u.size)
+
+
+def forgotten(u: NDArray[np.float64], share: float = SHARE, span: float | None = None) -> int:
     """
     Return the sample from which the start is forgotten.
 
@@ -55,17 +100,33 @@ def forgotten(u: NDArray[np.float64], share: float = 0.98, span: float | None = 
     span : float, optional
         That range, where `u` is the beginning of the record alone.
     """
-    goal = share * (float(np.ptp(u)) if span is None else span)
-    low = high = u[0]
-    for start in range(0, u.size, WINDOW):
-        part = u[start : start + WINDOW]
-        top = np.maximum(np.maximum.accumulate(part), high)
-        bottom = np.minimum(np.minimum.accumulate(part), low)
-        swept = top - bottom >= goal
-        if swept.any():
-            return start + int(np.argmax(swept))
-        low, high = bottom[-1], top[-1]
-    return 0
+    sweep = Sweep(share * (float(np.ptp(u)) if span is None else span))
+    start = sweep.before(u)
+    return start if sweep.is_done else 0
+
+
+def sweeps_of(
+    pieces: Sequence[Piece | Outline], ranges: Sequence[tuple[float, float]]
+) -> list[Sweep]:
+    """
+    Return for each piece how it, and those that follow it, forget its start.
+
+    Parameters
+    ----------
+    pieces : sequence of Piece or Outline
+    ranges : sequence of (float, float)
+        Smallest and largest voltage of each.
+    """
+    sweeps: list[Sweep] = []
+    low = high = 0.0
+    for i in range(len(pieces) - 1, -1, -1):
+        if i + 1 < len(pieces) and follows(pieces[i], pieces[i + 1]) is not None:
+            low, high = min(low, ranges[i][0]), max(high, ranges[i][1])
+        else:
+            low, high = ranges[i]
+        # a voltage that rests forgets nothing
+        sweeps.append(Sweep(SHARE * (high - low) if high > low else np.inf))
+    return sweeps[::-1]
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.bridging import follows
 from piezo_ident.errors import ModelError
-from piezo_ident.memory import forgotten, memories_of
+from piezo_ident.memory import memories_of, Sweep, sweeps_of
 from piezo_ident.metrics import fit_percent, percent_of_stroke
 from piezo_ident.model import Prediction, StageModel
 from piezo_ident.record import Record
@@ -123,12 +123,13 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
         said = start_warning(model, record.name, estimated)
         prediction = replace(prediction, warnings=(said, *prediction.warnings))
     late = []
-    for piece, unknown in zip(record, estimated, strict=True):
+    sweeps = sweeps_of(record.pieces, [(float(p.v.min()), float(p.v.max())) for p in record])
+    sweep: Sweep | None = None
+    for piece, last, unknown, own in zip(record, before, estimated, sweeps, strict=True):
+        if last is None or follows(last, piece) is None:
+            sweep = own if unknown else None
         mask = np.ones(piece.n, dtype=bool)
-        if unknown:
-            mask[: forgotten(piece.v)] = False
-            # a voltage that rests forgets nothing
-            mask &= np.ptp(piece.v) > 0.0
+        mask[: sweep.before(piece.v) if sweep else 0] = False
         late.append(mask)
     y = np.concatenate([piece.y for piece in record])
     y_hat = np.concatenate(prediction.pieces)

@@ -25,7 +25,8 @@ from piezo_ident import memory as memory_module
 from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.memory import fit_memory, forgotten, is_at_rest, start_memory
 from piezo_ident.play import play_columns
-from piezo_ident.record import Piece
+from piezo_ident.prediction import predict_record
+from piezo_ident.record import Piece, Record
 from piezo_ident.simulation import load_stage
 import pytest
 
@@ -134,3 +135,14 @@ def test_only_an_unknown_start_is_estimated():
     assert start_memory(PAPER, Piece(zero, zero, FS)) is None
     piece = started_from(None)
     assert_array_equal(start_memory(PAPER, piece), fit_memory(PAPER, piece))
+
+
+def test_a_gap_does_not_make_an_unknown_start_known():
+    piece = started_from(None)
+    # a sample is lost long before the range is swept
+    record = Record((piece.cut(0, 500), piece.cut(501, piece.n)))
+    found = predict_record(PAPER, record)
+    assert found.estimated == (True, False)
+    assert found.after.n == piece.n - forgotten(V)
+    still = Record((replace(piece, v=np.full(piece.n, 5.0)),))
+    assert predict_record(PAPER, still).after is None
