@@ -198,6 +198,8 @@ def write_bag(
     path = Path(path)
     plugins = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
     suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
+    if suffix and path.suffix != path.suffix.lower():
+        raise DataError(f'{path}: no reader of bags takes {path.suffix}; write small letters')
     if storage is not None and (storage not in plugins or (suffix or storage) != storage):
         raise DataError(
             f'{path}: storage {storage!r} is not possible; use mcap or sqlite3, and a file name '
@@ -215,7 +217,7 @@ def write_bag(
                 writer.set_custom_data(key, value)
             _write_pieces(writer, record, block_size, progress)
         if suffix:
-            next(f for f in folder.iterdir() if f.suffix == path.suffix.lower()).replace(target)
+            next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
 
 
 def _write_pieces(
@@ -234,6 +236,11 @@ def _write_pieces(
         for start, stop, label, columns in _cut_parts(piece, parts, block_size):
             t = piece.time(start, stop)
             stamp = round(t[0] * 1e9) + shift * 1_000_000_000
+            if stamp >= 2**63:
+                raise DataError(
+                    f't = {t[0]:.10g} s cannot be the stamp of a message, which ends at '
+                    f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
+                )
             for quantity, x in columns.items():
                 senders[quantity](Samples(t, x, label, quantity), stamp)
 

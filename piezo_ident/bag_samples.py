@@ -109,6 +109,8 @@ def opened_samples(
 
 def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
     for connection, stamp, raw in bag.messages(connections):
+        if stamp >= 2**63:
+            raise DataError(f'{bag.path}: damaged, a message on {connection.topic} has no time')
         with damage_as_data_error(bag.path):
             message = typestore().deserialize_cdr(raw, connection.msgtype)
         yield connection.topic, stamp, message
@@ -160,6 +162,12 @@ def _choose(
                 raise DataError(
                     f'{path}: no samples on topic {topic}; topics with samples: '
                     + ', '.join(sorted(carried))
+                )
+            if carried[topic] != quantity:
+                fit = sorted(t for t, q in carried.items() if q == quantity)
+                raise DataError(
+                    f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
+                    f'{quantity}: {", ".join(fit) or "none"}'
                 )
             chosen[quantity] = topic
             continue

@@ -57,6 +57,8 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     ...     file.write_text(text)
     """
     path = Path(path)
+    if path.name in ('', '..'):
+        raise DataError(f'{path}: names no file; add one')
     taken = path.exists() or path.is_symlink()
     if taken and not overwrite:
         raise DataError(f'{path}: exists already; choose another name or ask to overwrite it')

@@ -110,7 +110,7 @@ class Settings:
             raise ConfigError(f'swarm_size must be at least 2, got {self.swarm_size}')
         if self.swarm_iterations < 1:
             raise ConfigError(f'swarm_iterations must be positive, got {self.swarm_iterations}')
-        if self.hold_out is not None and not self.hold_out > 0.0:
+        if self.hold_out is not None and not 0.0 < self.hold_out < float('inf'):
             raise ConfigError(f'hold_out must be a positive time, got {self.hold_out} s')
         if self.seed < 0:
             raise ConfigError(f'seed must not be negative, got {self.seed}')

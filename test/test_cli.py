@@ -30,6 +30,7 @@ import time
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.cli import main
+from piezo_ident.cli.common import expand
 from piezo_ident.cli.demo import find_measured
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_file, check_folder
@@ -430,6 +431,67 @@ def test_folder_without_records(capsys, tmp_path):
     refuse(capsys, tmp_path, ['identify', tmp_path / 'empty'], tmp_path / 'empty', 'give a bag')
 
 
+def test_a_folder_of_records_leaves_none_out_unsaid(tmp_path):
+    for name in ('TEK0001.CSV', 'b.csv', 'notes.txt', '.hidden.csv'):
+        (tmp_path / name).write_text('')
+    (tmp_path / 'crashed').mkdir()
+    (tmp_path / 'crashed' / 'crashed.mcap').write_bytes(b'')
+    (tmp_path / 'pictures').mkdir()
+    found = expand([tmp_path])
+    assert [path.name for path in found] == ['TEK0001.CSV', 'b.csv', 'crashed']
+
+
+def test_files_of_one_name_are_two_records(capsys, tmp_path, made):
+    paths = [tmp_path / day / 'run.npz' for day in ('mon', 'tue')]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_bytes((made / 'record.npz').read_bytes())
+    data = json.loads(succeed(capsys, 'identify', *paths, *FAST, '--json'))
+    assert {row['record'] for row in data['errors']['rows']} == {str(path) for path in paths}
+
+
+def test_options_for_bags_are_refused_for_tables(capsys, tmp_path, made):
+    record, model = made / 'record.npz', made / 'model.yaml'
+    for argv in (
+        ['identify', record, '--namespace', 'other'],
+        ['predict', model, record, '--voltage-topic', 'v'],
+        ['convert', record, tmp_path / 'r.csv', '--displacement-topic', 'y'],
+        ['identify', record, '--each', tmp_path / 'out', '--namespace', 'other'],
+    ):
+        refuse(capsys, tmp_path, argv, 'is for bags', 'record.npz')
+
+
+def test_a_topic_that_carries_something_else(capsys, tmp_path, made):
+    bag = tmp_path / 'bag'
+    succeed(capsys, 'convert', made / 'record.npz', bag)
+    argv = ['identify', bag, '--voltage-topic', 'displacement']
+    refuse(capsys, tmp_path, argv, '/displacement carries displacement, not voltage', '/voltage')
+
+
+def test_bags_in_capital_letters(capsys, tmp_path, made):
+    out = tmp_path / 'R.MCAP'
+    refuse(capsys, tmp_path, ['convert', made / 'record.npz', out], 'small letters')
+    succeed(capsys, 'convert', made / 'record.npz', tmp_path / 'r.mcap')
+    (tmp_path / 'r.mcap').rename(out)
+    refuse(capsys, tmp_path, ['identify', out], 'R.MCAP', 'rename it')
+
+
+@pytest.mark.parametrize('suffix', ['.mcap', '.db3', ''])
+def test_times_that_no_bag_can_hold(capsys, tmp_path, suffix):
+    columns = table()
+    # days since year 0, as seconds
+    columns['t'] = columns['t'] + 7.4e5 * 86400.0
+    np.savez(tmp_path / 'r.npz', **columns)
+    argv = ['convert', tmp_path / 'r.npz', tmp_path / f'out{suffix}']
+    refuse(capsys, tmp_path, argv, 'cannot be the stamp', 'let t begin at zero')
+
+
+def test_an_output_without_a_name(capsys, tmp_path, made, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'metadata.yaml').write_text('')
+    refuse(capsys, tmp_path, ['convert', made / 'record.npz', '.', '--overwrite'], 'no file')
+
+
 def test_missing_record(capsys, tmp_path):
     refuse(capsys, tmp_path, ['identify', tmp_path / 'no.csv'], 'no.csv', 'check the name')
     refuse(capsys, tmp_path, ['convert', tmp_path / 'no', tmp_path / 'r.csv'], 'no', ';')
@@ -534,6 +596,7 @@ def test_misspelt_names(capsys, tmp_path, made):
         (['--solver', 'magic'], '--solver'),
         (['--seed', -1], '--seed'),
         (['--hold-out', -1], 'hold_out'),
+        (['--hold-out', 'inf'], 'hold_out'),
         (['--model', 'm.csv'], 'm.csv'),
         (['--mdoel', 'm.yaml'], '--mdoel'),
     ],

@@ -37,6 +37,7 @@ import pytest
         ({'delay': 10_001}, 'delay'),
         ({'hold_out': 0.0}, 'hold_out'),
         ({'hold_out': float('nan')}, 'hold_out'),
+        ({'hold_out': float('inf')}, 'hold_out'),
         ({'seed': -1}, 'seed'),
         ({'swarm_size': 1}, 'swarm_size'),
         ({'swarm_iterations': 0}, 'swarm_iterations'),

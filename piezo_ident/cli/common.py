@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +33,7 @@ from piezo_ident.record_io import read_record
 
 __all__ = [
     'RECORD_FILES',
+    'check_bag_options',
     'check_limits',
     'check_record_output',
     'expand',
@@ -43,7 +45,8 @@ __all__ = [
     'story',
 ]
 
-RECORD_FILES = ('.csv', '.npz', '.mat', '.mcap', '.db3')
+BAG_FILES = ('.mcap', '.db3')
+RECORD_FILES = ('.csv', '.npz', '.mat', *BAG_FILES)
 
 
 @contextmanager
@@ -64,12 +67,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir() or (path / 'metadata.yaml').is_file():
             found.append(path)
             continue
-        inside = [
-            p
-            for p in sorted(path.iterdir())
-            if not p.name.startswith('.')
-            and ((p / 'metadata.yaml').is_file() or (p.is_file() and p.suffix in RECORD_FILES))
-        ]
+        inside = [p for p in sorted(path.iterdir()) if _is_record(p)]
         if not inside:
             raise DataError(
                 f'{path}: a folder without records; give a bag, or a folder with '
@@ -77,6 +75,33 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             )
         found += inside
     return found
+
+
+def _is_record(path: Path) -> bool:
+    if path.name.startswith('.'):
+        return False
+    if path.is_dir():
+        # one that was not finished has no metadata.yaml, and is not to be left out unsaid
+        return (path / 'metadata.yaml').is_file() or any(
+            p.suffix in BAG_FILES for p in path.glob('*')
+        )
+    return path.is_file() and path.suffix.lower() in RECORD_FILES
+
+
+def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
+    """
+    Refuse options that choose topics where no record is a bag.
+
+    Raises
+    ------
+    ConfigError
+    """
+    for option in ('namespace', 'voltage_topic', 'displacement_topic'):
+        is_bag = (p.is_dir() or p.suffix.lower() in BAG_FILES for p in paths)
+        if getattr(args, option) is not None and not any(is_bag):
+            raise ConfigError(
+                f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
+            )
 
 
 def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
@@ -98,6 +123,7 @@ def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
 
 def read(path: Path, args: argparse.Namespace) -> Record:
     """Read one record as the options say."""
+    check_bag_options([path], args)
     return read_record(path, **_reading(args))
 
 
@@ -105,6 +131,7 @@ def read_long(
     path: Path, args: argparse.Namespace, progress: Progress, *, to_write: bool = False
 ) -> Record | LongRecord:
     """Read one record as the options say; a long bag is only looked through."""
+    check_bag_options([path], args)
     return record_io.read_long(path, progress=progress, to_write=to_write, **_reading(args))
 
 
@@ -121,11 +148,14 @@ def _reading(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
-    """Read records of one call, which share the options."""
+    """Read records of one call, which share the options; files of one name keep their folders."""
+    check_bag_options(paths, args)
+    names = Counter(path.name for path in {path.resolve() for path in paths})
     records = []
     for path in paths:
         try:
-            records.append(read(path, args))
+            record = read_record(path, **_reading(args))
+            records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
         except DataError as error:
             if len(paths) == 1 or '--displacement-unit' not in str(error):
                 raise

@@ -86,6 +86,10 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         check_distinct(args.model, [*paths, *further])
     if args.report is not None:
         check_folder(args.report)
+        if (args.report / 'diagnosis.json').exists():
+            raise ConfigError(
+                f'{args.report}: holds the report of a diagnosis; choose another folder'
+            )
     everything = read_all([*paths, *further], args)
     records, validation = everything[: len(paths)], everything[len(paths) :]
     with naming(*(record.name for record in records)), console.progress() as progress:
