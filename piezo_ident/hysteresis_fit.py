@@ -192,7 +192,7 @@ def factorise(
     def rows() -> Iterator[NDArray[np.float64]]:
         for i, excerpt in enumerate(excerpts):
             row, memory = excerpt.row, excerpt.start(thresholds)
-            stretches = np.array(stretches_of(excerpt.use)).reshape(-1, 2)
+            stretches = np.array(stretches_of(excerpt.use), dtype=np.int64).reshape(-1, 2)
             n = int(np.sum((stretches[:, 1] - stretches[:, 0]) // row))
             block = np.zeros((k + m + 3, n))
             block[i] = np.sqrt(row)

@@ -310,6 +310,9 @@ def _unlabelled(
     model = replace(model, scaling=replace(model.scaling, range=span))
     # the start of these very thresholds; the rule carried over from other ones is an approximation
     memories = {key_of(run): fit_memory(model, piece.cut(0, n_fit))}
+    if sum(key_of(other) == key_of(run) for other in runs) > 1:
+        # nobody could tell whose start it is
+        memories = {}
     masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
     for other in runs:
         fitted = np.zeros(other.piece.n, dtype=bool)

@@ -245,7 +245,7 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
                 continue
             u = scaling.u(piece.v)
             known = part.sound.copy()
-            if u[0] > REST:
+            if abs(u[0]) > REST:
                 known[: forgotten(u)] = False
             runs.append(Run(record.name, piece, u, scaling.x(piece.y), known, part.sound))
     return runs

@@ -33,7 +33,7 @@ Memories = dict[tuple[str, float], NDArray[np.float64]]
 
 
 def key_of(run: Run) -> tuple[str, float]:
-    """Return record and start time of a run [s], which no other run has."""
+    """Return record and start time of a run [s]; a clock that restarts may give it to several."""
     return run.record, run.piece.start_time
 
 
@@ -72,7 +72,8 @@ def errors_of(
             for data, mask in (
                 ('fitted', part & fitted),
                 ('selection', part & selection),
-                ('held out', part & ~fitted & ~selection),
+                # where the start is not forgotten the memory was fitted
+                ('held out', part & run.known & ~fitted & ~selection),
             ):
                 if not mask.any():
                     continue

@@ -18,9 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.testing import assert_array_equal
-from piezo_ident.dynamics import Delay
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import IdentificationError
+from piezo_ident.hysteresis_fit import factorise
 from piezo_ident.program import parse_program
 from piezo_ident.record import Piece, Record, Segment
 from piezo_ident.results import Settings, silent
@@ -133,3 +134,7 @@ def test_fitted_and_held_out_triangles_are_the_same_runs():
     for one, two in zip(fit, held, strict=True):
         assert not np.any(one.use & two.use)
     assert_array_equal(fit[0].use | held[0].use, made[0].mask('triangle'))
+    # an excerpt of nothing adds nothing
+    G = Dynamics(np.array([-0.5]), np.array([0.5]))
+    R, more = (factorise(part, np.array([0.2, 0.6]), G, Delay(3)) for part in (held[:1], held))
+    assert_allclose((more.T @ more)[2:, 2:], (R.T @ R)[1:, 1:], rtol=1e-9)
