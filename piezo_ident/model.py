@@ -43,6 +43,8 @@ __all__ = ['EffectSetting', 'Prediction', 'Scaling', 'StageModel', 'Stream']
 
 #: samples that pass the chain at once; small enough for the signals to stay in the cache
 CHUNK = 8192
+#: share of the identified voltages below which another unit is likelier than a small signal
+FAINT = 2e-3
 
 
 @dataclass(frozen=True)
@@ -295,11 +297,9 @@ class StageModel:
         )
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
-        """Return a warning when the voltage leaves the range in which the model was identified."""
+        """Return a warning when the voltage is not of the range in which H was identified."""
         outside = sum(self.outside(p.v) for p in record)
-        if not outside:
-            return ()
-        return (self.outside_warning(record.name, outside / record.n, record.voltage_range),)
+        return self.range_warnings(record.name, outside / record.n, record.voltage_range)
 
     def outside(self, v: NDArray[np.float64]) -> int:
         """Return how many voltages [V] leave the range in which the model was identified."""
@@ -307,14 +307,36 @@ class StageModel:
         slack = 1e-3 * (high - low)
         return int(np.sum((v < low - slack) | (v > high + slack)))
 
-    def outside_warning(self, name: str, share: float, seen: tuple[float, float]) -> str:
-        """Return what to say when a share of a record that reaches so far [V] is outside."""
+    def range_warnings(
+        self, name: str, outside: float, seen: tuple[float, float]
+    ) -> tuple[str, ...]:
+        """
+        Return what to say of voltages that the model was not identified with.
+
+        Parameters
+        ----------
+        name : str
+            Of the record.
+        outside : float
+            Share of its samples that leave the identified range.
+        seen : tuple of float
+            Its smallest and largest voltage [V].
+        """
         low, high = self.scaling.range
-        return (
-            f'{name}: {share:.1%} of the samples lie outside the identified '
-            f'range {low:g} .. {high:g} V (they reach {seen[0]:g} .. {seen[1]:g} V); '
-            'the prediction is an extrapolation there'
-        )
+        identified = f'identified range {low:g} .. {high:g} V'
+        reach = f'they reach {seen[0]:g} .. {seen[1]:g} V'
+        if outside:
+            return (
+                f'{name}: {outside:.1%} of the samples lie outside the {identified} ({reach}); '
+                'the prediction is an extrapolation there',
+            )
+        largest = max(map(abs, seen))
+        if 0.0 < largest < FAINT * max(abs(low), abs(high)):
+            return (
+                f'{name}: the voltages are next to nothing beside the {identified} ({reach}): '
+                'are they in volts?',
+            )
+        return ()
 
 
 class Stream:

@@ -18,6 +18,7 @@ Data with an undeclared effect: inside the catalogue, outside it, and none.
 The stages come from benchmarks/truths: their laws are not those of the candidates.
 """
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 import sys
@@ -245,6 +246,28 @@ def test_another_rate_and_too_little_are_refused(truths):
         diagnose(model, Record((piece.cut(0, 500),), 'short'))
 
 
+def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
+    unplugged = Record((replace(piece, y=noise),), 'unplugged')
+    with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
+        diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
+
+
+@pytest.mark.parametrize(
+    ('scale', 'said'), [(1.0, []), (1e-3, ['in volts?']), (1e3, ['extrapolation'])]
+)
+def test_voltages_that_the_model_does_not_know_are_said(truths, scale, said):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
+    found = diagnose(model, scaled, DiagnosisSettings(effects=('creep',)))
+    heard = [w for w in found.warnings if w.startswith('scaled: ')]
+    assert len(heard) == len(said)
+    assert all(part in line for part, line in zip(said, heard, strict=True))
+
+
 def test_one_pass_over_the_range_names_nothing(truths):
     model, record, _ = measured('creep', 0.3, 1)
     piece = record.pieces[0]
@@ -256,6 +279,44 @@ def test_one_pass_over_the_range_names_nothing(truths):
 
 
 # -- the parts that carry it -------------------------------------------------------------------
+
+
+def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    stroke = make_rows(model, [record]).stroke
+    # the sensor was set to zero anew in between
+    moved = Record((replace(piece, y=piece.y + 500e-6),), 'moved')
+    assert make_rows(model, [record, moved]).stroke == pytest.approx(stroke, rel=1e-9)
+    glitch = piece.y.copy()
+    glitch[1000] += 1e-3
+    faulty = Record((replace(piece, y=glitch),), 'faulty')
+    bad = np.arange(piece.n) == 1000
+    assert make_rows(model, [faulty]).stroke > 5 * stroke
+    assert make_rows(model, [faulty], [bad]).stroke == stroke
+
+
+def test_time_begins_with_the_record_whatever_its_clock_says(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    epoch = Record((replace(piece, start_time=600.0),), 'epoch')
+    here, there = make_rows(model, [record]), make_rows(model, [epoch])
+    np.testing.assert_allclose(there.time(0), piece.t, atol=1e-9)
+    np.testing.assert_allclose(there.time(0, 5, 9), piece.t[5:9], atol=1e-9)
+    assert there.duration == here.duration == piece.duration
+    # a gap is part of it
+    two = Record((piece.cut(0, 50_000), piece.cut(100_000, piece.n)), 'two')
+    assert make_rows(model, [two]).duration == pytest.approx(piece.duration)
+
+
+def test_of_one_kind_of_excitation_fifths_are_held_out(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    rows = make_rows(model, [Record((replace(piece, segments=()),), 'unlabelled')])
+    named = replace(piece, segments=(Segment('triangle', 0, piece.n),))
+    one = make_rows(model, [Record((named,), 'one kind')])
+    assert len(rows.labels) == len(one.labels) == 5
+    assert len(set(one.group)) == 5
 
 
 def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):

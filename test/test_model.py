@@ -190,6 +190,15 @@ def test_leaving_the_identified_range_warns_with_numbers():
     assert '12 V' in warning
 
 
+def test_millivolts_are_taken_for_what_they_are():
+    (warning,) = PAPER.predict(record([0, 5e-3, 10e-3])).warnings
+    assert 'mine: ' in warning
+    assert 'are they in volts?' in warning
+    # a small signal is a signal, and a stage at 0 V is at rest
+    assert PAPER.predict(record([0, 0.05, 0.03])).warnings == ()
+    assert PAPER.predict(record([0, 0, 0])).warnings == ()
+
+
 def test_hysteresis_alone_keeps_the_static_gain():
     model = replace(PAPER, effects=(EffectSetting('creep', EVERY['creep']),))
     alone = model.without_dynamics()

@@ -264,11 +264,15 @@ _STILL = 'refused: r.npz: the voltage never moves'
 EXPECTED: dict[str, tuple[str, ...]] = {
     'as measured': _GOOD,
     # one span of the voltage is as good as another, if the model came from it
-    'volts x 1e-12': (_GOOD[0], 'errs by 61 %', 'none, errs by 61, then 0.0031 %'),
+    'volts x 1e-12': (
+        _GOOD[0],
+        'errs by 61 % of stroke, warns',
+        'none, errs by 61, then 0.0031 % of stroke, warns',
+    ),
     'volts x 1e+6': (
         _GOOD[0],
         'errs by 4.4e+18 % of stroke, warns',
-        'none, errs by 4.4e+18, then 0.0031 %',
+        'none, errs by 4.4e+18, then 0.0031 % of stroke, warns',
     ),
     'volts denormal': _SPAN,
     'volts x 1e+300': _SPAN,
@@ -283,7 +287,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     'displacement is noise': (
         'refused: delay: no step rises above',
         'errs by 5e+02 %',
-        'none, errs by 5e+02, then 13 %',
+        'refused: r.npz: the displacement does not follow',
     ),
     'displacement is the voltage': ('model, errs by', 'errs by 10 %', 'unexplained, errs by 10'),
     'voltage and displacement swapped': (

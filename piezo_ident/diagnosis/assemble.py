@@ -37,7 +37,7 @@ from piezo_ident.diagnosis.verdict import (
     candidates_of,
     Findings,
     percent,
-    SMALLEST,
+    smallest_taken,
     untestable_of,
 )
 from piezo_ident.diagnosis.whole import Whole
@@ -46,16 +46,14 @@ from piezo_ident.model import StageModel
 from piezo_ident.residual.faults import FaultSearch
 from piezo_ident.residual.floor import NoiseFloor
 
-__all__ = ['PASSES', 'assemble']
+__all__ = ['assemble']
 
 #: held-out gain of the refitted base below which the model stays as it was given
 WORTH_REFIT = 0.05
 #: the same where structure stays unexplained: a refit that only bends H towards it helps nobody
 WORTH_IN_DOUBT = 0.5
-#: retuning of G that is worth a word, samples of delay
+#: retuning of G that is worth a word: samples of delay, or a share of the fast motion
 TUNED = 0.05
-#: passes over the range, there or back, that a test on data not fitted needs
-PASSES = 3.0
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
 
@@ -145,9 +143,12 @@ def assemble(
         for i, run in enumerate(rows.runs)
     )
     effects = _effects(rows, base, fitted, taken, findings, noise, judged)
-    smallest = _smallest(rows, base, rounds)
+    smallest = smallest_taken(rows, base, fitted, rounds, taken, noise)
     rest = replace(findings.unexplained, description=_rest(findings, smallest, rows.passes))
-    warnings = _warnings(state, findings, lasting, floor)
+    bent = base.mean_square - rounds[0].before.mean_square
+    warnings = _warnings(
+        state, findings, lasting, floor, bent / max(base.mean_square - noise, 1e-300)
+    )
     result = Diagnosis(
         verdict=findings.verdict,
         sentence='',
@@ -297,38 +298,31 @@ def _deviations(
     return found
 
 
-def _smallest(rows: Rows, base: Fitted, rounds: Sequence[Round]) -> float:
-    """Return the rms of the smallest effect that would have been taken, % of stroke."""
-    # what follows time alone fits any slow residual
-    last = rounds[-1].chance
-    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
-    return max(SMALLEST, percent(rows, chance))
-
-
-def _rest(findings: Findings, smallest: float, passes: float) -> str:
+def _rest(findings: Findings, smallest: float | None, passes: float) -> str:
     left = findings.unexplained.rms_percent
-    if left < smallest:
-        return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
-    if passes < PASSES:
+    if smallest is None:
         return (
             f'the voltage passes its range {passes:.1f} times, so nothing that is fitted could be '
             'tested; drive the range back and forth twice or more'
         )
+    if left < smallest:
+        return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
     if not findings.effects:
         return 'structure that no candidate of the catalogue accounts for'
     return 'structure that the effects added do not account for'
 
 
 def _warnings(
-    state: State, findings: Findings, lasting: Sequence[str], floor: NoiseFloor
+    state: State, findings: Findings, lasting: Sequence[str], floor: NoiseFloor, bent: float
 ) -> tuple[str, ...]:
     said = []
     if not floor.known:
         said.append(f'{floor.source}: every share counts the noise as unexplained')
     if lasting and np.any(np.abs(state.retuning) > TUNED):
         said.append(
-            'the dynamics were retuned along with the effect, which had bent them at the '
-            f'identification: about {-state.retuning[0]:.2g} samples of delay'
+            f'the dynamics were retuned along with the effect, and {100.0 * max(bent, 0.0):.0f} % '
+            'of what the model missed goes with that alone: the effect bent them at the '
+            'identification, or they have changed since'
         )
     driven = [n for n in findings.effects if find_effect(n).time_driven]
     for name in driven:
@@ -371,10 +365,11 @@ def _sentence(result: Diagnosis, findings: Findings) -> str:
             f'{tail}.'
         )
     tail = f'; after a refit of the hysteresis {errors}' if after is not before else ''
-    smallest = result.smallest_detectable or 0.0
+    if result.smallest_detectable is None:
+        return _capital(f'{result.unexplained.description}{tail}.')
     return (
-        f'No effect is missing that these data could show; the smallest would be {smallest:.2g} % '
-        f'of stroke{tail}.'
+        'No effect is missing that these data could show; the smallest would be '
+        f'{result.smallest_detectable:.2g} % of stroke{tail}.'
     )
 
 

@@ -21,7 +21,8 @@ fitted gain; and then comes the judgement.
 
 An effect that was there when G was identified has bent G a little.  Unless a linear change is the
 larger part of the story, G is therefore retuned along with the candidates, by a factor
-``1 + c_1 (1 - z^-1) + c_2 (1 - z^-1)^2``, which no candidate gets credit for.
+``1 + c_1 (1 - z^-1) + c_2 (1 - z^-1)^2`` and two slow relaxations.  No candidate is chosen for
+what that explains; it counts in the share of the effects that are named, and is said beside it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from piezo_ident.diagnosis.assemble import assemble, PASSES
+from piezo_ident.diagnosis.assemble import assemble
 from piezo_ident.diagnosis.beginnings import beginnings, said_of, share_of
 from piezo_ident.diagnosis.errors_of import row_noise
 from piezo_ident.diagnosis.fit import (
@@ -41,10 +42,10 @@ from piezo_ident.diagnosis.fit import (
 )
 from piezo_ident.diagnosis.handles import RETUNING
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
-from piezo_ident.diagnosis.rows import make_rows
+from piezo_ident.diagnosis.rows import make_rows, Rows
 from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.verdict import judge, SMALLEST, takes
+from piezo_ident.diagnosis.verdict import judge, PASSES, SMALLEST, takes
 from piezo_ident.diagnosis.whole import fitted_to_all, Whole
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.errors import IdentificationError, ModelError
@@ -63,8 +64,9 @@ __all__ = ['diagnose']
 LINEAR = 0.5
 #: share of what a linear change leaves that a bent G and another effect must not exceed
 BENT = 0.25
-
-
+#: share of the displacement's variance beyond which a fitted H explains none of it, and the
+#: share of the identified range from which the voltage moves
+UNRELATED, TREMBLES = 0.99, 0.01
 #: samples with a fault are left out up to this share; beyond it they are all there is
 FAULTY = 0.02
 
@@ -96,7 +98,7 @@ def diagnose(
     Raises
     ------
     IdentificationError
-        When the records carry nothing to judge.
+        When the records carry nothing to judge, or the displacement does not follow the voltage.
     """
     settings = settings or DiagnosisSettings()
     records = [records] if isinstance(records, Record) else list(records)
@@ -129,6 +131,7 @@ def _diagnosed(
     progress('residual', 0.5)
     is_long = records != whole
     base = _base(simulator, given, _swing(model, whole) if is_long else 0.0)
+    _check_related(rows, base)
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
     lines = find_lines(parts, stretches).lines
@@ -155,6 +158,7 @@ def _diagnosed(
         except (IdentificationError, ModelError, np.linalg.LinAlgError) as error:
             how = f'what was found could not be fitted to the rest ({error})'
     progress('verdict', 0.0)
+    outside = tuple(warning for record in whole for warning in model.extrapolation(record))
     result = assemble(
         simulator,
         given,
@@ -170,11 +174,27 @@ def _diagnosed(
         fits=fits,
         is_long=is_long,
     )
+    result = replace(result, warnings=(*result.warnings, *outside))
     if is_long:
         said = _said(model, result.model, whole, records, how, progress)
         result = replace(result, warnings=(*result.warnings, said))
     progress('verdict', 1.0)
     return result
+
+
+def _check_related(rows: Rows, base: Fitted) -> None:
+    """Refuse displacement that does not follow the voltage: no effect is missing, the stage is."""
+    swing = max(float(np.ptp(run.u)) for run in rows.runs)
+    mean = np.bincount(rows.of_record, rows.x) / np.bincount(rows.of_record)
+    moved = float(np.mean((rows.x - mean[rows.of_record]) ** 2))
+    # where the voltage only trembles all else may well be larger
+    if swing > TREMBLES and base.mean_square > UNRELATED * moved:
+        raise IdentificationError(
+            f'{", ".join(rows.names)}: the displacement does not follow the voltage: of blocks '
+            'that were held out a hysteresis fitted to the others accounts for '
+            f'{max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} %; is the sensor '
+            'connected, and do both columns come from one stage?'
+        )
 
 
 def _is_driven(effects: Sequence[str]) -> bool:

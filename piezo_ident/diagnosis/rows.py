@@ -75,7 +75,7 @@ class Rows:
     labels : tuple of str
         Name of each group.
     stroke : float
-        Largest minus smallest displacement of the records, normalised.
+        Largest minus smallest displacement of a record, the largest of all, normalised.
     """
 
     runs: tuple[Run, ...]
@@ -106,6 +106,33 @@ class Rows:
         # over rows, so that converter steps and noise are no travel
         travel = sum(float(np.abs(np.diff(means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
+
+    @property
+    def duration(self) -> float:
+        """Time from the start of a record to its end, of the longest one [s]."""
+        return max(
+            run.piece.duration + (run.piece.start_time - self._begin(run)) for run in self.runs
+        )
+
+    def _begin(self, run: Run) -> float:
+        return next(r.piece.start_time for r in self.runs if r.record == run.record)
+
+    def time(self, i: int, start: int = 0, stop: int | None = None) -> NDArray[np.float64]:
+        """
+        Return the time of samples of a run since its record began [s].
+
+        What drifts began with the record, whatever its clock was set to.
+
+        Parameters
+        ----------
+        i : int
+            Of the run.
+        start, stop : int, optional
+            First sample, and the one behind the last; all of them when absent.
+        """
+        run = self.runs[i]
+        stop = run.u.size if stop is None else min(stop, run.u.size)
+        return run.piece.time(start, stop) - self._begin(run)
 
     @property
     def edges(self) -> NDArray[np.int64]:
@@ -200,7 +227,6 @@ def make_rows(
     )
     block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
     group, group_labels = _groups(labels, np.bincount(block))
-    low, high = min(run.x.min() for run in runs), max(run.x.max() for run in runs)
     return Rows(
         runs=tuple(runs),
         record=record,
@@ -215,8 +241,19 @@ def make_rows(
         group=group,
         label=tuple(labels),
         labels=group_labels,
-        stroke=float(high - low),
+        stroke=_stroke(runs, bad),
     )
+
+
+def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None) -> float:
+    """Return the largest stroke of a record; between two of them the sensor may be set to zero."""
+    ends: dict[str, tuple[float, float]] = {}
+    for run, out in zip(runs, bad or [None] * len(runs), strict=True):
+        x = run.x[run.sound if out is None else run.sound & ~out]
+        if x.size:
+            low, high = ends.get(run.record, (np.inf, -np.inf))
+            ends[run.record] = min(low, float(x.min())), max(high, float(x.max()))
+    return max(high - low for low, high in ends.values())
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
@@ -258,6 +295,10 @@ def _groups(
     group = np.array([number.get(label, rest) for label in labels])
     if np.any(group == rest):
         names = [*names, 'the rest']
+    if len(names) == 1:
+        # of one kind nothing would be left to predict it from: fifths of it stand for kinds
+        group = np.arange(group.size) * 5 // group.size
+        names = [f'{names[0]}, part {i + 1}' for i in range(int(group.max()) + 1)]
     return group, tuple(names)
 
 

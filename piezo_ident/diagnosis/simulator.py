@@ -182,7 +182,7 @@ class Simulator:
         for start in range(0, run.u.size, size):
             cut = slice(start, start + size)
             block = Block(
-                t=run.piece.time(start, start + size),
+                t=self.rows.time(run_index, start, start + size),
                 v=run.u[cut],
                 x=run.u[cut],
                 channels={name: c[cut] for name, c in run.piece.channels.items()},
@@ -250,7 +250,7 @@ class Simulator:
         for i, run in enumerate(self.rows.runs):
             operators = self._operators(state, i)
             self._rest(operators, run.u)
-            block = Block(t=run.piece.t, v=run.u, x=run.u, channels=run.piece.channels)
+            block = Block(t=self.rows.time(i), v=run.u, x=run.u, channels=run.piece.channels)
             inputs = []
             for operator in operators:
                 inputs.append(block)

@@ -39,7 +39,15 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import catalogue, find_effect
 
-__all__ = ['Findings', 'candidates_of', 'judge', 'takes', 'untestable_of']
+__all__ = [
+    'PASSES',
+    'Findings',
+    'candidates_of',
+    'judge',
+    'smallest_taken',
+    'takes',
+    'untestable_of',
+]
 
 #: least share of the explainable part that a name stands for; below the second nothing is added
 NAMED, ADDED = 0.92, 0.5
@@ -55,6 +63,8 @@ HARM = 1.25
 MOST = 3
 #: a candidate is not testable when a refit of the base swallows all but this share of it
 SWALLOWED = 1e-4
+#: passes over the range, there or back, that a test on data not fitted needs
+PASSES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +125,45 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
     if gain < (ADDED if first else FURTHER) * left:
         return False
     return not _harms(rows, this.before, best.fitted, noise)
+
+
+def smallest_taken(
+    rows: Rows,
+    base: Fitted,
+    fitted: Fitted,
+    rounds: Sequence[Round],
+    taken: Sequence[Round],
+    noise: float,
+) -> float | None:
+    """
+    Return how much a further effect would have to explain, rms in % of stroke.
+
+    Parameters
+    ----------
+    rows : Rows
+    base, fitted : Fitted
+        Before and after everything that was added.
+    rounds, taken : sequence of Round
+        All, and those whose best contender was added.
+    noise : float
+        Mean square of the noise of a row.
+
+    Returns
+    -------
+    float or None
+        None where the range was passed so rarely that none would have been taken.
+    """
+    if rows.passes < PASSES:
+        return None
+    # what follows time alone fits any slow residual
+    last = rounds[-1].chance
+    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
+    least = max(
+        BEYOND_CHANCE * chance,
+        LEAST_GAIN * (base.mean_square - noise),
+        (FURTHER if taken else ADDED) * (fitted.mean_square - noise),
+    )
+    return max(SMALLEST, percent(rows, least))
 
 
 def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
@@ -204,22 +253,27 @@ def candidates_of(
         if name in findings.effects:
             continue
         value = float(np.clip(share, 0.0, 1.0))
-        found.append(Candidate(name, value, _why_not(name, value, findings, last)))
+        found.append(Candidate(name, value, _why_not(name, value, findings, last, rows.passes)))
     return tuple(found)
 
 
-def _why_not(name: str, share: float, findings: Findings, last: Round) -> str:
+def _why_not(name: str, share: float, findings: Findings, last: Round, passes: float) -> str:
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
     if not findings.effects:
         if share < LEAST_GAIN:
-            return 'explains nothing beyond chance'
+            return 'explains next to nothing'
         if findings.verdict == 'none':
             return f'there is only {findings.unexplained.rms_percent:.2g} % of stroke to explain'
-        return f'explains {100.0 * share:.0f} % of what could be explained, too little for a cause'
+        said = f'explains {100.0 * share:.0f} % of what could be explained'
+        if passes < PASSES:
+            return f'{said}, of a range that was passed too rarely to test that'
+        if share < ADDED:
+            return f'{said}, too little for a cause'
+        return f'{said}, as chance might, or at the expense of another kind of excitation'
     if share < LEAST_GAIN:
-        return 'explains nothing beyond chance'
+        return 'explains next to nothing'
     gain = last.before.mean_square
     if name in last.best and gain > 0.0:
         more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
