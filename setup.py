@@ -45,6 +45,7 @@ setup(
         (f'share/{package_name}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         (f'share/{package_name}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
+        (f'share/{package_name}/examples', sorted(glob('examples/*.py'))),
     ],
     python_requires='>=3.10',
     install_requires=[

@@ -17,8 +17,6 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from piezo_ident.bag_io import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
 from piezo_ident.capture import APPLIED, Capture
@@ -30,6 +28,11 @@ from piezo_ident.wire_format import cut_blocks, decode, Dimension, encode, Sampl
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 import yaml
+
+pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 RATE = 1000.0
 

@@ -26,10 +26,6 @@ import struct
 import subprocess
 import sys
 
-from mcap.reader import make_reader
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from piezo_ident.bag_io import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
 from piezo_ident.bag_recovery import is_unfinished, opened_bag
@@ -44,6 +40,13 @@ import pytest
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 import yaml
+
+pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from mcap_ros2.decoder import DecoderFactory
 
 HERE = Path(__file__).resolve().parent
 RATE = 20000.0

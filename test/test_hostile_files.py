@@ -31,8 +31,6 @@ import zipfile
 import zlib
 
 from hypothesis import given, HealthCheck, settings
-from mcap.writer import CompressionType
-from mcap_ros2.writer import Writer as McapWriter
 import numpy as np
 from piezo_ident import yaml_io
 from piezo_ident.bag_check import check_journal
@@ -49,6 +47,11 @@ from piezo_ident.wire_format import decode, Dimension
 import pytest
 import scipy.io
 import yaml
+
+pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
+
+from mcap.writer import CompressionType
+from mcap_ros2.writer import Writer as McapWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'benchmarks'))

@@ -18,7 +18,7 @@ Several nodes in one process: fewer interpreters, one executor.
     ros2 run piezo_ident composed stage model --ros-args -r __ns:=/stage_1
 
 They talk through their topics as before.  What it saves and what it costs is measured in
-docs/live.md: they share one interpreter, so a node that is busy makes the others wait.
+docs/live_stages.md: they share one interpreter, so a node that is busy makes the others wait.
 """
 
 from __future__ import annotations
