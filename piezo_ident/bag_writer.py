@@ -370,7 +370,7 @@ class LossCount:
         self._last: list[int] = []
 
     def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of the number that a publisher, the same and only one if `alone`, gave."""
+        """Take note of a number; `alone`: of who gave the one before, and is the only one."""
         before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)

@@ -84,9 +84,7 @@ class Ledger:
         except FileNotFoundError:
             return []
         except (OSError, UnicodeDecodeError):
-            raise ConfigError(
-                f'{self.path}: cannot be read; choose another folder, or take the file away'
-            ) from None
+            raise ConfigError(f'{self.path}: cannot be read; choose another folder') from None
         entries = []
         for number, line in enumerate(lines, 1):
             try:
@@ -97,7 +95,7 @@ class Ledger:
                 if number < len(lines):
                     raise ConfigError(
                         f'{self.path}: line {number} is none of this package; choose another '
-                        'folder, or take the file away'
+                        'folder'
                     ) from None
                 continue
             if entry.verb != self._verb:

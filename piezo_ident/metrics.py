@@ -16,10 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['FORMULA', 'fit_percent', 'percent_of_stroke']
+__all__ = ['FORMULA', 'fit_percent', 'percent_of_stroke', 'strokes']
 
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
@@ -48,6 +50,25 @@ def percent_of_stroke(
     if span == 0.0:
         return 0.0 if rms == 0.0 else float('inf')
     return 100.0 * rms / span
+
+
+def strokes(parts: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, float]:
+    """
+    Return ``max y - min y`` of each record over all its parts.
+
+    Between two records a sensor may be set to zero anew, so their strokes are no common one.
+
+    Parameters
+    ----------
+    parts : iterable of (str, ndarray)
+        Name of a record, and displacement of a part of it; empty ones do not count.
+    """
+    ends: dict[str, tuple[float, float]] = {}
+    for record, y in parts:
+        if y.size:
+            low, high = ends.get(record, (np.inf, -np.inf))
+            ends[record] = min(low, float(y.min())), max(high, float(y.max()))
+    return {record: high - low for record, (low, high) in ends.items()}
 
 
 def fit_percent(y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> float:

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.memory import start_memory
-from piezo_ident.metrics import fit_percent, percent_of_stroke
+from piezo_ident.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model import StageModel
 from piezo_ident.results import ErrorRow
 from piezo_ident.runs import Run
@@ -57,14 +57,17 @@ def errors_of(
         not start at rest is estimated.
     """
     static = model.without_dynamics()
+    stroke_of = strokes((run.record, run.piece.y) for run in runs)
     rows = []
     for run, (fitted, selection) in zip(runs, masks, strict=True):
         memory = (memories or {}).get(key_of(run))
+        # a start that is estimated here is estimated from samples that are then no test
+        judged = run.known if memory is None else run.sound
         if memory is None:
             memory = start_memory(model, run.piece)
         y = run.piece.y
         y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
-        stroke = float(np.ptp(y))
+        stroke = stroke_of[run.record]
         names = [(s.label, s.start, s.stop) for s in run.piece.segments]
         for label, start, stop in names or [('', 0, run.piece.n)]:
             part = np.zeros(run.piece.n, dtype=bool)
@@ -72,8 +75,7 @@ def errors_of(
             for data, mask in (
                 ('fitted', part & fitted),
                 ('selection', part & selection),
-                # where the start is not forgotten the memory was fitted
-                ('held out', part & run.known & ~fitted & ~selection),
+                ('held out', part & judged & ~fitted & ~selection),
             ):
                 if not mask.any():
                     continue

@@ -189,6 +189,12 @@ def _noise(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     low, high = s.limits
     if o['preset'] == 'paper':
+        own = [n for n in ('peaks', 'base') if o[n] is not None]
+        own += ['slope'] if o['slope'] != _SLOPE.default else []
+        if own:
+            raise ConfigError(
+                f'preset: paper has its own {" and ".join(own)}; leave out the one or the other'
+            )
         peaks, base, slope = excitation.PAPER_PEAKS, 0.0, excitation.PAPER_SLOPE
         name = 'paper'
     else:

@@ -438,7 +438,7 @@ def test_a_folder_of_records_leaves_none_out_unsaid(tmp_path):
     (tmp_path / 'crashed' / 'crashed.mcap').write_bytes(b'')
     (tmp_path / 'pictures').mkdir()
     found = expand([tmp_path])
-    assert [path.name for path in found] == ['TEK0001.CSV', 'b.csv', 'crashed']
+    assert [path.name for path in found] == ['TEK0001.CSV', 'b.csv', 'crashed.mcap']
 
 
 def test_files_of_one_name_are_two_records(capsys, tmp_path, made):

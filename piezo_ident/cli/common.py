@@ -67,7 +67,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir() or (path / 'metadata.yaml').is_file():
             found.append(path)
             continue
-        inside = [p for p in sorted(path.iterdir()) if _is_record(p)]
+        inside = [record for p in sorted(path.iterdir()) for record in _records_of(p)]
         if not inside:
             raise DataError(
                 f'{path}: a folder without records; give a bag, or a folder with '
@@ -77,15 +77,15 @@ def expand(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def _is_record(path: Path) -> bool:
+def _records_of(path: Path) -> list[Path]:
+    """Return what a folder of records has in one of its places."""
     if path.name.startswith('.'):
-        return False
-    if path.is_dir():
-        # one that was not finished has no metadata.yaml, and is not to be left out unsaid
-        return (path / 'metadata.yaml').is_file() or any(
-            p.suffix in BAG_FILES for p in path.glob('*')
-        )
-    return path.is_file() and path.suffix.lower() in RECORD_FILES
+        return []
+    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+        # a bag that was not finished is not to be left out unsaid
+        return [p for p in sorted(path.glob('*')) if p.suffix.lower() in BAG_FILES]
+    is_record = path.is_dir() or (path.is_file() and path.suffix.lower() in RECORD_FILES)
+    return [path] if is_record else []
 
 
 def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
@@ -97,8 +97,9 @@ def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
     ConfigError
     """
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
-        is_bag = (p.is_dir() or p.suffix.lower() in BAG_FILES for p in paths)
-        if getattr(args, option) is not None and not any(is_bag):
+        # one that is not there is said by whoever reads it
+        is_table = (p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
+        if getattr(args, option) is not None and all(is_table):
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
             )
@@ -150,7 +151,7 @@ def _reading(args: argparse.Namespace) -> dict[str, Any]:
 def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
     """Read records of one call, which share the options; files of one name keep their folders."""
     check_bag_options(paths, args)
-    names = Counter(path.name for path in {path.resolve() for path in paths})
+    names = Counter(path.name for path in {path.resolve(): path for path in paths}.values())
     records = []
     for path in paths:
         try:

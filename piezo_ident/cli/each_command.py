@@ -230,7 +230,7 @@ def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Con
     folder = _Folder(args.each)
     check_folder(folder.path)
     ledger = Ledger(folder.path, args.verb)
-    _refuse_inputs(folder.path, [*args.records, *(Path(job.path) for job in jobs)])
+    _refuse_inputs(folder.path, args.records, jobs)
     _refuse_targets(folder, jobs, getattr(args, 'model_file', None), ledger.exists)
     keys = [_key(job) for job in jobs]
     rows: dict[int, Row] = {}
@@ -284,10 +284,10 @@ def _run(jobs: Sequence[Job], places: Places, tick: Callable[[], None]) -> Any:
     return run_all(jobs, places, lost, tick)
 
 
-def _refuse_inputs(out: Path, records: Sequence[Path]) -> None:
+def _refuse_inputs(out: Path, named: Sequence[Path], jobs: Sequence[Job]) -> None:
     # its table would be taken for a record the next time
-    place = out.resolve()
-    if any(place in (path.resolve(), path.resolve().parent) for path in records):
+    beside = {Path(job.path).resolve().parent for job in jobs}
+    if out.resolve() in beside | {path.resolve() for path in named}:
         raise ConfigError(f'{out}: is where the records are; choose another folder for --each')
 
 

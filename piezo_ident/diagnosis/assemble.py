@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +73,7 @@ def assemble(
     *,
     fits: Whole | None = None,
     is_long: bool = False,
+    searched: Collection[str] = (),
 ) -> Diagnosis:
     """
     Return the diagnosis.
@@ -97,6 +98,8 @@ def assemble(
         and model are theirs, shares and pictures those of the beginnings.
     is_long : bool, optional
         Whether the records are longer than what the rest is about.
+    searched : collection of str, optional
+        Effects that were looked for by other means than a fit.
     """
     rows, model = simulator.rows, simulator.model
     span = abs(model.scaling.Y)
@@ -164,7 +167,9 @@ def assemble(
         noise_floor=None if rms is None else 100.0 * rms / (rows.stroke * span),
         noise_source=floor.source,
         smallest_detectable=smallest,
-        untestable=untestable_of(rounds, settings),
+        untestable=untestable_of(
+            rounds, settings, {*searched, *(setting.name for setting in model.effects)}
+        ),
         faults=faults.faults,
         residuals=residuals,
         records=rows.names,
@@ -204,6 +209,18 @@ def _lasting(added: Added) -> Added:
     if not added.effect.time_driven:
         return added
     return Added(added.name, tuple(added.effect.elsewhere(values) for values in added.values))
+
+
+def _is_off(added: Added) -> bool:
+    """Return whether nothing is left of an effect in another record."""
+    effect = added.effect
+    return all(
+        np.array_equal(np.asarray(one), np.asarray(other))
+        for values in added.values
+        for one, other in zip(
+            effect.elsewhere(values).values(), effect.neutral(values).values(), strict=True
+        )
+    )
 
 
 def _silenced(effects: Sequence[Added]) -> tuple[Added, ...]:
@@ -324,11 +341,14 @@ def _warnings(
             'of what the model missed goes with that alone: the effect bent them at the '
             'identification, or they have changed since'
         )
-    driven = [n for n in findings.effects if find_effect(n).time_driven]
-    for name in driven:
+    for added in state.effects:
+        if not added.effect.time_driven:
+            continue
+        # beside a lasting effect the rest was fitted to the mean of what wanders
+        kept = 'its mean' if lasting and not _is_off(added) else 'it switched off'
         said.append(
-            f'{name} follows time and not the voltage: what was found holds in its own record '
-            'alone, so the refined model carries the effect switched off'
+            f'{added.name} follows time and not the voltage: what was found holds in its own '
+            f'record alone, so the refined model carries {kept}'
         )
     return tuple(said)
 

@@ -64,6 +64,9 @@ class Scored:
         What the sum of squares of residuals falls by that have nothing to do with the data.
     visible : float
         Share of its columns that everything else in the model cannot make up for.
+    is_possible : bool
+        False where the data speak against it: an effect without amplitudes that should come out
+        of the fit about once, and does not.
     """
 
     effect: type[Effect]
@@ -73,20 +76,21 @@ class Scored:
     transfer: NDArray[np.float64]
     chance: NDArray[np.float64]
     visible: float
+    is_possible: bool = True
 
 
 def view_of(simulator: Simulator, lines: Sequence[float] = ()) -> View:
     """Return what effects may know of the data."""
     rows, model = simulator.rows, simulator.model
     speeds, top = [], 0.0
-    channels: dict[str, tuple[float, float]] = {}
+    channels: dict[str, list[NDArray[np.float64]]] = {}
     for run in rows.runs:
         # over a row, so that converter steps do not count as speed
         mean = run.u[: run.u.size // rows.m * rows.m].reshape(-1, rows.m).mean(axis=1)
         speeds.append(np.abs(np.diff(mean)) * model.sample_rate / rows.m)
         top = max(top, _highest_frequency(run.u, model.sample_rate))
         for name, x in run.piece.channels.items():
-            channels.setdefault(name, (float(x.mean()), float(x.std())))
+            channels.setdefault(name, []).append(x)
     speed = np.concatenate(speeds)
     moving = speed[speed > 1e-3 * speed.max(initial=0.0)]
     quantiles = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 0.999])
@@ -96,7 +100,11 @@ def view_of(simulator: Simulator, lines: Sequence[float] = ()) -> View:
         high=max(float(run.u.max()) for run in rows.runs),
         speeds=np.quantile(moving, quantiles) if moving.size else np.zeros(quantiles.size),
         duration=rows.duration,
-        channels=channels,
+        # of all that have it: the axis may rest in one of them
+        channels={
+            name: (float(np.concatenate(x).mean()), float(np.concatenate(x).std()))
+            for name, x in channels.items()
+        },
         lines=tuple(lines),
         modes=tuple(model.dynamics.modes(model.sample_rate)),
         max_frequency=top,
@@ -230,7 +238,10 @@ def score_trials(
         both = joined(rows, gram, M, C, e)
         wide = np.concatenate([prior, np.zeros(C.shape[1])])
         theta = solve(both.A.sum(axis=0), both.b.sum(axis=0), wide)[M.shape[1] :]
+        visible = _visible(both, M.shape[1], wide)
         if not trial.moves and not ONCE[0] <= theta[0] <= ONCE[1]:
+            nothing = np.zeros(0)
+            yield Scored(effect, trial, theta, gram.s, gram.s, nothing, visible, False)
             continue
         turned_b = np.concatenate([swallowed, block_products(rows, C, turned)], axis=1)
         with_it = chance_errors(both.A, turned_b, squares, rows.fold, wide)
@@ -241,7 +252,7 @@ def score_trials(
             held_out_errors(both, rows.fold, wide),
             held_out_errors(both, rows.group, wide),
             np.maximum(alone - with_it, 0.0),
-            _visible(both, M.shape[1], wide),
+            visible,
         )
 
 

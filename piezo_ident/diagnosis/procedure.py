@@ -67,6 +67,8 @@ BENT = 0.25
 #: share of the displacement's variance beyond which a fitted H explains none of it, and the
 #: share of the identified range from which the voltage moves
 UNRELATED, TREMBLES = 0.99, 0.01
+#: effect that is looked for by its lines
+HUM = 'periodic_disturbance'
 #: samples with a fault are left out up to this share; beyond it they are all there is
 FAULTY = 0.02
 
@@ -134,7 +136,8 @@ def _diagnosed(
     _check_related(rows, base)
     parts = _parts(simulator, base.state)
     stretches = [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
-    lines = find_lines(parts, stretches).lines
+    found = find_lines(parts, stretches)
+    lines = found.lines
     # hum is no noise: it can be explained
     resting = _parts(simulator, base.state, whole=True)
     rests = [s for i, part in enumerate(resting) for s in stretches_of(part, i)]
@@ -173,6 +176,8 @@ def _diagnosed(
         settings,
         fits=fits,
         is_long=is_long,
+        # where no line stands out there is nothing to fit
+        searched=(HUM,) if found.highest > 0.0 else (),
     )
     result = replace(result, warnings=(*result.warnings, *outside))
     if is_long:

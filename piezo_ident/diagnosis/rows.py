@@ -26,8 +26,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.effects import find_effect
 from piezo_ident.errors import IdentificationError
 from piezo_ident.memory import fit_memory, is_at_rest
+from piezo_ident.metrics import strokes
 from piezo_ident.model import StageModel
 from piezo_ident.play import initial_memory
 from piezo_ident.record import Record
@@ -58,6 +60,9 @@ class Rows:
         The record that each run belongs to.
     names : tuple of str
         Names of the records.
+    begin : ndarray, shape (runs,)
+        When the record of each run began [s]: what drifts began with it, whatever its clock was
+        set to.  Zero where the model follows time already, which it does by the clock.
     memories : tuple of callable
         Play outputs at the start of each run, as a function of the thresholds.
     m : int
@@ -81,6 +86,7 @@ class Rows:
     runs: tuple[Run, ...]
     record: NDArray[np.int64]
     names: tuple[str, ...]
+    begin: NDArray[np.float64]
     memories: tuple[Memory, ...]
     m: int
     keep: tuple[NDArray[np.bool_], ...]
@@ -111,17 +117,13 @@ class Rows:
     def duration(self) -> float:
         """Time from the start of a record to its end, of the longest one [s]."""
         return max(
-            run.piece.duration + (run.piece.start_time - self._begin(run)) for run in self.runs
+            run.piece.duration + (run.piece.start_time - begin)
+            for run, begin in zip(self.runs, self.begin, strict=True)
         )
-
-    def _begin(self, run: Run) -> float:
-        return next(r.piece.start_time for r in self.runs if r.record == run.record)
 
     def time(self, i: int, start: int = 0, stop: int | None = None) -> NDArray[np.float64]:
         """
         Return the time of samples of a run since its record began [s].
-
-        What drifts began with the record, whatever its clock was set to.
 
         Parameters
         ----------
@@ -132,7 +134,7 @@ class Rows:
         """
         run = self.runs[i]
         stop = run.u.size if stop is None else min(stop, run.u.size)
-        return run.piece.time(start, stop) - self._begin(run)
+        return run.piece.time(start, stop) - float(self.begin[i])
 
     @property
     def edges(self) -> NDArray[np.int64]:
@@ -227,10 +229,13 @@ def make_rows(
     )
     block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
     group, group_labels = _groups(labels, np.bincount(block))
+    by_clock = any(find_effect(setting.name).time_driven for setting in model.effects)
+    first_of = {run.record: run.piece.start_time for run in reversed(runs)}
     return Rows(
         runs=tuple(runs),
         record=record,
         names=names,
+        begin=np.zeros(len(runs)) if by_clock else np.array([first_of[r.record] for r in runs]),
         memories=tuple(_memory(model, run) for run in runs),
         m=m,
         keep=keep,
@@ -246,14 +251,12 @@ def make_rows(
 
 
 def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None) -> float:
-    """Return the largest stroke of a record; between two of them the sensor may be set to zero."""
-    ends: dict[str, tuple[float, float]] = {}
-    for run, out in zip(runs, bad or [None] * len(runs), strict=True):
-        x = run.x[run.sound if out is None else run.sound & ~out]
-        if x.size:
-            low, high = ends.get(run.record, (np.inf, -np.inf))
-            ends[run.record] = min(low, float(x.min())), max(high, float(x.max()))
-    return max(high - low for low, high in ends.values())
+    """Return the largest stroke of a record, its faults left out."""
+    used = (
+        (run.record, run.x[run.sound if out is None else run.sound & ~out])
+        for run, out in zip(runs, bad or [None] * len(runs), strict=True)
+    )
+    return max(strokes(used).values())
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:

@@ -149,8 +149,10 @@ def search_round(
         lambda share: tick(0.5 * share),
     ):
         name = scored.effect.name
-        chance[name] = max(chance.get(name, 0.0), float(scored.chance.max()) / rows.n)
         visible[name] = max(visible.get(name, 0.0), scored.visible)
+        if not scored.is_possible:
+            continue
+        chance[name] = max(chance.get(name, 0.0), float(scored.chance.max()) / rows.n)
         trials.setdefault(name, []).append(scored)
     for scores in trials.values():
         scores.sort(key=lambda s: float(s.errors.sum()))

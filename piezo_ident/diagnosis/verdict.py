@@ -240,6 +240,7 @@ def candidates_of(
 ) -> tuple[Candidate, ...]:
     """Return every candidate that was not added, its share when added alone, and why not."""
     first, last = rounds[0], rounds[-1]
+    refuted = [name for name in first.visible if name not in first.best]
     left = max(first.before.mean_square - noise, 1e-300)
     shares = {
         name: (first.before.errors.sum() - s.errors.sum()) / rows.n / left
@@ -254,6 +255,11 @@ def candidates_of(
             continue
         value = float(np.clip(share, 0.0, 1.0))
         found.append(Candidate(name, value, _why_not(name, value, findings, last, rows.passes)))
+    found += [
+        Candidate(name, 0.0, 'would show in these data, and does not')
+        for name in refuted
+        if first.visible[name] >= SWALLOWED and name not in findings.effects
+    ]
     return tuple(found)
 
 
@@ -282,14 +288,25 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
     return f'{best} explains more'
 
 
-def untestable_of(rounds: Sequence[Round], settings: DiagnosisSettings) -> tuple[Untestable, ...]:
-    """Return the candidates that these data cannot show."""
+def untestable_of(
+    rounds: Sequence[Round], settings: DiagnosisSettings, tested: Collection[str]
+) -> tuple[Untestable, ...]:
+    """
+    Return the candidates that these data cannot show.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+    settings : DiagnosisSettings
+    tested : collection of str
+        Effects that were tested otherwise, or are in the model as it was given.
+    """
     first = rounds[0]
     found = []
     for name in settings.effects or catalogue():
-        if name in settings.without:
+        if name in settings.without or name in tested:
             continue
         effect = find_effect(name)
-        if name not in first.best or first.visible.get(name, 0.0) < SWALLOWED:
+        if first.visible.get(name, 0.0) < SWALLOWED:
             found.append(Untestable(name, effect.needs or 'data in which it shows'))
     return tuple(found)

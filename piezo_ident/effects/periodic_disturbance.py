@@ -47,7 +47,8 @@ class PeriodicDisturbance(Effect):
     needs: ClassVar[str] = 'an idle stretch of 2 s, or motion at frequencies other than the lines'
     time_driven: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='log'),
+        # found as a line, far more sharply than a fit of neighbouring columns could move it
+        Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='fixed'),
         Parameter('harmonic', '1', 'multiple m_i of f', NAN, 1.0, 1e3, True, scale='fixed'),
         Parameter(
             'amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, True, default=0.0, step=1e-3

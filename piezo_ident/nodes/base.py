@@ -242,12 +242,12 @@ class LabNode(Node):
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
 
 
-def _report(node: LabNode, error: Exception) -> None:
+def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:
     """Say on the log what a callback tripped over."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     place = f'{where.name}, {Path(where.filename).name} line {where.lineno}'
     node.get_logger().error(
-        f'{type(error).__name__}: {str(error)[:200]} (in {place}); the node goes on',
+        f'{type(error).__name__}: {str(error)[:200]} (in {place}); {then}',
         throttle_duration_sec=1.0,
     )
 
@@ -259,7 +259,8 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 after a clean end, 2 when the node could not start.
+        Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
+        not start.
     """
     return run_together([make], argv)
 
@@ -294,6 +295,7 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     nodes: list[LabNode] = []
+    code = 0
     try:
         for make in makes:
             nodes.append(make())
@@ -314,7 +316,7 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
                 _report(nodes[0], error)
     except (PiezoIdentError, ParameterException) as error:
         sys.stderr.write(f'piezo_ident: error: {error}\n')
-        return 2
+        code = 2
     finally:
         # nobody spins for the stage any more: it is not to wait at 9 V for the others to end
         nodes.sort(key=lambda node: node.drives)
@@ -323,9 +325,10 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
                 node.close()
                 node.await_listeners()
             except Exception as error:  # noqa: BLE001
-                _report(node, error)
+                _report(node, error, 'it ends all the same')
+                code = code or 1
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown(timeout_sec=0.5)
         rclpy.try_shutdown()
-    return 0
+    return code

@@ -190,25 +190,23 @@ class RecorderNode(LabNode):
             return
         recording.path = str(writer.path)
         recording.opened.set()
-        failure = 'the recording ended by itself; see the log'
+        failure = ''
         try:
             self._record(recording, taps, writer)
             writer.close()
-            failure = ''
-        except PiezoIdentError as error:
-            failure = str(error)
-        finally:
-            recording.failure, recording.size = failure, writer.size
-            recording.end.set()
-            recording.over.set()
-            if failure:
-                writer.abort()
-                self._report('failed', failure, ERROR)
-            else:
-                parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
-                about = f'{writer.messages} messages in {writer.path}{parts}'
-                self._report('done', about, progress=100.0)
-            taps.close()
+        except Exception as error:  # noqa: BLE001
+            failure = str(error) if isinstance(error, PiezoIdentError) else repr(error)
+        recording.failure, recording.size = failure, writer.size
+        recording.end.set()
+        recording.over.set()
+        if failure:
+            writer.abort()
+            self._report('failed', failure, ERROR)
+        else:
+            parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
+            about = f'{writer.messages} messages in {writer.path}{parts}'
+            self._report('done', about, progress=100.0)
+        taps.close()
 
     def _give_up(self, recording: Recording, taps: Taps, reason: str) -> None:
         recording.failure = reason

@@ -148,6 +148,8 @@ class Tap:
     #: who publishes, and whether it has been one and the same at the last two looks
     publishers: frozenset[bytes] = frozenset()
     is_single: bool = False
+    #: whether the last message came from who has been the only one since
+    follows: bool = False
 
 
 class Taps:
@@ -208,6 +210,7 @@ class Taps:
         ]
         publishers = frozenset(bytes(i.endpoint_gid) for i in found)
         tap.is_single = len(publishers) == 1 and publishers == tap.publishers
+        tap.follows &= tap.is_single
         tap.publishers = publishers
         if not found:
             if tap.request is not None:
@@ -272,7 +275,8 @@ class Taps:
                     raw, info = found
                     tap.taken += 1
                     number = info['publication_sequence_number'] or 0
-                    tap.losses.note(number, alone=tap.is_single)
+                    tap.losses.note(number, alone=tap.follows)
+                    tap.follows = tap.is_single
                     messages.append((info['received_timestamp'] or time.time_ns(), tap.topic, raw))
         messages.sort(key=lambda m: m[0])
         return messages

@@ -41,7 +41,7 @@ from piezo_ident.plots.steps import (
 from piezo_ident.plots.style import NothingToDraw, Picture
 from piezo_ident.record import Record
 from piezo_ident.results import Identification
-from piezo_ident.validation import FreeRun, sines_of
+from piezo_ident.validation import FreeRun, sine_frequency, sines_of
 
 __all__ = [
     'NAMES',
@@ -62,6 +62,8 @@ __all__ = [
 
 #: at most so many records get a picture of their own
 OVERVIEWS = 4
+#: strokes of sines that differ by no more than this factor have one level of noise in %
+ALIKE = 1.1
 #: names of all pictures that `draw` can give
 NAMES = (
     'sines',
@@ -117,6 +119,20 @@ def response_caption(identification: Identification) -> str:
     )
 
 
+def _floor_of_sines(identification: Identification, runs: Sequence[FreeRun]) -> float | None:
+    """Return the sensor noise in % of the stroke of the sines, None where these differ."""
+    found = [
+        float(np.ptp(run.piece.y[s.start : s.stop]))
+        for run in runs
+        for s in run.piece.segments
+        if sine_frequency(s.label)
+    ]
+    floor = identification.noise_floor
+    if floor is None or not found or max(found) > ALIKE * min(found):
+        return None
+    return floor * identification.stroke / max(found)
+
+
 def draw(
     identification: Identification,
     runs: Sequence[FreeRun],
@@ -149,7 +165,7 @@ def draw(
             'sines',
             'Error over frequency',
             'Steady state of each sine: rms error in % of its stroke, with and without G.',
-            lambda: sines_figure(sines_of(runs), identification.noise_floor),
+            lambda: sines_figure(sines_of(runs), _floor_of_sines(identification, runs)),
         ),
         (
             'loops',

@@ -140,8 +140,9 @@ def draw_diagnosis(
         (
             'coherence',
             'Does the residual follow the voltage?',
-            f'{SAME} Coherence with the voltage, and correlation with it and its rate at a lag; '
-            'what stands out of its band is not noise.',
+            f'{SAME} Coherence with the voltage, and correlation with it and its rate at a lag. '
+            'Noise alone leaves the band of the correlation in one case of a hundred, and the '
+            'bound of the coherence at one frequency of a hundred.',
             lambda: residual_correlation_figure(*analyses()),
         ),
         (

@@ -94,7 +94,9 @@ def residual_dependence_figure(
             plain_log(axes.xaxis, low, high)
         elif name == 'dv/dt':
             _signed_log(axes, _curves(before, name))
-        note(axes, f'explains {" → ".join(shares)} of the variance')
+        # means over lg t, in which a decade counts as much as any other
+        what = 'the means' if name == 'time since the step' else 'the variance'
+        note(axes, f'explains {" → ".join(shares)} of {what}')
         legend(axes)
     for axes in grid.ravel()[len(names) :]:
         axes.set_axis_off()
@@ -194,7 +196,7 @@ def residual_correlation_figure(
         axes.axhline(0.0, color='#555555', linewidth=0.6, zorder=1)
         axes.margins(x=0.0)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        note(axes, 'dashed: 99 % bands')
+        note(axes, 'dashed: 99 % band of all lags')
         if before.coherence is None:
             legend(axes)
     return fig

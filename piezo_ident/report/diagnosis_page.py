@@ -160,7 +160,7 @@ def _remains(diagnosis: Diagnosis) -> list[str]:
         )
     if smallest is not None:
         said.append(
-            f'An effect of {number(smallest)} % of stroke rms, or larger, would have been taken; '
-            'smaller ones may be there.'
+            f'An effect of {number(smallest)} % of stroke rms or larger that these data can show '
+            'would have been taken; smaller ones may be there.'
         )
     return [_paragraph(text) for text in said]

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.errors import DataError
+from piezo_ident.metrics import strokes
 from piezo_ident.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import (
@@ -153,14 +154,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
     """Return ``max y - min y`` of each record over all its parts [m]."""
-    ends: dict[str, tuple[float, float]] = {}
-    for part in parts:
-        low, high = ends.get(part.record, (np.inf, -np.inf))
-        ends[part.record] = (
-            min(low, float(part.piece.y.min())),
-            max(high, float(part.piece.y.max())),
-        )
-    return {name: high - low for name, (low, high) in ends.items()}
+    return strokes((part.record, part.piece.y) for part in parts)
 
 
 def block_means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:

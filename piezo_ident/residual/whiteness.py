@@ -86,9 +86,8 @@ class CrossCorrelation:
         By which the residual follows the input [s].
     correlation : ndarray, shape (m,)
     band : ndarray, shape (m,)
-        Within it 99 % of the values at one lag when the two have nothing to do with each other.
-    wide_band : ndarray, shape (m,)
-        Within it all lags together in 99 % of such cases.
+        Within it all lags together in 99 % of the cases in which the two have nothing to do with
+        each other.
     p_value : float
         Chance of the largest value at any lag.
     """
@@ -97,7 +96,6 @@ class CrossCorrelation:
     lag: NDArray[np.float64]
     correlation: NDArray[np.float64]
     band: NDArray[np.float64]
-    wide_band: NDArray[np.float64]
     p_value: float
 
     @property
@@ -257,14 +255,12 @@ def cross_correlation(
     r = products / scale
     # lags are not independent, so counting each errs on the safe side
     p_value = min(1.0, r.size * float(2.0 * stats.norm.sf(float(np.abs(r).max()) / std)))
-    narrow = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)) * std
     wide = float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / r.size)) * std
     return CrossCorrelation(
         input=which,
         lag=np.arange(-lags, lags + 1) * m / rate,
         correlation=r,
-        band=np.full(r.size, narrow),
-        wide_band=np.full(r.size, wide),
+        band=np.full(r.size, wide),
         p_value=p_value,
     )
 
