@@ -383,6 +383,7 @@ SINE = 'signal: sine, bias: 5, amplitude: 5, frequency: 10'
         ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: []}]', 'list is empty'),
         ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: [3, 11]}]', 'reaches 0 .. 11 V'),
         ('limits: [0, 5]\nsegments: [{signal: triangle, preset: paper}]', 'reaches 0 .. 9 V'),
+        ('limits: [0, 10]\nsegments: [{signal: triangle, preset: paper, slope: 60}]', 'own slope'),
         ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e9}]', 'make it shorter'),
         ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e-9}]', 'shorter than one sample'),
         (

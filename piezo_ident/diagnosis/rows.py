@@ -117,7 +117,7 @@ class Rows:
     def duration(self) -> float:
         """Time from the start of a record to its end, of the longest one [s]."""
         return max(
-            run.piece.duration + (run.piece.start_time - begin)
+            run.piece.duration + (run.piece.start_time - float(begin))
             for run, begin in zip(self.runs, self.begin, strict=True)
         )
 
