@@ -34,6 +34,7 @@ from piezo_ident.diagnosis.simulator import Added, retuned, Simulator, State
 from piezo_ident.dynamics import Dynamics
 from piezo_ident.errors import Cancelled, ConfigError, IdentificationError
 from piezo_ident.identification import identify
+from piezo_ident.model import EffectSetting
 from piezo_ident.model_io import model_from_dict, model_to_dict
 from piezo_ident.prediction import predict_record
 from piezo_ident.program import parse_program
@@ -304,6 +305,13 @@ def test_time_begins_with_the_record_whatever_its_clock_says(truths):
     np.testing.assert_allclose(there.time(0), piece.t, atol=1e-9)
     np.testing.assert_allclose(there.time(0, 5, 9), piece.t[5:9], atol=1e-9)
     assert there.duration == here.duration == piece.duration
+    # so does what a diagnosis left switched off, while what follows the clock goes on with it
+    hum = {'frequency': 50.0, 'harmonic': [1.0], 'phase': [0.0]}
+    for amplitude, begin in ((0.0, 600.0), (0.01, 0.0)):
+        setting = EffectSetting('periodic_disturbance', {**hum, 'amplitude': [amplitude]})
+        rows = make_rows(replace(model, effects=(setting,)), [epoch])
+        assert rows.begin.tolist() == [begin]
+        assert rows.duration == piece.duration
     # a gap is part of it
     two = Record((piece.cut(0, 50_000), piece.cut(100_000, piece.n)), 'two')
     assert make_rows(model, [two]).duration == pytest.approx(piece.duration)

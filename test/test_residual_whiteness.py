@@ -47,11 +47,11 @@ def test_false_alarms_of_the_cross_correlation(pole, name):
     for _ in range(40):
         e = lfilter([1], [1, -pole], rng.standard_normal(N + 2000))[2000:]
         found = cross_correlation([part(v, e)])
-        outside += np.mean(np.abs(found.correlation) > found.band) / 40
+        outside += np.any(np.abs(found.correlation) > found.band) / 40
         plain += np.mean(np.abs(found.correlation) > 2.58 / np.sqrt(N)) / 40
         alarms += found.related / 40
-    # nominal 1 %; neighbouring lags go together, so 40 series tell it only roughly
-    assert outside < 0.05
+    # nominal 1 % for all lags together, of which 40 series tell only the order of magnitude
+    assert outside <= 0.05
     assert alarms <= 0.05
     if pole:
         assert plain > 0.3

@@ -286,8 +286,9 @@ def _run(jobs: Sequence[Job], places: Places, tick: Callable[[], None]) -> Any:
 
 def _refuse_inputs(out: Path, named: Sequence[Path], jobs: Sequence[Job]) -> None:
     # its table would be taken for a record the next time
-    beside = {Path(job.path).resolve().parent for job in jobs}
-    if out.resolve() in beside | {path.resolve() for path in named}:
+    records = {Path(job.path).resolve() for job in jobs}
+    folders = {path.parent for path in records} | {path.resolve() for path in named}
+    if out.resolve() in records | folders:
         raise ConfigError(f'{out}: is where the records are; choose another folder for --each')
 
 

@@ -214,13 +214,7 @@ def _lasting(added: Added) -> Added:
 def _is_off(added: Added) -> bool:
     """Return whether nothing is left of an effect in another record."""
     effect = added.effect
-    return all(
-        np.array_equal(np.asarray(one), np.asarray(other))
-        for values in added.values
-        for one, other in zip(
-            effect.elsewhere(values).values(), effect.neutral(values).values(), strict=True
-        )
-    )
+    return all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
 
 
 def _silenced(effects: Sequence[Added]) -> tuple[Added, ...]:

@@ -62,7 +62,10 @@ class Rows:
         Names of the records.
     begin : ndarray, shape (runs,)
         When the record of each run began [s]: what drifts began with it, whatever its clock was
-        set to.  Zero where the model follows time already, which it does by the clock.
+        set to.  Zero where an effect of the model follows time already, which it does by the
+        clock.
+    duration : float
+        From the start of a record to its end, of the longest one [s].
     memories : tuple of callable
         Play outputs at the start of each run, as a function of the thresholds.
     m : int
@@ -87,6 +90,7 @@ class Rows:
     record: NDArray[np.int64]
     names: tuple[str, ...]
     begin: NDArray[np.float64]
+    duration: float
     memories: tuple[Memory, ...]
     m: int
     keep: tuple[NDArray[np.bool_], ...]
@@ -112,14 +116,6 @@ class Rows:
         # over rows, so that converter steps and noise are no travel
         travel = sum(float(np.abs(np.diff(means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
-
-    @property
-    def duration(self) -> float:
-        """Time from the start of a record to its end, of the longest one [s]."""
-        return max(
-            run.piece.duration + (run.piece.start_time - float(begin))
-            for run, begin in zip(self.runs, self.begin, strict=True)
-        )
 
     def time(self, i: int, start: int = 0, stop: int | None = None) -> NDArray[np.float64]:
         """
@@ -229,13 +225,16 @@ def make_rows(
     )
     block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
     group, group_labels = _groups(labels, np.bincount(block))
-    by_clock = any(find_effect(setting.name).time_driven for setting in model.effects)
     first_of = {run.record: run.piece.start_time for run in reversed(runs)}
+    begin = np.array([0.0 if _has_clock(model) else first_of[run.record] for run in runs])
     return Rows(
         runs=tuple(runs),
         record=record,
         names=names,
-        begin=np.zeros(len(runs)) if by_clock else np.array([first_of[r.record] for r in runs]),
+        begin=begin,
+        duration=max(
+            run.piece.duration + (run.piece.start_time - first_of[run.record]) for run in runs
+        ),
         memories=tuple(_memory(model, run) for run in runs),
         m=m,
         keep=keep,
@@ -248,6 +247,12 @@ def make_rows(
         labels=group_labels,
         stroke=_stroke(runs, bad),
     )
+
+
+def _has_clock(model: StageModel) -> bool:
+    """Return whether an effect of the model does more than it would in any other record."""
+    found = [(find_effect(setting.name), setting.parameters) for setting in model.effects]
+    return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
 def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None) -> float:

@@ -298,7 +298,8 @@ def afresh(
     M, prior = rest.J[:, rest.free], rest.prior[rest.free]
     base = (M, gram_of(rows, M, rest.e), prior)
     view, nothing = view_of(simulator, lines), np.zeros((rows.n, 0))
-    trials = list(score_trials(simulator, [own.effect], view, base, rest.e, now, nothing))
+    scored = score_trials(simulator, [own.effect], view, base, rest.e, now, nothing)
+    trials = [trial for trial in scored if trial.is_possible]
     trials.sort(key=lambda s: float(s.errors.sum()))
     for start in trials[:STARTS]:
         effects = [*others[:i], started(rows, start), *others[i:]]

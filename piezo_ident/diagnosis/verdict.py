@@ -240,7 +240,8 @@ def candidates_of(
 ) -> tuple[Candidate, ...]:
     """Return every candidate that was not added, its share when added alone, and why not."""
     first, last = rounds[0], rounds[-1]
-    refuted = [name for name in first.visible if name not in first.best]
+    possible = {name for one in rounds for name in one.best}
+    possible |= {*findings.effects, *(findings.group.names if findings.group else ())}
     left = max(first.before.mean_square - noise, 1e-300)
     shares = {
         name: (first.before.errors.sum() - s.errors.sum()) / rows.n / left
@@ -256,9 +257,9 @@ def candidates_of(
         value = float(np.clip(share, 0.0, 1.0))
         found.append(Candidate(name, value, _why_not(name, value, findings, last, rows.passes)))
     found += [
-        Candidate(name, 0.0, 'would show in these data, and does not')
-        for name in refuted
-        if first.visible[name] >= SWALLOWED and name not in findings.effects
+        Candidate(name, 0.0, 'these data speak against it')
+        for name, share in first.visible.items()
+        if share >= SWALLOWED and name not in possible
     ]
     return tuple(found)
 

@@ -234,6 +234,17 @@ class Effect:
         return checked
 
     @classmethod
+    def is_neutral(cls, values: Mapping[str, Any]) -> bool:
+        """Return whether every parameter that has a neutral value is there: nothing is done."""
+        return cls.same(values, cls.neutral(values))
+
+    @classmethod
+    def same(cls, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        """Return whether two sets of values are equal."""
+        first, second = cls.check(one), cls.check(other)
+        return all(np.array_equal(x, second[name]) for name, x in first.items())
+
+    @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
         """
         Return what to expect of an effect that is driven by time in a record that nobody knows.

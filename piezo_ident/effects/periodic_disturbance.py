@@ -29,8 +29,8 @@ class PeriodicDisturbance(Effect):
     """
     Mains hum or a machine nearby: a sum of sines added to the displacement.
 
-    ``d(t) = sum_i A_i sin(2 pi m_i f t + phi_i)`` with a free base frequency f and the harmonics
-    m_i that are wanted.  Time is that of the sample clock, so the phase holds across the pieces
+    ``d(t) = sum_i A_i sin(2 pi m_i f t + phi_i)`` with a base frequency f and the harmonics m_i
+    that are wanted.  Time is that of the sample clock, so the phase holds across the pieces
     of a record but is another in each record.
 
     Notes

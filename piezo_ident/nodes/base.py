@@ -234,6 +234,13 @@ class LabNode(Node):
 
         self.create_service(Trigger, f'~/{name}', answer, qos_profile=QUESTIONS)
 
+    def _said(self, error: Exception) -> str:
+        """Return the reason why a thread ended; what nobody expected goes to the log too."""
+        if isinstance(error, PiezoIdentError):
+            return str(error)
+        _report(self, error, 'its work ends')
+        return repr(error)
+
     def await_listeners(self) -> None:
         """Wait a moment until the last status was heard."""
         self._status.wait_for_all_acked(Duration(seconds=0.1))

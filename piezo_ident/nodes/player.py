@@ -193,7 +193,7 @@ class PlayerNode(LabNode):
             )
         # nobody would hear of a thread that ends by itself
         except Exception as error:  # noqa: BLE001
-            reason = str(error) if isinstance(error, PiezoIdentError) else repr(error)
+            reason = self._said(error)
             if not replay.ready.is_set():
                 replay.refusal = reason
                 self._report('refused', reason, ERROR)

@@ -185,8 +185,7 @@ class RecorderNode(LabNode):
             )
         # nobody would hear of a thread that ends by itself
         except Exception as error:  # noqa: BLE001
-            known = isinstance(error, PiezoIdentError)
-            self._give_up(recording, taps, str(error) if known else repr(error))
+            self._give_up(recording, taps, self._said(error))
             return
         recording.path = str(writer.path)
         recording.opened.set()
@@ -195,7 +194,7 @@ class RecorderNode(LabNode):
             self._record(recording, taps, writer)
             writer.close()
         except Exception as error:  # noqa: BLE001
-            failure = str(error) if isinstance(error, PiezoIdentError) else repr(error)
+            failure = self._said(error)
         recording.failure, recording.size = failure, writer.size
         recording.end.set()
         recording.over.set()

@@ -209,9 +209,10 @@ class Taps:
             i for i in self._node.get_publishers_info_by_topic(tap.topic) if '/' in i.topic_type
         ]
         publishers = frozenset(bytes(i.endpoint_gid) for i in found)
-        tap.is_single = len(publishers) == 1 and publishers == tap.publishers
-        tap.follows &= tap.is_single
-        tap.publishers = publishers
+        with self._lock:
+            tap.is_single = len(publishers) == 1 and publishers == tap.publishers
+            tap.follows &= tap.is_single
+            tap.publishers = publishers
         if not found:
             if tap.request is not None:
                 return tap.request

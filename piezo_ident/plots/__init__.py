@@ -128,7 +128,7 @@ def _floor_of_sines(identification: Identification, runs: Sequence[FreeRun]) -> 
         if sine_frequency(s.label)
     ]
     floor = identification.noise_floor
-    if floor is None or not found or max(found) > ALIKE * min(found):
+    if floor is None or not found or max(found) > ALIKE * min(found) or max(found) == 0.0:
         return None
     return floor * identification.stroke / max(found)
 

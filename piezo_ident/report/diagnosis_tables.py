@@ -117,8 +117,7 @@ def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
 
 
 def _with(added: EffectSetting) -> str:
-    neutral = find_effect(added.name).neutral(added.parameters)
-    idle = _frozen(dict(added.parameters)) == _frozen(neutral)
+    idle = find_effect(added.name).is_neutral(added.parameters)
     return f'with {added.name}{", switched off" if idle else ""}'
 
 
