@@ -423,7 +423,8 @@ def main() -> int:
                 'how_often': f'1 run, {found.samples:,} samples, {load}',
                 'result': f'{lost}; memory in MB/h: {growth}; sample clock '
                 f'{1e6 * found.drift:+.1f} ± {1e6 * found.drift_error:.1f} µs/s against that of '
-                f'the machine; {found.late} blocks late; {found.parts} parts',
+                f'the machine, of whose schedule {found.slipped:.1f} s were lost where blocks '
+                f'came too late ({found.late}); {found.parts} parts',
                 'command': f'python benchmarks/reliability/soak.py --seconds {found.seconds:g}'
                 + (f' --factor {args.factor:g}' if args.factor != 1.0 else ''),
             }
