@@ -177,23 +177,20 @@ def test_an_excitation_that_is_killed_before_its_first_block(lab):
         assert lab.set('identifier', 'excitation_limit', 20.0)[0]
 
 
-def test_a_stage_that_never_answers(lab):
-    stage = lab.handle('stage')
-    assert lab.set('identifier', 'excitation_limit', 2.0)[0]
-    seen = run(lab, HIGH)
-    # before the first block
-    stage.send(signal.SIGSTOP)
-    try:
-        reason = ended(lab, seen, 'failed')
-        assert 'the stage has given no displacement for 2 s' in reason
-    finally:
-        seen = len(lab.collect('applied_voltage'))
-        stage.send(signal.SIGCONT)
-    assert lab.set('identifier', 'excitation_limit', 20.0)[0]
-    applied = lab.collect('applied_voltage')
-    # what was on its way to it comes now
-    lab.wait(lambda: len(applied) > seen and applied[-1].values[-1] == 0.0, '0 V')
-    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'the stage at rest')
+def test_a_stage_that_answers_no_block(graph):
+    half = {'sample_rate': 10_000.0, 'block_size': 500, 'subscribers': 2}
+    graph.start_all(
+        ('excitation', half, 'odd'),
+        ('stage', {}, 'odd'),
+        ('identifier', {**QUICK, 'excitation_limit': 2.0}, 'odd'),
+    )
+    assert graph.set('odd/identifier', 'program', HIGH)[0]
+    ok, reason = graph.call('odd/identifier/run')
+    assert ok, reason
+    graph.wait(lambda: graph.status('odd/identifier')['state'] == 'failed', 'the end of the run')
+    reason = graph.status('odd/identifier')['message']
+    assert 'the stage has given no displacement for 2 s, with none at all' in reason
+    assert graph.status('odd/stage')['level'] == '1'
 
 
 def test_an_identifier_that_is_killed_in_a_run(lab):
