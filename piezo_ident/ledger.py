@@ -27,10 +27,18 @@ from pathlib import Path
 from piezo_ident.batch import Outcome, Row
 from piezo_ident.errors import ConfigError, DataError
 
-__all__ = ['LEDGER', 'Ledger']
+__all__ = ['LEDGER', 'Ledger', 'unwritable']
 
 #: name of the file in the folder of results
 LEDGER = 'done.jsonl'
+
+
+def unwritable(path: Path, error: OSError) -> DataError:
+    """Return what to raise where a result cannot be written."""
+    return DataError(
+        f'{path}: cannot be written ({error.strerror or error}); choose a folder with room and '
+        'the right to write'
+    )
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ class Ledger:
         try:
             self.path.touch()
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise unwritable(self.path, error) from None
 
     def done(self, record: str, key: str) -> Row | None:
         """Return the row of a record that was good under the same key, None otherwise."""
@@ -149,14 +157,8 @@ class Ledger:
                 # file names need not be Unicode
                 file.write(f'{json.dumps(asdict(entry))}\n'.encode('utf-8', 'replace'))
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise unwritable(self.path, error) from None
         self._entries[row.record] = entry
-
-    def _unwritable(self, error: OSError) -> DataError:
-        return DataError(
-            f'{self.path}: cannot be written ({error.strerror or error}); choose a folder with '
-            'room and the right to write'
-        )
 
     def _size_of_whole_lines(self) -> int:
         # the last one of a run that was killed may be half written

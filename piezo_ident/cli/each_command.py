@@ -36,7 +36,7 @@ from piezo_ident.cli.outputs import check_folder
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.errors import ConfigError, DataError
 from piezo_ident.executors import cluster, cores, Places, run_all
-from piezo_ident.ledger import Ledger
+from piezo_ident.ledger import Ledger, unwritable
 from piezo_ident.model_io import load_model, model_to_yaml, write_text
 from piezo_ident.results import Settings
 from piezo_ident.spread import in_order, QUANTITIES, Spread, spread_of
@@ -189,7 +189,7 @@ class _Folder:
         try:
             self.models.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise _unwritable(self.path, error) from None
+            raise unwritable(self.path, error) from None
 
     def holds(self, job: Job) -> bool:
         """Whether the files of a record that is done are still there."""
@@ -216,14 +216,7 @@ class _Folder:
                 work.chmod(0o755)
                 work.rename(target)
         except OSError as error:
-            raise _unwritable(target, error) from None
-
-
-def _unwritable(path: Path, error: OSError) -> DataError:
-    return DataError(
-        f'{path}: cannot be written ({error.strerror or error}); choose a folder with room and '
-        'the right to write'
-    )
+            raise unwritable(target, error) from None
 
 
 def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Console) -> None:

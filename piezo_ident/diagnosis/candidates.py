@@ -102,8 +102,9 @@ def view_of(simulator: Simulator, lines: Sequence[float] = ()) -> View:
         duration=rows.duration,
         # of all that have it: the axis may rest in one of them
         channels={
-            name: (float(np.concatenate(x).mean()), float(np.concatenate(x).std()))
-            for name, x in channels.items()
+            name: (float(x.mean()), float(x.std()))
+            for name, parts in channels.items()
+            for x in (np.concatenate(parts),)
         },
         lines=tuple(lines),
         modes=tuple(model.dynamics.modes(model.sample_rate)),

@@ -42,7 +42,7 @@ from piezo_ident.diagnosis.fit import (
 )
 from piezo_ident.diagnosis.handles import RETUNING
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
-from piezo_ident.diagnosis.rows import make_rows, Rows
+from piezo_ident.diagnosis.rows import centred, make_rows, Rows
 from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, PASSES, SMALLEST, takes
@@ -161,7 +161,6 @@ def _diagnosed(
         except (IdentificationError, ModelError, np.linalg.LinAlgError) as error:
             how = f'what was found could not be fitted to the rest ({error})'
     progress('verdict', 0.0)
-    outside = tuple(warning for record in whole for warning in model.extrapolation(record))
     result = assemble(
         simulator,
         given,
@@ -179,19 +178,17 @@ def _diagnosed(
         # where no line stands out there is nothing to fit
         searched=(HUM,) if found.highest > 0.0 else (),
     )
-    result = replace(result, warnings=(*result.warnings, *outside))
+    further = [warning for record in whole for warning in model.extrapolation(record)]
     if is_long:
-        said = _said(model, result.model, whole, records, how, progress)
-        result = replace(result, warnings=(*result.warnings, said))
+        further.append(_said(model, result.model, whole, records, how, progress))
     progress('verdict', 1.0)
-    return result
+    return replace(result, warnings=(*result.warnings, *further))
 
 
 def _check_related(rows: Rows, base: Fitted) -> None:
     """Refuse displacement that does not follow the voltage: no effect is missing, the stage is."""
     swing = max(float(np.ptp(run.u)) for run in rows.runs)
-    mean = np.bincount(rows.of_record, rows.x) / np.bincount(rows.of_record)
-    moved = float(np.mean((rows.x - mean[rows.of_record]) ** 2))
+    moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
     # where the voltage only trembles all else may well be larger
     if swing > TREMBLES and base.mean_square > UNRELATED * moved:
         raise IdentificationError(

@@ -35,7 +35,7 @@ from piezo_ident.play import initial_memory
 from piezo_ident.record import Record
 from piezo_ident.runs import Run, runs_of
 
-__all__ = ['Rows', 'make_rows']
+__all__ = ['Rows', 'centred', 'make_rows']
 
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
@@ -160,6 +160,12 @@ def means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
     n = x.size // m
     # a product with a vector is several times faster than a mean along a short axis
     return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
+
+
+def centred(x: NDArray[np.float64], of_record: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return rows without the mean of the record that each belongs to."""
+    mean = np.bincount(of_record, x) / np.bincount(of_record)
+    return np.asarray(x - mean[of_record])
 
 
 def make_rows(

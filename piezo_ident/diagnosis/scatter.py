@@ -25,7 +25,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.fit import Fitted
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = ['SCATTER', 'refit_holds', 'standard_errors']
 
@@ -74,8 +74,7 @@ def refit_holds(rows: Rows, given: NDArray[np.float64], base: Fitted) -> bool:
     base : Fitted
         Without effects.
     """
-    shift = np.bincount(rows.of_record, given) / np.bincount(rows.of_record)
-    squares = (given - shift[rows.of_record]) ** 2
+    squares = centred(given, rows.of_record) ** 2
     before = np.bincount(rows.block, squares, minlength=rows.group.size)
     if standard_errors(before - base.transfer) < SCATTER:
         return False
