@@ -97,10 +97,11 @@ class Answers:
                 found = subscription.handle.take_message(Float64MultiArray, False)
                 if found is None:
                     continue
+                # rows of time and value: what is in them was dealt with
                 data = found[0].data
-                # rows of time and value: that of the last row tells how far it is
-                if len(data) >= 2 and math.isfinite(data[-2]):
-                    self.flow.heard(topic, data[-2])
+                for t in (data[0], data[-2]) if len(data) >= 2 else ():
+                    if math.isfinite(t):
+                        self.flow.heard(topic, t)
         return self.flow.ahead
 
     def wait(self, most: int, limit: float, pause: Callable[[float], None]) -> None:

@@ -87,7 +87,7 @@ class IdentifierNode(LabNode):
             self._take_file(self.values['model'])
         self._counted, self._counted_at = 0, time.monotonic()
         self._passed: dict[str, int] = {}
-        self._newest = Samples(np.empty(0), np.empty(0))
+        self._newest: dict[str, Samples] = {}
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
         self._captured = self.create_publisher(Float64MultiArray, 'captured', STREAM)
@@ -121,7 +121,7 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        if self._intake.drain() and self._newest.t.size:
+        if self._intake.drain() and self._newest:
             self._answer()
 
     def _take(
@@ -142,15 +142,16 @@ class IdentifierNode(LabNode):
         self._capture.add(key or samples.quantity, samples, arrival)
         self._passed[topic] = self._passed.get(topic, 0) + samples.t.size
         if key in ('voltage', 'displacement') and samples.t.size:
-            self._newest = samples
+            self._newest[key] = samples
 
     def _answer(self) -> None:
         """Tell how far the capture is, so that a fast sender does not run away from it."""
         taken = min(self._passed.get('voltage', 0), self._passed.get('displacement', 0))
-        row = Samples(
-            self._newest.t[-1:], np.array([float(taken)]), self._newest.segment, 'captured'
-        )
-        self._captured.publish(to_message(row))
+        # of each stream: either may be a block ahead, which the sender may know of one alone
+        newest = [self._newest[k] for k in ('voltage', 'displacement') if k in self._newest]
+        t = np.array([samples.t[-1] for samples in newest])
+        rows = Samples(t, np.full(t.size, float(taken)), newest[-1].segment, 'captured')
+        self._captured.publish(to_message(rows))
 
     def _streams(self) -> Streams:
         c = self._capture

@@ -130,7 +130,8 @@ TOPICS = (
         ('identifier',),
         ('excitation', 'player'),
         _STREAM,
-        'one row, every 20 ms while blocks come: t of the newest sample, samples of both streams',
+        'every 20 ms while they come, rows for voltage and displacement: t of its newest sample, '
+        'samples of both streams',
     ),
     Topic('prediction', ARRAY, ('model',), ('excitation', 'player'), _STREAM, 'blocks of (t, m)'),
     Topic(

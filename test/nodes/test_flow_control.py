@@ -42,15 +42,15 @@ segments:
 """
 
 
-def bag(path: Path) -> Path:
-    """Write a bag of N pairs of blocks that came at once."""
+def bag(path: Path, n: int = N, order: tuple[str, ...] = ('voltage', 'displacement')) -> Path:
+    """Write a bag of n pairs of blocks that came at once."""
     writer = BagWriter(path)
-    for quantity in ('voltage', 'displacement'):
+    for quantity in order:
         writer.add_topic(f'/{quantity}', MESSAGE_TYPE)
-    for k in range(N):
+    for k in range(n):
         t = np.arange(100 * k, 100 * (k + 1)) / FS
-        for quantity, scale in (('voltage', 1.0), ('displacement', 1e-6)):
-            block = Samples(t, scale * np.sin(t), 'noise', quantity)
+        for quantity in order:
+            block = Samples(t, 1e-6 * np.sin(t), 'noise', quantity)
             writer.write(f'/{quantity}', 10**18 + 50_000 * k, serialize_message(to_message(block)))
     writer.close()
     return path
@@ -107,6 +107,20 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
         ):
             ok, why = g.set('player', 'answers', value)
             assert not ok and reason in why
+
+
+def test_a_displacement_that_is_recorded_before_its_voltage(tmp_path):
+    # the newest that the identifier has is then later than any voltage that is on its way
+    path = bag(tmp_path / 'bag', 50, ('displacement', 'voltage'))
+    with Graph() as g:
+        g.collect('captured')
+        g.start('identifier')
+        g.start('player', {'bag': str(path), 'rate': 100.0, 'wait_limit': 5.0, 'in_flight': 1})
+        g.matched('captured')
+        _, status = play(g, 'player')
+        assert (status['state'], status['messages']) == ('done', '100'), status['message']
+        assert 'not answered' not in status['message']
+        g.wait(lambda: captured(g) == 100 * 50, 'all samples')
 
 
 def test_the_whole_graph_as_fast_as_all_answer(tmp_path):
