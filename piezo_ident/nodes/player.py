@@ -21,9 +21,10 @@ from its start.  Only the measured topics are replayed unless `topics` says othe
 
 Nothing is sent before every topic has met as many subscribers as `subscribers` says.  Whoever
 answers on one of the topics `answers` - the identifier on `captured`, the model on `prediction` -
-is never overrun: no more than `in_flight` blocks of the first topic are on their way to it, and
-the replay is done when it has answered the last one.  Where somebody publishes the first of these
-topics he has to answer; the others are waited for from their first answer on.
+is never overrun: no more than `in_flight` blocks of the voltage (of the first topic, where the
+voltage is not replayed) are on their way to it, and the replay is done when it has answered the
+last one.  Where somebody publishes the first of these topics he has to answer; the others are
+waited for from their first answer on.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ class PlayerNode(LabNode):
                 answers = Answers(self, self.values['answers'].split())
                 try:
                     self._await_subscribers(replay, senders)
-                    lead = next((t for t in chosen if _is_block(bag, t)), '')
+                    lead = _lead(bag, chosen)
                     clock = self._send(replay, bag, senders, answers, lead)
                     open_end = self._await_last(replay, answers)
                 finally:
@@ -357,8 +358,11 @@ def _span(bag: Bag, connection: Connection, raw: bytes) -> tuple[float, float] |
     return float(message.data[0]), float(message.data[-2])
 
 
-def _is_block(bag: Bag, topic: str) -> bool:
-    return any(c.topic == topic and c.msgtype == MESSAGE_TYPE for c in bag.connections)
+def _lead(bag: Bag, chosen: Mapping[str, str]) -> str:
+    """Return the topic that is answered: the voltage, as every listener goes by its times."""
+    blocks = {c.topic for c in bag.connections if c.msgtype == MESSAGE_TYPE}
+    found = [topic for topic in chosen if topic in blocks]
+    return min(found, key=lambda t: chosen[t].rpartition('/')[2] != 'voltage', default='')
 
 
 def _profile(connection: Connection) -> QoSProfile:

@@ -109,18 +109,28 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
             assert not ok and reason in why
 
 
-def test_a_displacement_that_is_recorded_before_its_voltage(tmp_path):
-    # the newest that the identifier has is then later than any voltage that is on its way
-    path = bag(tmp_path / 'bag', 50, ('displacement', 'voltage'))
+@pytest.mark.parametrize(
+    ('listener', 'order', 'answer'),
+    [
+        ('identifier', ('displacement', 'voltage'), 'captured'),
+        # the model goes by the voltage, whichever is named first
+        ('model', ('voltage', 'displacement'), 'prediction'),
+    ],
+)
+def test_a_stream_that_is_a_block_ahead(tmp_path, listener, order, answer):
+    # what a listener has at last may then be later than any block that it has not answered
+    path = bag(tmp_path / 'bag', 50, order)
+    save_model(load_stage(find_config('paper', 'stage')).model, tmp_path / 'model.yaml')
     with Graph() as g:
-        g.collect('captured')
-        g.start('identifier')
-        g.start('player', {'bag': str(path), 'rate': 100.0, 'wait_limit': 5.0, 'in_flight': 1})
-        g.matched('captured')
+        blocks = g.collect(answer)
+        g.start(listener, {'model': str(tmp_path / 'model.yaml')})
+        parameters = {'bag': str(path), 'rate': 100.0, 'wait_limit': 5.0, 'in_flight': 1}
+        g.start('player', {**parameters, 'topics': ['displacement', 'voltage']})
+        g.matched(answer)
         _, status = play(g, 'player')
         assert (status['state'], status['messages']) == ('done', '100'), status['message']
         assert 'not answered' not in status['message']
-        g.wait(lambda: captured(g) == 100 * 50, 'all samples')
+        g.wait(lambda: blocks and blocks[-1].t[-1] == (100 * 50 - 1) / FS, 'the last answer')
 
 
 def test_the_whole_graph_as_fast_as_all_answer(tmp_path):
