@@ -64,9 +64,13 @@ class BagWriter:
         Format.
     custom_data : mapping of str to str, optional
         For the bag's metadata.
+    number : int, optional
+        The first one that is tried behind the name; 0: the name itself.
 
     Attributes
     ----------
+    number : int
+        The one behind the name, 0 where there is none.
     path, file : Path
         The folder that was made, and the file in it.
     messages : int
@@ -90,8 +94,10 @@ class BagWriter:
         path: str | Path,
         storage: str = 'mcap',
         custom_data: Mapping[str, str] | None = None,
+        number: int = 0,
     ) -> None:
         self.messages = 0
+        self.number = number
         self._storage = storage
         self._topics: dict[str, Connection] = {}
         self._writer = self._opened(Path(path).expanduser())
@@ -114,7 +120,7 @@ class BagWriter:
     def _opened(self, path: Path) -> Writer:
         # made whole, so that a later change of the working directory changes nothing
         path = Path(os.path.abspath(path))
-        for number in range(NAMES):
+        for number in range(self.number, self.number + NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
             try:
                 if place.exists() or place.is_symlink():
@@ -131,6 +137,7 @@ class BagWriter:
                     f'{place}: cannot be written ({reason}); choose a place with room and the '
                     'right to write'
                 ) from None
+            self.number = number
             return writer
         raise DataError(f'{path}: this name and {NAMES} numbered ones are taken; choose another')
 
@@ -289,10 +296,12 @@ class PartWriter:
 
     def _next(self) -> BagWriter:
         path, storage, custom = self._make
+        number = self._bag.number + 1 if self.parts else 0
         if self.max_size:
             name = self.parts[0].name if self.parts else ''
             custom = {**custom, 'part': str(len(self.parts)), 'recording': name}
-        bag = BagWriter(path, storage, custom)
+        # a week has more parts than names are tried
+        bag = BagWriter(path, storage, custom, number)
         self.parts.append(bag.path)
         for topic, (message_type, qos) in self._topics.items():
             bag.add_topic(topic, message_type, qos)

@@ -67,6 +67,15 @@ def test_parts_are_whole_bags_that_follow_each_other(tmp_path, storage):
     assert np.array_equal(np.rint(np.concatenate(t) * RATE), np.arange(6000))
 
 
+def test_more_parts_than_names_are_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr('piezo_ident.bag_writer.NAMES', 2)
+    (tmp_path / 'bag_1').mkdir()
+    writer = recorded(tmp_path / 'bag', 'mcap', 30_000)
+    writer.close()
+    assert len(writer.parts) > 3
+    assert [p.name for p in writer.parts[:3]] == ['bag', 'bag_2', 'bag_3']
+
+
 def test_without_a_size_there_is_one_bag_without_part(tmp_path):
     writer = recorded(tmp_path / 'bag', 'mcap', 0)
     writer.close()

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 from piezo_ident.follower import Follower, Kind
-from piezo_ident.pacing import BlockClock, SLIP
+from piezo_ident.pacing import BlockClock, LogClock, SLIP
 from piezo_ident.wire_format import Samples
 import pytest
 
@@ -156,3 +156,43 @@ def test_a_clock_does_not_drift_but_slips_after_a_long_delay():
     assert clock.due(400) == pytest.approx(due + SLIP + 0.1)
     assert clock.worst == pytest.approx(SLIP + 0.1)
     assert BlockClock(0.0, 5.0).due(10**9) == 5.0
+
+
+class Machine:
+    """A machine whose clock can be set."""
+
+    def __init__(self):
+        self.steady, self.ahead = 5 * 10**9, 1_700_000_000 * 10**9
+
+    def wall(self):
+        return self.steady + self.ahead
+
+    def clock(self):
+        return LogClock(self.wall, lambda: self.steady)
+
+
+@pytest.mark.parametrize('step', [-3_600.0, -1.0, -0.02, 0.02, 1.0, 86_400.0])
+def test_log_times_go_on_evenly_when_the_clock_is_set(step):
+    machine = Machine()
+    clock, stamps, waiting = machine.clock(), [], []
+    for k in range(100):
+        # a block every 5 ms, taken every 20 ms; the clock is set between two of them
+        machine.steady += 5_000_000
+        if k in (41, 70):
+            machine.ahead += int(step * 1e9)
+        waiting.append(machine.wall())
+        if k % 4 == 3:
+            clock.look()
+            stamps += [clock.stamp(arrival) for arrival in waiting]
+            waiting = []
+    assert np.all(np.diff(stamps) == 5_000_000)
+    assert clock.set_by == 2 * int(step * 1e9)
+
+
+def test_log_times_are_those_of_arrival_while_nobody_sets_the_clock():
+    machine = Machine()
+    clock = machine.clock()
+    # a clock that is slowed down is followed by the steady one too; what is left is no step
+    machine.ahead += 400_000
+    clock.look()
+    assert clock.stamp(machine.wall()) == machine.wall() and clock.set_by == 0

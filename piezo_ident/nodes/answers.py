@@ -86,6 +86,11 @@ class Answers:
         }
 
     @property
+    def topics(self) -> tuple[str, ...]:
+        """What is listened to."""
+        return tuple(self._ears)
+
+    @property
     def published(self) -> tuple[str, ...]:
         """Topics that somebody publishes."""
         return tuple(t for t, ear in self._ears.items() if ear.get_publisher_count())

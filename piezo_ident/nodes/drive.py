@@ -95,6 +95,11 @@ class Drive:
         return bool(self._phase)
 
     @property
+    def is_starting(self) -> bool:
+        """Whether the excitation was asked to start and has not answered yet."""
+        return self._phase == 'starting'
+
+    @property
     def is_possible(self) -> bool:
         """Whether an excitation and a stage are there, as far as is known now."""
         ready = self._set.service_is_ready() and self._start.service_is_ready()
@@ -120,7 +125,7 @@ class Drive:
             Called once with None when the programme was captured to its end, else with the
             reason; not called after `stop`.
         begin : callable, optional
-            Called right before the excitation is asked to start.
+            Called once the excitation has agreed to start.
         """
         self._program, self._limit = program, limit
         self._begin, self._ended = begin or _nothing, ended
@@ -185,7 +190,6 @@ class Drive:
         if not result.successful:
             self._end(f'the excitation refuses the programme: {result.reason}')
             return
-        self._begin()
         self._first, self._active, self._done = self._streams(), False, 0.0
         self._seen, self._stage_sign = self._first, time.monotonic()
         self._state, self._message = _UNHEARD, ''
@@ -201,6 +205,7 @@ class Drive:
             self._phase = 'refused'
             self._end(f'the excitation does not start: {answer.message}')
             return
+        self._begin()
         self._phase, self._sign = 'playing', time.monotonic()
         # the status may have come before the answer
         self._active = self._state not in (*_RESTING, _UNHEARD)

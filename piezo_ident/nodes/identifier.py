@@ -88,6 +88,7 @@ class IdentifierNode(LabNode):
         self._counted, self._counted_at = 0, time.monotonic()
         self._passed: dict[str, int] = {}
         self._newest: dict[str, Samples] = {}
+        self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
         self._captured = self.create_publisher(Float64MultiArray, 'captured', STREAM)
@@ -121,10 +122,22 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
+        if not self._drive.is_starting:
+            while self._held:
+                self._keep(*self._held.popleft())
         if self._intake.drain() and self._newest:
             self._answer()
 
     def _take(
+        self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
+    ) -> None:
+        # what was captured before a run is forgotten once it has begun, and kept if it does not
+        if self._drive.is_starting:
+            self._held.append((topic, key, message, info))
+        else:
+            self._keep(topic, key, message, info)
+
+    def _keep(
         self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
     ) -> None:
         try:
@@ -178,6 +191,8 @@ class IdentifierNode(LabNode):
 
     def _poll(self) -> None:
         if self._drive.running:
+            # a run that has ended is identified from all of it
+            self._drain()
             self._drive.poll()
         if self._drive.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''

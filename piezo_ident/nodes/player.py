@@ -118,7 +118,10 @@ class PlayerNode(LabNode):
             raise PiezoIdentError('no bag is named; set the parameter bag')
         self._halt()
         replay = Replay(self.values['bag'], tuple(self.values['topics']))
-        replay.thread = threading.Thread(target=self._work, args=(replay,), name='replay')
+        # a daemon: while a large bag is looked through nothing is lost by an end
+        replay.thread = threading.Thread(
+            target=self._work, args=(replay,), name='replay', daemon=True
+        )
         self._replay = replay
         replay.thread.start()
         replay.ready.wait(PATIENCE)
@@ -177,10 +180,10 @@ class PlayerNode(LabNode):
                 replay.names = ', '.join(chosen.values())
                 replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
                 replay.ready.set()
-                answers = Answers(self, self.values['answers'].split())
+                lead = self._lead(bag, chosen)
+                answers = Answers(self, self._answering(chosen, lead))
                 try:
                     self._await_subscribers(replay, senders)
-                    lead = _lead(bag, chosen)
                     clock = self._send(replay, bag, senders, answers, lead)
                     open_end = self._await_last(replay, answers)
                 finally:
@@ -226,6 +229,22 @@ class PlayerNode(LabNode):
         if not any(c.msgcount for c in bag.connections if c.topic in senders):
             raise DataError(f'{bag.path}: no messages on {", ".join(chosen)}; name another bag')
         return senders
+
+    def _lead(self, bag: Bag, chosen: Mapping[str, str]) -> str:
+        """Return the topic that is answered: the voltage, as every listener goes by its times."""
+        blocks = {c.topic for c in bag.connections if c.msgtype == MESSAGE_TYPE}
+        found = [topic for topic in chosen if topic in blocks]
+        voltage = self.resolve_topic_name('voltage')
+        return min(found, key=lambda topic: chosen[topic] != voltage, default='')
+
+    def _answering(self, chosen: Mapping[str, str], lead: str) -> list[str]:
+        """Return the topics on which answers may come: not from here, and to what is measured."""
+        measured = {self.resolve_topic_name(name) for name in ('voltage', 'displacement')}
+        if chosen.get(lead) not in measured:
+            return []
+        replayed = set(chosen.values())
+        names = self.values['answers'].split()
+        return [name for name in names if self.resolve_topic_name(name) not in replayed]
 
     def _await_subscribers(self, replay: Replay, senders: Mapping[str, Any]) -> None:
         """
@@ -298,9 +317,8 @@ class PlayerNode(LabNode):
 
     def _hear(self, replay: Replay, answers: Answers, span: tuple[float, float]) -> None:
         """Let the first block stand alone, so that nobody is overrun who was not heard yet."""
-        first = next(iter(self.values['answers'].split()), '')
-        if first in answers.published:
-            answers.flow.expect(first)
+        if answers.topics and answers.topics[0] in answers.published:
+            answers.flow.expect(answers.topics[0])
         answers.flow.sent(*span)
         alone = time.monotonic() + HEAR
         while answers.published and not answers.flow.answering and time.monotonic() < alone:
@@ -356,13 +374,6 @@ def _span(bag: Bag, connection: Connection, raw: bytes) -> tuple[float, float] |
     if message.data.size < 2 or not np.isfinite(message.data[[0, -2]]).all():
         return None
     return float(message.data[0]), float(message.data[-2])
-
-
-def _lead(bag: Bag, chosen: Mapping[str, str]) -> str:
-    """Return the topic that is answered: the voltage, as every listener goes by its times."""
-    blocks = {c.topic for c in bag.connections if c.msgtype == MESSAGE_TYPE}
-    found = [topic for topic in chosen if topic in blocks]
-    return min(found, key=lambda t: chosen[t].rpartition('/')[2] != 'voltage', default='')
 
 
 def _profile(connection: Connection) -> QoSProfile:

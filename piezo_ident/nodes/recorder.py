@@ -46,8 +46,10 @@ __all__ = ['RecorderNode', 'main']
 POLL = 0.02
 #: how often publishers are looked for [s]
 LOOK = 0.1
-#: how long a start may take before it is answered, and a stop before the node ends anyway [s]
+#: how long a start may take before it is answered [s]
 PATIENCE = 1.5
+#: how long a bag may take to be closed before the node ends anyway, as ros2 launch has it [s]
+END = 4.0
 #: how long the subscriptions may take to meet the publishers that are there [s]
 MATCH_LIMIT = 2.0
 
@@ -141,7 +143,7 @@ class RecorderNode(LabNode):
         if self._recording is not None:
             self._recording.end.set()
         if self._thread is not None:
-            self._thread.join(PATIENCE)
+            self._thread.join(END)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return what the recording takes in."""

@@ -191,7 +191,7 @@ class StageNode(LabNode):
         self._say()
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
-        verdict = self._follower.judge(samples, sequence, self._count_publishers())
+        verdict = self._follower.judge(samples, sequence, self._count_publishers(samples))
         kind = verdict.kind
         if not verdict.is_taken:
             self._blame(kind.value, f'a block is refused: {verdict.reason}')
@@ -218,10 +218,13 @@ class StageNode(LabNode):
         self._counts['samples'] += samples.t.size
         self._state, self._segment = 'running', samples.segment
 
-    def _count_publishers(self) -> int:
-        # asking costs more than a block: once every tenth of a second will do
-        now = time.monotonic()
-        if now > self._recount or not self._sources:
+    def _count_publishers(self, samples: Samples) -> int:
+        # asking costs more than a block: of one that goes on where the last one ended, once every
+        # tenth of a second will do
+        now, head = time.monotonic(), self._follower.head
+        first = samples.t[0] * self.sample_rate if samples.t.size else float('nan')
+        goes_on = head is not None and abs(first - head) < 0.5
+        if now > self._recount or not goes_on or not self._sources:
             self._sources = self._input.get_publisher_count()
             self._recount = now + 0.1
         return self._sources

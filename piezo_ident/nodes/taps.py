@@ -31,6 +31,7 @@ from piezo_ident.bag_writer import knows_type, LossCount
 from piezo_ident.errors import PiezoIdentError
 from piezo_ident.nodes.interfaces import ARRAY, TOPICS
 from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.pacing import LogClock
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
@@ -170,6 +171,7 @@ class Taps:
         self._group = Aside()
         self._lock = threading.Lock()
         self._closed = False
+        self._clock = LogClock()
 
     @property
     def lost(self) -> int:
@@ -178,8 +180,12 @@ class Taps:
 
     @property
     def problems(self) -> str:
-        """Why a topic is not recorded, empty when all are."""
-        return '; '.join(tap.problem for tap in self._taps.values() if tap.problem)
+        """Why a topic is not recorded, and a clock that was set; empty when all is well."""
+        said = [tap.problem for tap in self._taps.values() if tap.problem]
+        if self._clock.set_by:
+            moved = f'the clock of this machine was set by {self._clock.set_by * 1e-9:+.3g} s'
+            said.append(f'{moved}; log times go on as before')
+        return '; '.join(said)
 
     def look(self) -> bool:
         """Subscribe to what has come; return whether all publishers that are there are met."""
@@ -263,6 +269,7 @@ class Taps:
     def arrived(self) -> list[tuple[int, str, bytes]]:
         """Return log time, topic and bytes of what has arrived, in the order of arrival."""
         messages = []
+        self._clock.look()
         with self._lock:
             for tap in self._taps.values():
                 if tap.subscription is None:
@@ -278,7 +285,8 @@ class Taps:
                     number = info['publication_sequence_number'] or 0
                     tap.losses.note(number, alone=tap.follows)
                     tap.follows = tap.is_single
-                    messages.append((info['received_timestamp'] or time.time_ns(), tap.topic, raw))
+                    arrival = info['received_timestamp'] or time.time_ns()
+                    messages.append((self._clock.stamp(arrival), tap.topic, raw))
         messages.sort(key=lambda m: m[0])
         return messages
 

@@ -15,6 +15,7 @@
 
 """Faster than real time on a running graph: whoever answers is never overrun."""
 
+from collections.abc import Mapping
 from pathlib import Path
 import signal
 
@@ -42,14 +43,21 @@ segments:
 """
 
 
-def bag(path: Path, n: int = N, order: tuple[str, ...] = ('voltage', 'displacement')) -> Path:
-    """Write a bag of n pairs of blocks that came at once."""
+def bag(
+    path: Path,
+    n: int = N,
+    order: tuple[str, ...] = ('voltage', 'displacement'),
+    ends: Mapping[str, int] = {},
+) -> Path:
+    """Write a bag of n blocks of each that came at once; some end before."""
     writer = BagWriter(path)
     for quantity in order:
         writer.add_topic(f'/{quantity}', MESSAGE_TYPE)
     for k in range(n):
         t = np.arange(100 * k, 100 * (k + 1)) / FS
         for quantity in order:
+            if k >= ends.get(quantity, n):
+                continue
             block = Samples(t, 1e-6 * np.sin(t), 'noise', quantity)
             writer.write(f'/{quantity}', 10**18 + 50_000 * k, serialize_message(to_message(block)))
     writer.close()
@@ -131,6 +139,28 @@ def test_a_stream_that_is_a_block_ahead(tmp_path, listener, order, answer):
         assert (status['state'], status['messages']) == ('done', '100'), status['message']
         assert 'not answered' not in status['message']
         g.wait(lambda: blocks and blocks[-1].t[-1] == (100 * 50 - 1) / FS, 'the last answer')
+
+
+def test_a_replay_does_not_wait_for_what_it_sends_itself(tmp_path):
+    # predictions that end early, as where a model node was ended
+    path = bag(
+        tmp_path / 'bag', 100, ('voltage', 'displacement', 'prediction'), {'prediction': 20}
+    )
+    with Graph() as g:
+        g.collect('captured')
+        g.collect('prediction')
+        g.start('identifier')
+        parameters = {'bag': str(path), 'rate': 100.0, 'wait_limit': 5.0, 'in_flight': 5}
+        g.start('player', {**parameters, 'topics': ['voltage', 'displacement', 'prediction']})
+        g.matched('captured')
+        _, status = play(g, 'player')
+        assert (status['state'], status['messages']) == ('done', '220'), status['message']
+        assert 'not answered' not in status['message']
+        g.wait(lambda: captured(g) == 100 * 100, 'all samples')
+        # to what nobody measures nobody answers
+        assert g.set('player', 'topics', ['prediction'])[0]
+        _, status = play(g, 'player')
+        assert (status['state'], status['messages']) == ('done', '20'), status['message']
 
 
 def test_the_whole_graph_as_fast_as_all_answer(tmp_path):
