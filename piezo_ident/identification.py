@@ -257,7 +257,8 @@ def _either(
     progress: Progress,
 ) -> tuple[DelayResult, DynamicsResult, Dynamics]:
     """Return delay and G with the delay of the steps or of the scan, whichever errs less."""
-    other = replace(delay, samples=delay.scan or 0, source='scan')
+    # the loss was scanned in whole samples
+    other = replace(delay, samples=delay.scan or 0, std=0.5, source='scan')
     result, other_G = second_step(runs, Delay(other.samples), settings, progress)
     # slow noise is averaged out of few steps badly; a free run does not care who was right
     if min(result.methods.values()) < min(dynamics.methods.values()):

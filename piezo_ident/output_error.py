@@ -83,6 +83,17 @@ class OutputErrorFit:
     iterations: int
     improved: bool
 
+    @property
+    def normalised_covariance(self) -> NDArray[np.float64]:
+        """Covariance of (a, b) of ``dynamics.normalised()``, whose b depend on the gain."""
+        G, na = self.dynamics, self.dynamics.a.size
+        J = np.eye(na + G.b.size)
+        # b / g with the gain g = sum(b) / (1 + sum(a))
+        J[na:, :na] = (G.b / G.b.sum())[:, None]
+        J[na:, na:] -= (G.b / G.b.sum())[:, None]
+        J[na:, na:] /= G.gain
+        return np.asarray(J @ self.covariance @ J.T)
+
 
 Stretches = list[tuple[int, int]]
 

@@ -319,11 +319,14 @@ def refuse_closed_loop(record: Record) -> None:
                     f'creep of {creep:.2g} V a decade of time, '
                     f'{100.0 * creep / span:.2g} % of its range'
                 )
+                cause = 'a position controller was on'
+                if np.ptp(piece.y[(start + 1) * window : stop * window]) == 0.0:
+                    cause += ', or the sensor is at its stop, as it reads one value there'
                 raise IdentificationError(
                     f'{record.name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by '
                     f'{moved:.1%} of its range while the position moves by {followed:.2%} of its '
-                    'stroke: a position controller was on, so the position is no response to '
-                    f'the voltage{said}; record in open loop'
+                    f'stroke: {cause}, so the position is no response to the voltage{said}; '
+                    'record in open loop'
                 )
 
 

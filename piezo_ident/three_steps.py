@@ -308,9 +308,7 @@ def second_step(
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
     fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
-    G, gain = fit.dynamics.normalised(), fit.dynamics.gain
-    scale = np.concatenate([np.ones(G.a.size), np.full(G.b.size, 1.0 / gain)])
-    covariance = fit.covariance * np.outer(scale, scale)
+    G = fit.dynamics.normalised()
     progress('dynamics', 0.95)
     # the same regression on the measured and on the modelled answer: the plays that the noise
     # drags along count in both
@@ -330,7 +328,7 @@ def second_step(
             order=result.order,
             table=result.table,
             methods=result.methods,
-            covariance=covariance,
+            covariance=fit.normalised_covariance,
             response=response,
             bias=bias,
             slope_measured=slope_measured,
@@ -381,9 +379,11 @@ def _stretches(
             first, last = np.flatnonzero(use)[[0, -1]]
             part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
             w, y = delay.apply(H(run.u))[part], run.x[part]
-            # both sides pass the same filter, so G is still what leads from one to the other
-            sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
-            w, y = signal.sosfilt(sos, w - w[0]), signal.sosfilt(sos, y - y[:20].mean())
+            w, y = w - w[0], y - y[:20].mean()
+            if run.piece.sample_rate > 2.0 * SLOWEST:
+                # both sides pass the same filter, so G is still what leads from one to the other
+                sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
+                w, y = signal.sosfilt(sos, w), signal.sosfilt(sos, y)
             for stretches, mask in ((fitted, use & ~out), (held, use & out)):
                 if mask.any():
                     stretches.append(Stretch(w, y, mask[part]))

@@ -277,7 +277,7 @@ def joint_fit(
                 'seen; add a slow triangle',
             )
         )
-    covariance = np.zeros((1, 1)) if fit is None else fit.covariance
+    covariance = np.zeros((1, 1)) if fit is None else fit.normalised_covariance
     progress('dynamics', 1.0)
     return JointFit(
         delay=found,

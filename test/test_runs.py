@@ -199,4 +199,10 @@ def test_open_loop_passes():
     creep = np.concatenate([np.zeros(1001), 0.1 * np.log10(1 + np.arange(n))])
     refuse_closed_loop(record(piece(v, 7.5e-6 * (v + creep))))
     refuse_closed_loop(record(piece(np.zeros(100), np.zeros(100))))
+
+
+def test_a_sensor_at_its_stop_is_not_blamed_on_a_controller_alone():
+    v = np.concatenate([np.linspace(0, 10, 20_000), np.linspace(10, 7, 6_000)])
+    with pytest.raises(IdentificationError, match='or the sensor is at its stop'):
+        refuse_closed_loop(record(piece(v, np.minimum(7.5e-6 * v, 40e-6))))
     assert_allclose(v[0], 0)

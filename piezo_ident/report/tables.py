@@ -158,7 +158,8 @@ def dynamics_tables(identification: Identification) -> list[Table]:
         said = f'average of {delay.step.repeats}' if delay.step.repeats else 'no steps'
         rows.append(('steps', found, number(delay.step.std, 2), said))
     if delay.scan is not None:
-        rows.append(('scan of the ARX loss', str(delay.scan), '–', 'noise segment'))
+        scanned = 'noise segment' if delay.step is None else 'the same steps'
+        rows.append(('scan of the ARX loss', str(delay.scan), '–', scanned))
     tables = [Table('Delay', ('', 'd / samples', '± / samples', 'from'), tuple(rows))]
     if not na:
         return tables
