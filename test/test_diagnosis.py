@@ -170,9 +170,53 @@ def test_no_effect_is_none(truths):
     assert after < 1.05 * before
 
 
+NARROW = """
+limits: [0, 10]
+rest: 4
+slew: 100
+segments:
+  - {signal: triangle, peaks: [6, 6, 6], base: 4, slope: 8}
+  - {signal: hold, level: 6, duration: 3}
+  - {signal: hold, level: 4, duration: 3}
+  - {signal: sine, bias: 5, amplitude: 1, frequency: 1, periods: 3}
+  - {signal: hold, level: 6, duration: 3}
+"""
+
+
+def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    sequence = parse_program(NARROW).build(RATE)
+    stage = truths.make_stage('creep', 0.3, 1)
+    t = np.arange(sequence.n) / RATE
+    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
+    narrow = record_of(sequence.v, stage.respond(t, sequence.v), labels, 'narrow')
+    few = DiagnosisSettings(effects=('creep', 'saturation'))
+    result = diagnose(model, narrow, few)
+    assert [e.name for e in result.effects] == ['creep'], result.sentence
+    assert result.model.scaling.range == (sequence.v.min(), sequence.v.max())
+    assert 'the hysteresis was refitted to 4 .. 6 V alone' in result.warnings[-1]
+    # and who leaves that range hears of it
+    assert result.model.extrapolation(record)
+    whole = diagnose(model, record, few)
+    assert whole.model.scaling.range == model.scaling.range
+    assert not [w for w in whole.warnings if 'was refitted' in w]
+
+
+def test_a_share_is_of_what_a_refit_leaves(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    # the sensor was set to zero anew
+    (piece,) = record.pieces
+    moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
+    result = diagnose(model, moved, DiagnosisSettings(effects=('creep',)))
+    assert 'of what a refit of the hysteresis leaves' in result.sentence
+    assert f'with the refit alone to {result.refit.overall:.3g} %' in result.sentence
+    assert result.after.overall < result.refit.overall < 0.1 * result.before.overall
+
+
 def test_hum_stays_in_its_record(truths):
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     result = diagnose(model, record)
+    assert 'switched off beside the hysteresis as it was given' in ' '.join(result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
     frequency = result.effects[0].parameters['frequency'].value
@@ -277,6 +321,8 @@ def test_one_pass_over_the_range_names_nothing(truths):
     result = diagnose(model, once)
     assert not result.effects
     assert result.verdict in ('none', 'unexplained')
+    assert 'nothing that is fitted could be tested' in result.sentence
+    assert 'no candidate' not in result.sentence
 
 
 # -- the parts that carry it -------------------------------------------------------------------

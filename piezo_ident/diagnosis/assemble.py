@@ -56,6 +56,8 @@ WORTH_IN_DOUBT = 0.5
 TUNED = 0.05
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
+#: share of the given range that records must cover for a refitted H to hold in all of it
+COVERED = 0.95
 
 
 def assemble(
@@ -129,10 +131,11 @@ def assemble(
     elif findings.effects and not lasting:
         # H was refitted beside a drift that another record will not repeat
         state = fitted.state
-        refined = _refined(simulator, replace(given, effects=_silenced(state.effects)), findings)
+        silent = replace(given, effects=_silenced(state.effects))
+        refined = _refined(simulator, silent, findings, model.scaling.range)
     else:
         state = judged.fitted.state
-        refined = _refined(judged.simulator, state, findings)
+        refined = _refined(judged.simulator, state, findings, _range(judged.simulator))
     full = [simulator.full(s) for s in (given, base.state, state)]
     residuals = tuple(
         Residual(
@@ -152,6 +155,12 @@ def assemble(
     warnings = _warnings(
         state, findings, lasting, floor, bent / max(base.mean_square - noise, 1e-300)
     )
+    (low, high), (least, most) = refined.scaling.range, model.scaling.range
+    if low > least or high < most:
+        warnings += (
+            f'the hysteresis was refitted to {low:g} .. {high:g} V alone, and the refined model '
+            f'holds there; the given one holds in {least:g} .. {most:g} V',
+        )
     result = Diagnosis(
         verdict=findings.verdict,
         sentence='',
@@ -180,8 +189,21 @@ def assemble(
     return replace(result, sentence=_sentence(result, findings))
 
 
-def _refined(simulator: Simulator, state: State, findings: Findings) -> StageModel:
-    """Return the model of a state, in the record that holds the most rows."""
+def _range(simulator: Simulator) -> tuple[float, float]:
+    """Return the voltages between which an H refitted to the rows holds."""
+    pieces = [run.piece for run in simulator.rows.runs]
+    low, high = min(float(p.v.min()) for p in pieces), max(float(p.v.max()) for p in pieces)
+    least, most = simulator.model.scaling.range
+    # plays of larger thresholds than what was driven have no weight any more
+    if high - low < COVERED * (most - least):
+        return low, high
+    return min(least, low), max(most, high)
+
+
+def _refined(
+    simulator: Simulator, state: State, findings: Findings, span: tuple[float, float]
+) -> StageModel:
+    """Return the model of a state, in the record that holds the most rows, and its range."""
     rows = simulator.rows
     k = int(np.bincount(rows.of_record, minlength=len(rows.names)).argmax())
     h = state.hysteresis
@@ -190,11 +212,7 @@ def _refined(simulator: Simulator, state: State, findings: Findings) -> StageMod
     kept = tuple(_lasting(added) for added in state.effects)
     model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
     scaling = model.scaling
-    low = min(scaling.range[0], *(float(run.piece.v.min()) for run in rows.runs))
-    high = max(scaling.range[1], *(float(run.piece.v.max()) for run in rows.runs))
-    moved = replace(
-        scaling, y0=scaling.y0 + float(state.offsets[k]) * scaling.Y, range=(low, high)
-    )
+    moved = replace(scaling, y0=scaling.y0 + float(state.offsets[k]) * scaling.Y, range=span)
     story = dict(model.identification)
     story['diagnosis'] = {
         'verdict': findings.verdict,
@@ -340,6 +358,8 @@ def _warnings(
             continue
         # beside a lasting effect the rest was fitted to the mean of what wanders
         kept = 'its mean' if lasting and not _is_off(added) else 'it switched off'
+        if not lasting:
+            kept += ' beside the hysteresis as it was given'
         said.append(
             f'{added.name} follows time and not the voltage: what was found holds in its own '
             f'record alone, so the refined model carries {kept}'
@@ -348,37 +368,38 @@ def _warnings(
 
 
 def _sentence(result: Diagnosis, findings: Findings) -> str:
-    before, after = result.before, result.after
+    before, refit, after = result.before, result.refit, result.after
     errors = (
         f'the error on held-out data falls from {before.overall:.3g} to {after.overall:.3g} % of '
         'stroke'
     )
     names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
     rest = result.unexplained.rms_percent
-    share = f'{100.0 * findings.share:.0f} %'
+    missed = 'what the model missed'
+    if result.effects and refit.overall < (1.0 - WORTH_IN_DOUBT) * before.overall:
+        # of which a share is told: a sensor set to zero anew is no effect
+        missed = 'what a refit of the hysteresis leaves'
+        errors += f', with the refit alone to {refit.overall:.3g} %'
+    share = f'{100.0 * findings.share:.0f} % of {missed}'
     if result.verdict == 'named':
         verb = 'explains' if len(result.effects) == 1 else 'explain'
-        return _capital(
-            f'{names} {verb} {100.0 * findings.share:.0f} % of what the model missed; {errors}.'
-        )
+        return _capital(f'{names} {verb} {share}; {errors}.')
     if result.verdict == 'class' and result.group is not None:
         group = ' or '.join(n.replace('_', ' ') for n in result.group.names)
         return _capital(
             f'{group}: these data do not tell which; {names} was added and explains '
-            f'{share} of what the model missed; {errors}.'
+            f'{share}; {errors}.'
         )
     if result.verdict == 'partly_explained':
         return _capital(
-            f'{names} explains {share} of what the model missed, {rest:.2g} % of '
-            f'stroke stays unexplained; {errors}.'
-        )
-    if result.verdict == 'unexplained':
-        tail = f'; refitting the hysteresis alone: {errors}' if after is not before else ''
-        return (
-            f'The model misses {rest:.2g} % of stroke that no candidate explains: unexplained'
-            f'{tail}.'
+            f'{names} explains {share}, {rest:.2g} % of stroke stays unexplained; {errors}.'
         )
     tail = f'; after a refit of the hysteresis {errors}' if after is not before else ''
+    if result.verdict == 'unexplained':
+        why = ' that no candidate explains: unexplained'
+        if result.smallest_detectable is None:
+            why = f', unexplained: {result.unexplained.description}'
+        return f'The model misses {rest:.2g} % of stroke{why}{tail}.'
     if result.smallest_detectable is None:
         return _capital(f'{result.unexplained.description}{tail}.')
     return (

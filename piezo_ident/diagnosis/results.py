@@ -227,7 +227,8 @@ class Diagnosis:
         Best first.
     before, refit, after : Errors
         Of the model as given, of the base model refitted (held out), of the refined model (held
-        out).
+        out); what follows time counts as it was found in these records, with H refitted beside
+        it, though the model leaves both out where there is nothing else.
     noise_floor : float or None
         Rms of single samples, % of stroke.
     noise_source : str

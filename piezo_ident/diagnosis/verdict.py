@@ -255,7 +255,11 @@ def candidates_of(
         if name in findings.effects:
             continue
         value = float(np.clip(share, 0.0, 1.0))
-        found.append(Candidate(name, value, _why_not(name, value, findings, last, rows.passes)))
+        why = _why_not(name, value, findings, last, rows.passes)
+        is_partly = findings.verdict == 'partly_explained'
+        if is_partly and value >= shares.get(findings.effects[0], 1.0):
+            why = f'explains no less than {findings.effects[0]}, which is as simple or simpler'
+        found.append(Candidate(name, value, why))
     found += [
         Candidate(name, 0.0, 'these data speak against it')
         for name, share in first.visible.items()
