@@ -50,7 +50,9 @@ def _rows() -> list[dict[str, Any]]:
 HEAD = """# What it stands
 
 *Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
-its own rows. Every row can be run again with its command, from the root of the sources.*
+its own rows. Every row can be run again with its command, from the root of the sources, after
+`make test` (for `make fuzz` and `make crash` nothing before), with `.venv` active
+(`. .venv/bin/activate`); the rows of `fuzz.py` need what `make .venv/.fuzz` installs.*
 
 `make test` and `make test-graph` keep a fast subset of each row; `make attack`, `make netns`,
 `make soak`, `make fuzz` and `make crash` run the whole.

@@ -15,7 +15,7 @@
 """
 The graph over two hosts, with a network between them that loses packets, or goes away.
 
-    sudo python benchmarks/reliability/netns.py
+    sudo .venv/bin/python benchmarks/reliability/netns.py
 
 Stage and excitation run in one network namespace, identifier and model in another, with a pair of
 virtual Ethernet devices between them.  A short programme is run by ``~/run`` while none, 1 % or
@@ -405,6 +405,7 @@ def main() -> int:
         return 0
     from rows import crowd, write_rows
 
+    command = f'sudo .venv/bin/python benchmarks/reliability/netns.py --repeat {args.repeat}'
     rows, perfect, honest = [], '', True
     for percent, down in ((0, 0.0), (1, 0.0), (5, 0.0), (0, 10.0)):
         outcomes = [run(percent, down) for _ in range(args.repeat)]
@@ -422,7 +423,7 @@ def main() -> int:
                 'how_often': f'{len(outcomes)} runs, {sum(o.dropped for o in outcomes)} packets '
                 f'dropped{crowd()}',
                 'result': '; '.join(f'{n} x {text}' for text, n in results.items()),
-                'command': f'sudo python benchmarks/reliability/netns.py --repeat {args.repeat}',
+                'command': command,
             }
         )
     kept, open_ = seen_from(''), seen_from('SUBNET')
@@ -435,7 +436,7 @@ def main() -> int:
             'how_often': '1 run each',
             'result': f'{"nothing" if apart else kept} with the default; '
             f'{"both" if together else open_} with SUBNET',
-            'command': f'sudo python benchmarks/reliability/netns.py --repeat {args.repeat}',
+            'command': command,
         }
     )
     write_rows('netns', rows)
