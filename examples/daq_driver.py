@@ -108,8 +108,9 @@ class Driver(LabNode):
         """Be at rest within a second: a slow ramp that is under way gives way to this one."""
         self.guard = Guard(self.guard.settings, self.guard.applied)
         while not self.guard.is_at_rest:
+            due = time.monotonic() + PERIOD
             self._move(self.guard.idle(round(PERIOD * RATE), 0.7), 'ramp:stop')
-            time.sleep(PERIOD)
+            time.sleep(max(0.0, due - time.monotonic()))
 
 
 if __name__ == '__main__':
