@@ -29,13 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.bag_samples import (
-    BagSamples,
-    carried_quantities,
-    MESSAGE_TYPE,
-    opened_samples,
-    typestore,
-)
+from piezo_ident.bag_samples import BagSamples, MESSAGE_TYPE, opened_samples, typestore
 from piezo_ident.capture import record_of_streams
 from piezo_ident.errors import DataError
 from piezo_ident.long_record import LongRecord, Outline, parts_of, Progress
@@ -61,7 +55,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 __all__ = [
     'MESSAGE_TYPE',
     'SAMPLE_QOS',
-    'carried_quantities',
     'read_bag',
     'record_in',
     'typestore',

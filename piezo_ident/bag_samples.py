@@ -37,7 +37,14 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-__all__ = ['MESSAGE_TYPE', 'BagSamples', 'carried_quantities', 'opened_samples', 'typestore']
+__all__ = [
+    'MESSAGE_TYPE',
+    'BagSamples',
+    'carried_quantities',
+    'is_computed',
+    'opened_samples',
+    'typestore',
+]
 
 MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
 
@@ -146,6 +153,11 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
     return found
 
 
+def is_computed(topic: str) -> bool:
+    """Return whether a topic is one of a model's, which nobody has measured."""
+    return topic.rpartition('/')[2] in ('prediction', 'residual')
+
+
 def _choose(
     carried: Mapping[str, str],
     asked: Mapping[str, str | None],
@@ -172,8 +184,15 @@ def _choose(
             chosen[quantity] = topic
             continue
         there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
-        # applied_voltage and prediction carry the same quantity under another name
-        commanded = [t for t in there if t.rpartition('/')[2] != APPLIED] or there
+        # a model fitted to the prediction of another would look perfect
+        measured = [t for t in there if not is_computed(t)]
+        if there and not measured:
+            raise DataError(
+                f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
+                f'measured {quantity}; record that, or name the topic to take'
+            )
+        # applied_voltage carries the same quantity under another name
+        commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured
         named = [t for t in commanded if t.rpartition('/')[2] == quantity]
         fit = named if len(commanded) > 1 and named else commanded
         if not fit:

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from piezo_ident.bag_io import carried_quantities
 from piezo_ident.bag_recovery import Bag
+from piezo_ident.bag_samples import carried_quantities, is_computed
 from piezo_ident.errors import DataError
 
 __all__ = ['ReplayClock', 'chosen_topics']
@@ -61,7 +61,8 @@ def chosen_topics(
         if not found and not name.startswith(('/', '~')):
             found = [t for t in there if t.endswith(f'/{name}')]
             if not found and '/' not in name:
-                found = [t for t, quantity in _carried(bag).items() if quantity == name]
+                carried = _carried(bag).items()
+                found = [t for t, q in carried if q == name and not is_computed(t)]
         if not found:
             raise DataError(
                 f'{bag.path}: no topic {name} in it; set topics to some of: '

@@ -285,6 +285,20 @@ def test_remapped_and_further_topics(tmp_path):
     assert read_bag(write(tmp_path / 'bag2', messages)).n == 1000
 
 
+@pytest.mark.parametrize('name', ['prediction', 'residual'])
+def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
+    messages = [m for v, y in blocks() for m in (('/s/voltage', v), (f'/s/{name}', y))]
+    path = write(tmp_path / 'bag', messages)
+    with pytest.raises(DataError, match=f'/s/{name}: computed by a model, and no topic carries'):
+        read_bag(path)
+    # whoever asks for it gets it
+    assert read_bag(path, displacement_topic=f's/{name}').n == 1000
+    # beside what was measured under another name it is no second displacement
+    messages += [('/s/gauge', Samples(y.t, -y.values, '', y.quantity)) for _, y in blocks()]
+    got = read_bag(write(tmp_path / 'both', messages))
+    np.testing.assert_array_equal(got.pieces[0].y[:100], -blocks()[0][1].values)
+
+
 @pytest.mark.parametrize('voltage', ['voltage', 'drive'])
 def test_applied_voltage_is_met_as_in_a_live_capture(tmp_path, voltage):
     messages, capture = [], Capture()

@@ -65,6 +65,14 @@ def test_remapped_topics_are_found_by_what_they_carry(tmp_path):
         }
 
 
+def test_a_prediction_is_not_replayed_as_displacement(tmp_path):
+    messages = [m for v, y in blocks() for m in (('/voltage', v), ('/prediction', y))]
+    with opened_bag(write(tmp_path / 'bag', messages)) as opened:
+        assert chosen_topics(opened, ['prediction'], here(A)) == {'/prediction': '/a/prediction'}
+        with pytest.raises(DataError, match='no topic displacement in it'):
+            chosen_topics(opened, ['displacement'], here(A))
+
+
 def test_refusals(tmp_path):
     there = bag(tmp_path, '/a/voltage', '/c/voltage')
     closed = Bag(there.path, there.connections, lambda _: iter(()), 0, 0)
