@@ -25,13 +25,18 @@ from contextlib import contextmanager, suppress
 import ctypes
 import os
 from pathlib import Path
+import re
 import shutil
 import sqlite3
 import tempfile
 
-from piezo_ident.errors import DataError
+from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.yaml_io import load_yaml
 
-__all__ = ['temporary_output']
+__all__ = ['check_replaceable', 'temporary_output']
+
+#: what a bag is made of
+_PART = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd|-wal|-shm|-journal)?')
 
 
 @contextmanager
@@ -44,7 +49,7 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     path : path
         Where the finished file or folder will stand.
     overwrite : bool
-        Replace what stands there.  A folder is only replaced when it is a bag.
+        Replace what stands there.  A folder is only replaced when it is a bag and nothing else.
 
     Raises
     ------
@@ -62,8 +67,8 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     taken = path.exists() or path.is_symlink()
     if taken and not overwrite:
         raise DataError(f'{path}: exists already; choose another name or ask to overwrite it')
-    if path.is_dir() and not (path / 'metadata.yaml').is_file():
-        raise DataError(f'{path}: is a folder and no bag; choose another name')
+    if path.is_dir():
+        check_replaceable(path)
     # a folder of our own keeps the name, which rosbag2 repeats inside, and takes the old output
     try:
         work = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent))
@@ -88,6 +93,27 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
             f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
             'the right to write'
         ) from None
+
+
+def check_replaceable(folder: Path) -> None:
+    """
+    Refuse a folder that is no bag, or holds what is no part of it: replacing it deletes all.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        is_bag = 'rosbag2_bagfile_information' in load_yaml(folder / 'metadata.yaml')
+    except ConfigError:
+        is_bag = False
+    if not is_bag:
+        raise DataError(f'{folder}: is a folder and no bag; choose another name')
+    others = [p for p in folder.iterdir() if p.is_dir() or not _PART.fullmatch(p.name)]
+    if others:
+        raise DataError(
+            f'{folder}: holds {min(others).name}, which is no part of a bag; choose another name'
+        )
 
 
 def _exchanged(new: Path, old: Path) -> bool:

@@ -488,7 +488,7 @@ def test_times_that_no_bag_can_hold(capsys, tmp_path, suffix):
 
 def test_an_output_without_a_name(capsys, tmp_path, made, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'metadata.yaml').write_text('')
+    (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
     refuse(capsys, tmp_path, ['convert', made / 'record.npz', '.', '--overwrite'], 'no file')
 
 

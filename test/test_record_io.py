@@ -180,6 +180,28 @@ def test_a_folder_that_is_no_bag_is_never_replaced(tmp_path):
     with pytest.raises(DataError, match='no bag'):
         write_record(record(), tmp_path / 'home', overwrite=True)
     assert (tmp_path / 'home' / 'thesis.tex').exists()
+    # others call their files metadata.yaml, too
+    for text in ('author: me', '[', ''):
+        (tmp_path / 'home' / 'metadata.yaml').write_text(text)
+        with pytest.raises(DataError, match='no bag'):
+            write_record(record(), tmp_path / 'home', overwrite=True)
+    assert (tmp_path / 'home' / 'thesis.tex').exists()
+
+
+@pytest.mark.parametrize('name', ['notes.txt', 'model.yaml', 'pictures'])
+def test_a_bag_with_something_beside_it_is_never_replaced(tmp_path, name):
+    bag = tmp_path / 'bag'
+    write_record(record(), bag)
+    for part in ('bag.db3-wal', 'bag_1.mcap.zstd'):
+        (bag / part).touch()
+    write_record(record(), bag, overwrite=True)
+    if name == 'pictures':
+        (bag / name).mkdir()
+    else:
+        (bag / name).touch()
+    with pytest.raises(DataError, match=f'holds {name}, which is no part of a bag'):
+        write_record(record(), bag, overwrite=True)
+    assert (bag / name).exists()
 
 
 @pytest.mark.parametrize('name', FORMATS)

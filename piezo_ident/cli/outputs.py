@@ -21,6 +21,7 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.errors import ConfigError, DataError
+from piezo_ident.output import check_replaceable
 from piezo_ident.yaml_io import broken_link
 
 __all__ = ['check_distinct', 'check_file', 'check_folder', 'check_link', 'check_suffix']
@@ -75,8 +76,8 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
     try:
         if path.is_dir() and not folder_too:
             raise DataError(f'{path}: is a folder; name a file')
-        if path.is_dir() and not (path / 'metadata.yaml').is_file():
-            raise DataError(f'{path}: is a folder and no bag; choose another name')
+        if path.is_dir():
+            check_replaceable(path)
         if path.exists() and not (path.is_dir() or path.is_file()):
             raise DataError(f'{path}: is a device, no file; choose another name')
         if (path.exists() or path.is_symlink()) and not overwrite:
