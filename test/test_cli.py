@@ -304,6 +304,25 @@ def test_convert_refuses_to_replace_unless_told(capsys, tmp_path, made):
     assert read_record(out).n == read_record(made / 'record.npz').n
 
 
+def test_convert_keeps_its_input(capsys, tmp_path, made):
+    bag, table = tmp_path / 'bag', tmp_path / 'r.csv'
+    for path in (bag, table):
+        succeed(capsys, 'convert', made / 'record.npz', path)
+    (tmp_path / 'link.csv').symlink_to(table)
+    before = {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()}
+    for there, out in (
+        (table, table),
+        (tmp_path / 'link.csv', table),
+        (table, bag / '..' / 'r.csv'),
+        (bag, bag),
+        (bag / 'bag.mcap', bag),
+        (bag, bag / 'r.csv'),
+    ):
+        for option in ([], ['--overwrite']):
+            refuse(capsys, tmp_path, ['convert', there, out, *option], out, 'is the input')
+    assert {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()} == before
+
+
 # --- measured data as they come -------------------------------------------------------------
 
 

@@ -26,7 +26,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
-from piezo_ident.cli.outputs import check_folder, check_link
+from piezo_ident.cli.outputs import check_apart, check_folder, check_link
 from piezo_ident.errors import ConfigError
 from piezo_ident.long_record import LongRecord
 from piezo_ident.program import load_program
@@ -94,6 +94,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
 
 def convert_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident convert``."""
+    check_apart(args.out, args.record)
     check_record_output(args)
     with console.progress() as progress:
         if args.out.suffix.lower() == '.mat':

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+import os
 from pathlib import Path
 import tempfile
 
@@ -24,7 +25,14 @@ from piezo_ident.errors import ConfigError, DataError
 from piezo_ident.output import check_replaceable
 from piezo_ident.yaml_io import broken_link
 
-__all__ = ['check_distinct', 'check_file', 'check_folder', 'check_link', 'check_suffix']
+__all__ = [
+    'check_apart',
+    'check_distinct',
+    'check_file',
+    'check_folder',
+    'check_link',
+    'check_suffix',
+]
 
 
 def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
@@ -120,6 +128,22 @@ def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
     """
     if output.exists() and any(p.exists() and output.samefile(p) for p in inputs):
         raise DataError(f'{output}: is one of the inputs; choose another name')
+
+
+def check_apart(output: Path, record: Path) -> None:
+    """
+    Refuse to write a record over another, into the folder of it, or where that lies below.
+
+    Raises
+    ------
+    DataError
+    """
+    # pathlib has an error of its own for links in a circle
+    out, given = (Path(os.path.realpath(path)) for path in (output, record))
+    if out == given or out in given.parents or given in out.parents:
+        raise DataError(
+            f'{output}: is the input {record}, lies in it or holds it; choose another name'
+        )
 
 
 def _try(folder: Path) -> None:
