@@ -51,10 +51,12 @@ class Entry:
     verb : {'identify', 'diagnose'}
     record : str
     key : str
-        Of record and settings.
+        Of settings and record, with a blank between them.
     row : Row
     seconds : float
         That it took.
+    path : str
+        Where the record was; empty where an earlier version of this package did not say it.
     """
 
     verb: str
@@ -62,6 +64,7 @@ class Entry:
     key: str
     row: Row
     seconds: float
+    path: str = ''
 
 
 class Ledger:
@@ -138,9 +141,27 @@ class Ledger:
         entry = self._entries.get(record)
         return entry.row if entry is not None and entry.key == key and entry.row.good else None
 
-    def add(self, key: str, outcome: Outcome) -> None:
+    def check_place(self, record: str, path: str, key: str) -> None:
         """
-        Keep a row.
+        Refuse a record under whose name the results of another one are kept.
+
+        Raises
+        ------
+        ConfigError
+        """
+        entry = self._entries.get(record)
+        if entry is None or not entry.row.good or entry.path in ('', path):
+            return
+        # one that was moved, or copied with its time, is still the same
+        if entry.key.rpartition(' ')[2] != key.rpartition(' ')[2]:
+            raise ConfigError(
+                f'{path}: {self.path.parent} keeps the results of {entry.path} under the name '
+                f'{record}; choose another folder for --each, or rename the record'
+            )
+
+    def add(self, key: str, outcome: Outcome, path: str) -> None:
+        """
+        Keep a row of the record at a path.
 
         Raises
         ------
@@ -148,7 +169,7 @@ class Ledger:
             When it cannot be written.
         """
         row = outcome.row
-        entry = Entry(self._verb, row.record, key, row, round(outcome.seconds, 3))
+        entry = Entry(self._verb, row.record, key, row, round(outcome.seconds, 3), path)
         try:
             with self.path.open('ab') as file:
                 if not self._whole:

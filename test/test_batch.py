@@ -314,6 +314,25 @@ def test_no_input_and_nothing_foreign_is_written_over(capsys, records, tmp_path)
     assert (bag / 'run.npz').is_file()
 
 
+def test_a_record_of_the_same_name_is_another_one(capsys, records, result, tmp_path):
+    out, other = tmp_path / 'out', tmp_path / 'stage_1.npz'
+    shutil.copytree(result, out)
+    shutil.copyfile(records / 'stage_2.npz', other)
+    before = {p: p.read_bytes() for p in out.rglob('*') if p.is_file()}
+    err = refused(capsys, 'identify', other, '--each', out, '--jobs', 1, *FAST)
+    assert f'{records / "stage_1.npz"} under the name stage_1; choose another folder' in err
+    assert {p: p.read_bytes() for p in out.rglob('*') if p.is_file()} == before
+    # the one that failed has left nothing that could be lost
+    shutil.copyfile(other, tmp_path / 'stage_3.npz')
+    argv = ['--each', out, '--jobs', 1, *FAST]
+    assert run(capsys, 'identify', tmp_path / 'stage_3.npz', *argv)[0] == 0
+    # earlier ledgers do not say where the records were
+    entries = [json.loads(line) for line in lines(out)]
+    text = ''.join(json.dumps({k: e[k] for k in e if k != 'path'}) + '\n' for e in entries)
+    (out / LEDGER).write_text(text)
+    assert run(capsys, 'identify', other, *argv)[0] == 0
+
+
 def test_the_folder_one_is_in_has_a_name(capsys, records, tmp_path, monkeypatch):
     here = tmp_path / 'mine'
     here.mkdir()
@@ -495,13 +514,13 @@ def test_the_key_follows_the_record_and_the_settings(tmp_path):
 
 def test_half_a_line_of_a_killed_run_is_passed_over(tmp_path):
     good = Outcome(Row('a', {'gain': 1e-6}))
-    Ledger(tmp_path, 'identify').add('key', good)
+    Ledger(tmp_path, 'identify').add('key', good, '/in/a.csv')
     with (tmp_path / LEDGER).open('a') as file:
         file.write('{"verb": "ident')
     ledger = Ledger(tmp_path, 'identify')
     assert ledger.done('a', 'key') == good.row
     assert ledger.done('a', 'other') is None
-    ledger.add('key', Outcome(Row('b', reason='no')))
+    ledger.add('key', Outcome(Row('b', reason='no')), '/in/b.csv')
     ledger = Ledger(tmp_path, 'identify')
     assert ledger.done('a', 'key') == good.row
     # to be tried again

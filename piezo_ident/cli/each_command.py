@@ -228,6 +228,7 @@ def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Con
     keys = [_key(job) for job in jobs]
     rows: dict[int, Row] = {}
     for i, (job, key) in enumerate(zip(jobs, keys, strict=True)):
+        ledger.check_place(job.name, job.path, key)
         row = ledger.done(job.name, key)
         if row is not None and folder.holds(job):
             rows[i] = row
@@ -247,7 +248,7 @@ def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Con
                         i = todo[number]
                         with interrupts.waiting():
                             folder.keep(outcome)
-                            ledger.add(keys[i], outcome)
+                            ledger.add(keys[i], outcome, jobs[i].path)
                         rows[i] = outcome.row
     except KeyboardInterrupt:
         console.note(
