@@ -35,6 +35,7 @@ from piezo_ident.batch import Diagnose, fingerprint, Identify, Outcome, Row
 from piezo_ident.batch_table import COLUMNS, columns_of, csv_text
 from piezo_ident.character import character
 from piezo_ident.cli import main
+from piezo_ident.cli.each_command import SUMMARY
 from piezo_ident.dynamics import Delay, Dynamics
 from piezo_ident.errors import ConfigError
 from piezo_ident.executors import cores, run_all
@@ -42,7 +43,7 @@ from piezo_ident.hysteresis import Hysteresis
 from piezo_ident.ledger import LEDGER, Ledger
 from piezo_ident.model import Scaling, StageModel
 from piezo_ident.model_io import load_model, model_to_yaml, save_model
-from piezo_ident.plots.spread import write_spread
+from piezo_ident.plots.spread import PICTURES, write_spread
 from piezo_ident.program import parse_program
 from piezo_ident.record_io import write_record
 from piezo_ident.simulation import Sensor, simulate, SimulatedStage
@@ -310,6 +311,14 @@ def test_no_input_and_nothing_foreign_is_written_over(capsys, records, tmp_path)
     (out / 'models' / 'a.yaml').write_text('mine')
     assert 'is there already' in refused(capsys, 'identify', record, '--each', out)
     assert (out / 'models' / 'a.yaml').read_text() == 'mine'
+    # and under the name of a table or a picture
+    assert set(PICTURES) < set(SUMMARY)
+    for name in SUMMARY:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text('mine')
+        argv = ['identify', record, '--each', tmp_path / name]
+        assert f'{name}: is there already' in refused(capsys, *argv)
+        assert [p.name for p in (tmp_path / name).iterdir()] == [name]
     assert model.read_bytes() == kept
     assert (bag / 'run.npz').is_file()
 

@@ -46,6 +46,8 @@ __all__ = ['check_each', 'diagnose_each', 'identify_each']
 Job = Identify | Diagnose
 #: records whose reason, or whose standing out, is printed
 SAID = 10
+#: what stands beside the models and the reports
+SUMMARY = ('records.csv', 'records.parquet', 'errors.png', 'parameters.png', 'effects.png')
 
 
 def check_each(args: argparse.Namespace) -> None:
@@ -303,11 +305,14 @@ def _refuse_targets(
                 raise ConfigError(
                     f'{target}: is an input, or holds one; choose another folder for --each'
                 )
-            if target.exists() and not is_ours:
-                raise ConfigError(
-                    f'{target}: is there already, and not of an earlier --each; choose another '
-                    'folder'
-                )
+    if is_ours:
+        return
+    results = [place(job.name) for job in jobs for place in (folder.model, folder.report)]
+    for target in (*results, *(folder.path / name for name in SUMMARY)):
+        if target.exists():
+            raise ConfigError(
+                f'{target}: is there already, and not of an earlier --each; choose another folder'
+            )
 
 
 def _key(job: Job) -> str:
