@@ -660,6 +660,8 @@ def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, 
     monkeypatch.setattr('piezo_ident.cli.model_commands.predict_record', forbidden)
     monkeypatch.setattr('piezo_ident.cli.commands.simulate', forbidden)
     (tmp_path / 'file').write_text('')
+    (tmp_path / 'mine').mkdir()
+    (tmp_path / 'mine' / 'model.yaml').write_text('')
     below, record = tmp_path / 'file' / 'm.yaml', made / 'record.npz'
     for argv in (
         ['identify', record, '--model', below],
@@ -669,6 +671,7 @@ def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, 
         ['identify', record, '--report', below],
         ['identify', record, '--report', tmp_path / 'file'],
         ['identify', record, '--report', '/proc/report'],
+        ['identify', record, '--report', tmp_path / 'mine'],
         ['predict', made / 'model.yaml', record, '--out', below.with_suffix('.csv')],
         ['predict', made / 'model.yaml', record, '--plot', below.with_suffix('.png')],
         ['predict', made / 'model.yaml', record, '--out', record],

@@ -220,7 +220,7 @@ def test_names_that_are_no_text(coarse, tmp_path):
 
 
 def test_an_earlier_report_leaves_no_pictures_behind(coarse, tmp_path):
-    for name in ('residual_3.png', 'mine.png'):
+    for name in ('diagnosis.json', 'residual_3.png', 'mine.png'):
         (tmp_path / name).write_bytes(b'old')
     write_diagnosis_report(example('none'), tmp_path)
     names = {path.name for path in tmp_path.iterdir()}

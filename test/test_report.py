@@ -195,6 +195,7 @@ def test_page_tells_warnings_and_what_is_missing(unlabelled, tmp_path):
 
 def test_an_earlier_report_leaves_no_pictures_behind(unlabelled, tmp_path):
     found, record = unlabelled
+    (tmp_path / 'identification.json').write_text('{}')
     (tmp_path / 'orders.png').write_bytes(b'old')
     (tmp_path / 'mine.png').write_bytes(b'mine')
     write_report(found, record, tmp_path)
@@ -202,6 +203,15 @@ def test_an_earlier_report_leaves_no_pictures_behind(unlabelled, tmp_path):
     assert 'orders.png' not in names
     assert 'mine.png' in names
     assert not [name for name in names if name.startswith('.')]
+
+
+@pytest.mark.parametrize('name', ['model.yaml', 'orders.png', 'sines.png', 'report.html'])
+def test_what_is_of_no_report_stays(unlabelled, tmp_path, name):
+    (tmp_path / name).write_text('mine')
+    with pytest.raises(DataError, match=f'{name}: is there already, and of no earlier report'):
+        write_report(*unlabelled, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == 'mine'
 
 
 def test_numbers_are_strict_json(folder, found, records):

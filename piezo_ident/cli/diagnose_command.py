@@ -37,7 +37,13 @@ from piezo_ident.model import StageModel
 from piezo_ident.model_io import load_model, save_model
 from piezo_ident.prediction import predict_record
 from piezo_ident.record import Record
-from piezo_ident.report import changes, diagnosis_summary, Unseen, write_diagnosis_report
+from piezo_ident.report import (
+    changes,
+    check_diagnosis_folder,
+    diagnosis_summary,
+    Unseen,
+    write_diagnosis_report,
+)
 from piezo_ident.validation import sine_errors
 
 __all__ = ['diagnose_command']
@@ -126,6 +132,7 @@ def _check_outputs(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
             )
         for name in ('model.yaml', 'diagnosis.json', 'report.html'):
             check_distinct(args.report / name, inputs)
+        check_diagnosis_folder(args.report)
 
 
 def _unseen(given: StageModel, refined: StageModel, record: Record) -> Unseen:

@@ -90,6 +90,9 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
             raise ConfigError(
                 f'{args.report}: holds the report of a diagnosis; choose another folder'
             )
+        with interrupts.quitting():
+            from piezo_ident.report import check_report_folder
+        check_report_folder(args.report)
     everything = read_all([*paths, *further], args)
     records, validation = everything[: len(paths)], everything[len(paths) :]
     with naming(*(record.name for record in records)), console.progress() as progress:

@@ -14,16 +14,18 @@
 
 """What an identification or a diagnosis found, for people and for programs."""
 
-from piezo_ident.report.diagnosis_folder import write_diagnosis_report
+from piezo_ident.report.diagnosis_folder import check_diagnosis_folder, write_diagnosis_report
 from piezo_ident.report.diagnosis_tables import changes, Unseen
 from piezo_ident.report.diagnosis_text import diagnosis_summary
-from piezo_ident.report.folder import write_report
+from piezo_ident.report.folder import check_report_folder, write_report
 from piezo_ident.report.numbers import steps_to_json, to_json, verdict
 from piezo_ident.report.text import error_table_for_sines, table_one, text_summary
 
 __all__ = [
     'Unseen',
     'changes',
+    'check_diagnosis_folder',
+    'check_report_folder',
     'diagnosis_summary',
     'error_table_for_sines',
     'steps_to_json',

@@ -24,13 +24,12 @@ from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.report.diagnosis_page import diagnosis_page
 from piezo_ident.report.diagnosis_tables import Unseen
-from piezo_ident.report.folder import PAGE, put_in_place, rendered
+from piezo_ident.report.folder import check_own, PAGE, put_in_place, rendered
 from piezo_ident.results import Progress, silent
 
-__all__ = ['DIAGNOSIS_FILES', 'write_diagnosis_report']
+__all__ = ['check_diagnosis_folder', 'write_diagnosis_report']
 
-#: what is in the folder, besides the pictures
-DIAGNOSIS_FILES = (PAGE, 'diagnosis.json', 'model.yaml')
+NUMBERS = 'diagnosis.json'
 
 
 def write_diagnosis_report(
@@ -74,7 +73,20 @@ def write_diagnosis_report(
     shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.5 + 0.4 * share))
     progress('writing', 0.9)
     texts = {
-        'diagnosis.json': json_text(diagnosis) + '\n',
+        NUMBERS: json_text(diagnosis) + '\n',
         PAGE: diagnosis_page(diagnosis, shown, drawn.left_out, unseen),
     }
     return put_in_place(folder, texts, diagnosis.model, shown, DIAGNOSIS_NAMES)
+
+
+def check_diagnosis_folder(folder: str | os.PathLike[str]) -> None:
+    """
+    Refuse a folder in which this report would lay hands on what is of no earlier one.
+
+    Raises
+    ------
+    DataError
+    """
+    from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES
+
+    check_own(folder, (NUMBERS, PAGE), DIAGNOSIS_NAMES)

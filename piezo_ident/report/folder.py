@@ -38,9 +38,16 @@ from piezo_ident.validation import free_runs, sines_of
 if TYPE_CHECKING:
     from piezo_ident.plots import Picture
 
-__all__ = ['PAGE', 'put_in_place', 'rendered', 'write_report']
+__all__ = [
+    'PAGE',
+    'check_own',
+    'check_report_folder',
+    'put_in_place',
+    'rendered',
+    'write_report',
+]
 
-PAGE = 'report.html'
+PAGE, NUMBERS, MODEL = 'report.html', 'identification.json', 'model.yaml'
 
 
 def write_report(
@@ -89,8 +96,21 @@ def write_report(
     numbers = json.dumps(
         to_json(identification, records, runs), indent=2, ensure_ascii=False, allow_nan=False
     )
-    texts = {'identification.json': numbers + '\n', PAGE: html}
+    texts = {NUMBERS: numbers + '\n', PAGE: html}
     return put_in_place(folder, texts, identification.model, shown, NAMES)
+
+
+def check_report_folder(folder: str | os.PathLike[str]) -> None:
+    """
+    Refuse a folder in which `write_report` would lay hands on what is of no earlier report.
+
+    Raises
+    ------
+    DataError
+    """
+    from piezo_ident.plots import NAMES
+
+    check_own(folder, (NUMBERS, PAGE), NAMES)
 
 
 def rendered(pictures: Sequence[Picture], tick: Callable[[float], None]) -> list[Shown]:
@@ -112,6 +132,36 @@ def rendered(pictures: Sequence[Picture], tick: Callable[[float], None]) -> list
         picture.figure.savefig(buffer, format='png', dpi=DPI)
         shown.append((picture.name, picture.title, picture.caption, buffer.getvalue()))
     return shown
+
+
+def check_own(
+    folder: str | os.PathLike[str], texts: Collection[str], names: Collection[str]
+) -> None:
+    """
+    Refuse to replace or take away files of no earlier report, which is known by its numbers.
+
+    Parameters
+    ----------
+    folder : path
+        Need not exist.
+    texts : collection of str
+        File names of the page and of the numbers.
+    names : collection of str
+        As for `put_in_place`.
+
+    Raises
+    ------
+    DataError
+    """
+    target = Path(folder)
+    if any((target / name).exists() for name in texts if name != PAGE):
+        return
+    for name in (*texts, MODEL, *(f'{name}.png' for name in names)):
+        if (target / name).exists():
+            raise DataError(
+                f'{target / name}: is there already, and of no earlier report; choose another '
+                'folder'
+            )
 
 
 def put_in_place(
@@ -144,9 +194,10 @@ def put_in_place(
     Raises
     ------
     DataError
-        When the folder cannot be written.
+        When the folder cannot be written, or holds such files that are of no earlier report.
     """
     target = Path(folder)
+    check_own(target, texts, names)
     try:
         target.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(dir=target, prefix='.report.', suffix='.tmp'))
@@ -156,8 +207,9 @@ def put_in_place(
             for name, text in texts.items():
                 # file names need not be Unicode
                 (work / name).write_bytes(text.encode('utf-8', 'replace'))
-            save_model(model, work / 'model.yaml')
-            for name in sorted(os.listdir(work), key=lambda name: name == PAGE):
+            save_model(model, work / MODEL)
+            # the numbers first: they tell that what comes after them is of a report
+            for name in sorted(os.listdir(work), key=lambda n: (n == PAGE, n not in texts)):
                 os.replace(work / name, target / name)
             for name in set(names) - {name for name, *_ in pictures}:
                 (target / f'{name}.png').unlink(missing_ok=True)
