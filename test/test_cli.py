@@ -469,6 +469,13 @@ def test_files_of_one_name_are_two_records(capsys, tmp_path, made):
     assert {row['record'] for row in data['errors']['rows']} == {str(path) for path in paths}
 
 
+def test_a_record_that_is_fitted_is_no_validation(capsys, tmp_path, made):
+    (tmp_path / 'again.npz').symlink_to(made / 'record.npz')
+    for path in (made / 'record.npz', tmp_path / 'again.npz'):
+        argv = ['identify', made / 'record.npz', '--validation', path, *FAST]
+        refuse(capsys, tmp_path, argv, path, 'is no validation')
+
+
 def test_options_for_bags_are_refused_for_tables(capsys, tmp_path, made):
     record, model = made / 'record.npz', made / 'model.yaml'
     for argv in (

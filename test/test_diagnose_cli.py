@@ -237,6 +237,7 @@ def test_inputs_and_other_reports_are_never_overwritten(capsys, made, quick):
     model, record = made / 'model.yaml', made / 'val.npz'
     argv = ['diagnose', model, record]
     refuse(capsys, made, [*argv, '--model', model], 'is one of the inputs')
+    refuse(capsys, made, [*argv, '--validation', record], 'is no validation')
     # the report would put its model.yaml there
     refuse(capsys, made, [*argv, '--report', made], 'is one of the inputs')
     (made / 'old').mkdir()

@@ -20,6 +20,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+import os
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ __all__ = [
     'check_limits',
     'check_record_output',
     'expand',
+    'expand_apart',
     'naming',
     'read',
     'read_all',
@@ -75,6 +77,28 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             )
         found += inside
     return found
+
+
+def expand_apart(
+    records: Sequence[Path], validation: Sequence[Path]
+) -> tuple[list[Path], list[Path]]:
+    """
+    Return the records that are named for a model and for its validation.
+
+    Raises
+    ------
+    DataError
+        When one is named for both.
+    """
+    paths, further = expand(records), expand(validation)
+    # pathlib has an error of its own for links in a circle
+    fitted = set(map(os.path.realpath, paths))
+    for path in further:
+        if os.path.realpath(path) in fitted:
+            raise DataError(
+                f'{path}: is among the records, too, so it is no validation; leave out one of them'
+            )
+    return paths, further
 
 
 def _records_of(path: Path) -> list[Path]:

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from piezo_ident.cli.common import expand, naming, read_all
+from piezo_ident.cli.common import expand_apart, naming, read_all
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
@@ -59,7 +59,7 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
         diagnose_each(args, settings, console)
         return
     check_order(args.model_file, args.records[0], 'diagnose')
-    paths, further = expand(args.records), expand(args.validation)
+    paths, further = expand_apart(args.records, args.validation)
     _check_outputs(args, [args.model_file, *paths, *further])
     given = load_model(args.model_file)
     everything = read_all([*paths, *further], args)

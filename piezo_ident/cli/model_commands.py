@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.cli.common import (
-    expand,
+    expand_apart,
     naming,
     read,
     read_all,
@@ -75,7 +75,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     if args.each is not None:
         identify_each(args, settings, console)
         return
-    paths, further = expand(args.records), expand(args.validation)
+    paths, further = expand_apart(args.records, args.validation)
     if args.model is not None:
         check_suffix(args.model, MODEL_FILES, 'a model')
         if args.model.parent == args.report:
