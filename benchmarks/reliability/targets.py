@@ -25,6 +25,7 @@ from contextlib import suppress
 import io
 import json
 from pathlib import Path
+import shutil
 import struct
 from typing import Any
 from unittest import mock
@@ -255,7 +256,9 @@ def _message(folder: Path) -> list[bytes]:
 
 
 def _metadata(folder: Path) -> list[bytes]:
-    write_record(example(), folder / 'bag', overwrite=True)
+    # of changed metadata no bag can be told, and what is no bag is never replaced
+    shutil.rmtree(folder / 'bag', ignore_errors=True)
+    write_record(example(), folder / 'bag')
     return [(folder / 'bag' / 'metadata.yaml').read_bytes()]
 
 
