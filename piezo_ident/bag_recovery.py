@@ -137,7 +137,8 @@ def damage_as_data_error(path: Path) -> Iterator[None]:
     """Turn whatever a damaged bag provokes into a `DataError` that names the bag."""
     try:
         yield
-    except DataError:
+    # too little memory is no damage
+    except (DataError, MemoryError):
         raise
     # damage surfaces in a reader as anything from an assertion to a zstd error
     except Exception as error:  # noqa: BLE001

@@ -344,7 +344,8 @@ def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
     """Turn whatever a parser throws at damaged bytes into one line."""
     try:
         yield
-    except DataError:
+    # too little memory is no damage
+    except (DataError, MemoryError):
         raise
     # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
     except Exception as error:
