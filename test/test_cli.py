@@ -31,6 +31,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.cli import main
 from piezo_ident.cli.common import expand
+from piezo_ident.cli.console import Console
 from piezo_ident.cli.demo import find_measured
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_file, check_folder
@@ -450,14 +451,27 @@ def test_folder_without_records(capsys, tmp_path):
     refuse(capsys, tmp_path, ['identify', tmp_path / 'empty'], tmp_path / 'empty', 'give a bag')
 
 
-def test_a_folder_of_records_leaves_none_out_unsaid(tmp_path):
+def test_a_folder_of_records_leaves_none_out_unsaid(capsys, tmp_path):
     for name in ('TEK0001.CSV', 'b.csv', 'notes.txt', '.hidden.csv'):
         (tmp_path / name).write_text('')
     (tmp_path / 'crashed').mkdir()
     (tmp_path / 'crashed' / 'crashed.mcap').write_bytes(b'')
     (tmp_path / 'pictures').mkdir()
-    found = expand([tmp_path])
-    assert [path.name for path in found] == ['TEK0001.CSV', 'b.csv', 'crashed.mcap']
+    # a table beside a ledger holds the results of many records
+    (tmp_path / 'line').mkdir()
+    for name in ('done.jsonl', 'records.csv'):
+        (tmp_path / 'line' / name).write_text('')
+    taken = ['TEK0001.CSV', 'b.csv', 'crashed.mcap']
+    assert [path.name for path in expand([tmp_path], Console())] == taken
+    assert capsys.readouterr().err == ''
+    (tmp_path / 'monday').mkdir()
+    (tmp_path / 'monday' / 'a.NPZ').write_text('')
+    (tmp_path / 'bags' / 'whole').mkdir(parents=True)
+    (tmp_path / 'bags' / 'whole' / 'metadata.yaml').write_text('')
+    assert [path.name for path in expand([tmp_path], Console())] == taken
+    said = capsys.readouterr().err
+    assert 'what is in its folders is not read (bags, monday); name them' in said
+    assert said.count('\n') == 1
 
 
 def test_files_of_one_name_are_two_records(capsys, tmp_path, made):

@@ -28,6 +28,7 @@ from piezo_ident import record_io
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.ledger import LEDGER
 from piezo_ident.long_record import LongRecord, Progress
 from piezo_ident.record import Record
 from piezo_ident.record_io import read_record
@@ -62,25 +63,32 @@ def naming(*names: str) -> Iterator[None]:
         raise type(error)(f'{", ".join(names)}: {error}') from None
 
 
-def expand(paths: Sequence[Path]) -> list[Path]:
+def expand(paths: Sequence[Path], console: Console) -> list[Path]:
     """Return the records that are named: a folder that is no bag stands for all in it."""
     found = []
     for path in paths:
         if not path.is_dir() or (path / 'metadata.yaml').is_file():
             found.append(path)
             continue
-        inside = [record for p in sorted(path.iterdir()) for record in _records_of(p)]
+        places = sorted(path.iterdir())
+        inside = [record for p in places for record in _records_of(p)]
         if not inside:
             raise DataError(
                 f'{path}: a folder without records; give a bag, or a folder with '
                 f'{", ".join(RECORD_FILES)} files'
+            )
+        left_out = [p.name for p in places if _is_left_out(p)]
+        if left_out:
+            console.note(
+                f'{path}: what is in its folders is not read ({", ".join(left_out)}); name them, '
+                'too, where their records are meant'
             )
         found += inside
     return found
 
 
 def expand_apart(
-    records: Sequence[Path], validation: Sequence[Path]
+    records: Sequence[Path], validation: Sequence[Path], console: Console
 ) -> tuple[list[Path], list[Path]]:
     """
     Return the records that are named for a model and for its validation.
@@ -90,7 +98,7 @@ def expand_apart(
     DataError
         When one is named for both.
     """
-    paths, further = expand(records), expand(validation)
+    paths, further = expand(records, console), expand(validation, console)
     # pathlib has an error of its own for links in a circle
     fitted = set(map(os.path.realpath, paths))
     for path in further:
@@ -105,11 +113,24 @@ def _records_of(path: Path) -> list[Path]:
     """Return what a folder of records has in one of its places."""
     if path.name.startswith('.'):
         return []
-    if path.is_dir() and not (path / 'metadata.yaml').is_file():
-        # a bag that was not finished is not to be left out unsaid
-        return [p for p in sorted(path.glob('*')) if p.suffix.lower() in BAG_FILES]
-    is_record = path.is_dir() or (path.is_file() and path.suffix.lower() in RECORD_FILES)
-    return [path] if is_record else []
+    if _is_record(path):
+        return [path]
+    # a bag that was not finished is not to be left out unsaid
+    return [p for p in sorted(path.glob('*')) if p.suffix.lower() in BAG_FILES]
+
+
+def _is_left_out(path: Path) -> bool:
+    """Tell whether one of the places in a folder of records is a folder of further ones."""
+    # the table of many records is none itself
+    if path.name.startswith('.') or _is_record(path) or (path / LEDGER).is_file():
+        return False
+    return any(_is_record(p) and p.suffix.lower() not in BAG_FILES for p in path.glob('[!.]*'))
+
+
+def _is_record(path: Path) -> bool:
+    return (path / 'metadata.yaml').is_file() or (
+        path.is_file() and path.suffix.lower() in RECORD_FILES
+    )
 
 
 def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:

@@ -59,7 +59,7 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
         diagnose_each(args, settings, console)
         return
     check_order(args.model_file, args.records[0], 'diagnose')
-    paths, further = expand_apart(args.records, args.validation)
+    paths, further = expand_apart(args.records, args.validation, console)
     _check_outputs(args, [args.model_file, *paths, *further])
     given = load_model(args.model_file)
     everything = read_all([*paths, *further], args)

@@ -83,7 +83,7 @@ def identify_each(args: argparse.Namespace, settings: Settings, console: Console
     reading = _reading(args)
     jobs = [
         Identify(name, path, reading, settings, identification_files if args.reports else None)
-        for name, path in _named(_records(args))
+        for name, path in _named(_records(args, console))
     ]
     _each(args, jobs, 'identified', console)
 
@@ -95,7 +95,7 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     reading = _reading(args)
     find = _models(args.model_file)
     jobs = []
-    for name, path in _named(_records(args)):
+    for name, path in _named(_records(args, console)):
         model, text = find(name)
         jobs.append(
             Diagnose(
@@ -111,8 +111,8 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     _each(args, jobs, 'diagnosed', console)
 
 
-def _records(args: argparse.Namespace) -> list[Path]:
-    paths = expand(args.records)
+def _records(args: argparse.Namespace, console: Console) -> list[Path]:
+    paths = expand(args.records, console)
     check_bag_options(paths, args)
     return paths
 

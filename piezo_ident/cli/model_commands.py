@@ -75,7 +75,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     if args.each is not None:
         identify_each(args, settings, console)
         return
-    paths, further = expand_apart(args.records, args.validation)
+    paths, further = expand_apart(args.records, args.validation, console)
     if args.model is not None:
         check_suffix(args.model, MODEL_FILES, 'a model')
         if args.model.parent == args.report:
