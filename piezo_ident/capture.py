@@ -40,6 +40,7 @@ from piezo_ident.wire_format import Samples
 
 __all__ = [
     'APPLIED',
+    'SPARSE',
     'Capture',
     'Snapshot',
     'record_of_streams',
@@ -51,7 +52,9 @@ __all__ = [
 APPLIED = 'applied_voltage'
 #: commanded and applied voltage may differ by this share of the range
 TOLERANCE = 1e-3
-#: most of a segment, by time, that may be missing before it is no longer used
+#: fault of a further channel of a lower rate, or that ended early
+SPARSE = 'sparse_channel'
+#: most of a segment by time, or of a further channel, that may be missing before it is not used
 MAX_MISSING = 0.05
 #: segments that the three steps stand on
 NEEDED = ('step', 'noise', 'triangle')
@@ -80,7 +83,8 @@ def record_of_streams(
     streams : mapping of str to Stream
         Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
         command and applied voltage differ, the amplifier's guard was at work: the stage did not
-        get the command, so these samples are cut out.
+        get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
+        `MAX_MISSING` of the samples is left out.
     name : str
         What errors call the data, and the record's name.
     tolerance : float, optional
@@ -94,13 +98,14 @@ def record_of_streams(
     DataError
         For data that cannot be used without a guess.
     """
-    needed = {key: stream for key, stream in streams.items() if key != APPLIED}
+    sparse = _sparse(streams)
+    needed = {key: s for key, s in streams.items() if key != APPLIED and key not in sparse}
     try:
         joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
     except DataError as error:
         raise DataError(f'{name}: {error}') from None
     met, t, columns, segments = (
-        [*faults, *joined.faults],
+        [*faults, *sparse.values(), *joined.faults],
         joined.t,
         joined.columns,
         joined.segments,
@@ -143,6 +148,16 @@ def record_of_streams(
         faults=met,
         overall=overall,
     )
+
+
+def _sparse(streams: Mapping[str, Stream]) -> dict[str, Fault]:
+    """Return the further channels for whose sake too many other samples would be cut out."""
+    n = min(streams['voltage'].n, streams['displacement'].n)
+    return {
+        key: Fault(SPARSE, f'{key}, {stream.n} samples beside {n}', n - stream.n, 'left out')
+        for key, stream in streams.items()
+        if key.startswith('x_') and stream.n < (1.0 - MAX_MISSING) * n
+    }
 
 
 def tolerance_of(v: NDArray[np.float64]) -> float:

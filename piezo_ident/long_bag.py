@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.bag_io import read_bag, record_in
 from piezo_ident.bag_samples import BagSamples, opened_samples
-from piezo_ident.capture import record_of_streams, tolerance_of
+from piezo_ident.capture import record_of_streams, SPARSE, tolerance_of
 from piezo_ident.errors import DataError
 from piezo_ident.long_record import LongRecord, NeedsWhole, Progress
 from piezo_ident.outlining import Outlining
@@ -164,6 +164,8 @@ class _Reading:
                     if self.rate is None:
                         self.rate = record.pieces[0].sample_rate
                     _check_clock(streams['voltage'].times, self.rate, slack)
+                    if any(fault.name == SPARSE for fault in record.faults):
+                        raise NeedsWhole('a channel is sparse in one window, which is not all')
                     found.add(record, lap, self.rate)
                     if inspect is not None:
                         inspect(record)

@@ -285,6 +285,21 @@ def test_remapped_and_further_topics(tmp_path):
     assert read_bag(write(tmp_path / 'bag2', messages)).n == 1000
 
 
+@pytest.mark.parametrize(('step', 'stop', 'n'), [(10, 1000, 100), (1, 600, 600)])
+def test_a_sparse_channel_costs_no_other_sample(tmp_path, step, stop, n):
+    messages = []
+    for v, y in blocks():
+        x = v.t[v.t < stop / RATE][::step]
+        messages += [('/voltage', v), ('/displacement', y)]
+        messages += [('/x_temp', Samples(x, x, '', 'x_temp'))] if x.size else []
+    got = read_bag(write(tmp_path / 'bag', messages))
+    (piece,) = got.pieces
+    assert (piece.n, list(piece.channels)) == (1000, [])
+    (fault,) = got.faults
+    assert (fault.name, fault.count) == ('sparse_channel', 1000 - n)
+    assert str(fault.where) == f'x_temp, {n} samples beside 1000'
+
+
 @pytest.mark.parametrize('name', ['prediction', 'residual'])
 def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
     messages = [m for v, y in blocks() for m in (('/s/voltage', v), (f'/s/{name}', y))]

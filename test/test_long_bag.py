@@ -240,6 +240,17 @@ def test_stream_that_is_absent_for_long_is_read_whole(tmp_path):
     assert faults['gap'] == 1
 
 
+@pytest.mark.parametrize(('end', 'kept'), [(1.15, True), (4.0, False)])
+def test_channel_that_is_absent_for_a_while_is_judged_by_the_whole(tmp_path, end, kept):
+    tape = Tape(6000)
+    tape.columns['x_temp'] = tape.v + 1
+    tape.cut()
+    tape.messages = [(q, s) for q, s in tape.messages if q != '/x_temp' or not 1.0 < s.t[0] < end]
+    (_, faults, _), record = same(tape.save(tmp_path / 'b'), long=False)
+    assert ('sparse_channel' in faults) != kept
+    assert all(list(p.channels) == ['temp'] * kept for p in record.pieces)
+
+
 def test_whole_record_is_judged(tmp_path):
     tape = Tape()
     # one window at rest, one with more than one per cent of NaN: neither is refused for it
