@@ -122,9 +122,10 @@ Two hours at 20 kHz are 1.4e8 samples. They stand for a week where nothing but t
 that grows with messages shows in two hours as it does in a week (the slope is in the table), the
 sample clock is counted from its start and not summed up, so its rounding does not grow
 (t = k/fs stays exact to 2^53 ticks, 14,000 years), and a recording is cut into parts. They do not
-stand for a week where the world changes: the wall clock may be set, a disk fills, temperature and
-stage drift, Fast DDS and the kernel are not watched for leaks below the slope's resolution, and
-t loses digits in text (a CSV needs 11 of them after a day).
+stand for a week where the world changes: a disk fills, temperature and stage drift, somebody sets
+the clock of the machine (log times then go on as before; a test does it to a made-up clock), Fast
+DDS and the kernel are not watched for leaks below the slope's resolution, and t loses digits in
+text (a CSV needs 11 of them after a day).
 """
 
 
