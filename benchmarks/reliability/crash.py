@@ -140,7 +140,8 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
     programme.write_text('{limits: [0, 10], segments: [{signal: hold, level: 5, duration: 2}]}')
     found = [
         Job('save', 'save', _save(stage), ('model.yaml',)),
-        Job('report', 'report', _report(stage), ('report.html', 'model.yaml', 'loops.png')),
+        Job('report', 'report', _report(stage),
+            ('report.html', 'identification.json', 'model.yaml', 'loops.png')),
         *(
             Job('convert', f'convert to {x}', command('convert', record, f'OUT/{x}',
                 '--overwrite'), (x,)) for x in FORMATS
@@ -158,7 +159,8 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
         found += [
             Job('identify', 'identify', command('identify', inputs / 'learn.npz', '--model',
                 'OUT/model.yaml', '--report', 'OUT/report'),
-                ('model.yaml', 'report/report.html', 'report/model.yaml')),
+                ('model.yaml', 'report/report.html', 'report/identification.json',
+                 'report/model.yaml')),
             Job('diagnose', 'diagnose', command('diagnose', stage, inputs / 'check.npz', '--only',
                 'creep', '--model', 'OUT/refined.yaml', '--report', 'OUT/report'),
                 ('refined.yaml', 'report/report.html', 'report/diagnosis.json')),
