@@ -38,6 +38,8 @@ _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 _UNHEARD = 'unheard'
 #: how long the last blocks may be under way after the excitation says done [s]
 _TAIL = 1.0
+#: after how long a programme that is not acknowledged is set once more [s]
+_AGAIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Drive:
         node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
         self._phase = ''
         self._future: Any = None
+        self._asked = 0.0
         self._state, self._message = '', ''
         self.progress = 0.0
 
@@ -170,10 +173,8 @@ class Drive:
         ready = self._set.service_is_ready() and self._start.service_is_ready()
         missing = self._missing() if ready else ''
         if ready and not missing:
-            parameter = Parameter('program', value=self._program).to_parameter_msg()
-            request = SetParameters.Request(parameters=[parameter])
             self._phase, self._sign = 'setting', time.monotonic()
-            self._future = self._set.call_async(request)
+            self._ask_for_programme()
         elif missing and self._silent():
             self._end(f'nobody publishes {missing} within {self._limit:g} s; start the stage')
         elif self._silent():
@@ -182,9 +183,20 @@ class Drive:
                 'it in this namespace, or remap that name'
             )
 
+    def _ask_for_programme(self) -> None:
+        parameter = Parameter('program', value=self._program).to_parameter_msg()
+        if self._future is not None:
+            self._set.remove_pending_request(self._future)
+        self._future = self._set.call_async(SetParameters.Request(parameters=[parameter]))
+        self._asked = time.monotonic()
+
     def _setting(self) -> None:
         answer = self._answer('taking the programme')
         if answer is None:
+            # what both sides have not heard of each other yet is dropped by the middleware, and to
+            # set a programme twice does no harm
+            if self.running and time.monotonic() - self._asked > _AGAIN:
+                self._ask_for_programme()
             return
         result = answer.results[0]
         if not result.successful:

@@ -1,0 +1,99 @@
+# Copyright 2026 The piezo_ident authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The route to the excitation where the middleware drops a call."""
+
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+
+from piezo_ident.nodes import drive
+from piezo_ident.nodes.drive import Drive, Streams
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+ANSWERS = {
+    SetParameters: SetParameters.Response(results=[SetParametersResult(successful=True)]),
+    Trigger: Trigger.Response(success=True),
+}
+
+
+class Client:
+    """A client whose first calls are never answered."""
+
+    srv_name = 'a service'
+
+    def __init__(self, kind, dropped):
+        self.kind, self.dropped = kind, dropped
+        self.calls, self.waited_for = 0, set()
+
+    def service_is_ready(self):
+        return True
+
+    def call_async(self, request):
+        self.calls += 1
+        future = Future()
+        self.waited_for.add(future)
+        if self.calls > self.dropped:
+            future.set_result(ANSWERS[self.kind])
+        return future
+
+    def remove_pending_request(self, future):
+        self.waited_for.remove(future)
+
+
+class Node:
+    """A node that hears nothing."""
+
+    def __init__(self, dropped):
+        self.clients = []
+        self.dropped = dropped
+
+    def create_client(self, kind, name, qos_profile):
+        lost = self.dropped if kind is SetParameters else 0
+        self.clients.append(Client(kind, lost))
+        return self.clients[-1]
+
+    def create_subscription(self, *_):
+        pass
+
+
+@pytest.mark.parametrize(
+    ('dropped', 'reason'), [(2, None), (10**6, 'gave no answer within 0.3 s')]
+)
+def test_a_programme_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, reason):
+    monkeypatch.setattr(drive, '_AGAIN', 0.01)
+    node, ends, begun = Node(dropped), [], []
+    nan = float('nan')
+    it = Drive(node, lambda: Streams(0, nan, 0, nan), lambda: '')
+    it.start('programme', 0.3, ends.append, lambda: begun.append(True))
+    give_up = time.monotonic() + 10.0
+    while it.running and not begun and time.monotonic() < give_up:
+        it.poll()
+        time.sleep(0.001)
+    setter, starter, _ = node.clients
+    if reason is None:
+        # started once, when the programme is there
+        assert begun == [True] and ends == []
+        assert (setter.calls, starter.calls) == (3, 1)
+    else:
+        assert begun == [] and reason in ends[0]
+        assert setter.calls > 2 and starter.calls == 0
+    # those that were given up are waited for no more
+    assert len(setter.waited_for) == 1
