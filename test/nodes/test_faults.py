@@ -411,6 +411,8 @@ def shifted(blocks: list[Samples], tick: int) -> list[Samples]:
 def test_a_stage_that_is_killed_and_comes_back_joins_by_a_ramp(rig):
     g, models = rig.g, len(rig.models)
     rig.send(BLOCKS[:K])
+    # what is on its way dies with who sent it
+    rig.settle()
     g.handle('stage').kill()
     volts = BLOCKS[K - 1].values[-1]
     hold = rig.holding(rig.answered(), volts)
