@@ -137,8 +137,7 @@ def damage_as_data_error(path: Path) -> Iterator[None]:
     """Turn whatever a damaged bag provokes into a `DataError` that names the bag."""
     try:
         yield
-    # too little memory is no damage
-    except (DataError, MemoryError):
+    except DataError:
         raise
     # damage surfaces in a reader as anything from an assertion to a zstd error
     except Exception as error:  # noqa: BLE001

@@ -255,8 +255,7 @@ def _unpacked(packed: memoryview, compression: str, size: int, whole: bool) -> m
                 raise _Damage('a chunk with two sizes')
             # half a frame of lz4 gives nothing
             return memoryview(_lz4_decompress(bytes(packed)) if whole else b'')
-    # too little memory is no damage
-    except (_Damage, MemoryError):
+    except _Damage:
         raise
     # each library has errors of its own, that share no base
     except Exception as error:  # noqa: BLE001

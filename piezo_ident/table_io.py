@@ -344,8 +344,7 @@ def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
     """Turn whatever a parser throws at damaged bytes into one line."""
     try:
         yield
-    # too little memory is no damage
-    except (DataError, MemoryError):
+    except DataError:
         raise
     # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
     except Exception as error:

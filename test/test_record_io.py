@@ -381,25 +381,6 @@ def test_damaged_files(tmp_path, name):
             refuse(path)
 
 
-@pytest.mark.parametrize(
-    ('name', 'where'),
-    [
-        ('r.npz', 'piezo_ident.table_io._from_arrays'),
-        ('r.mat', 'piezo_ident.table_io._from_arrays'),
-        ('r.mcap', 'piezo_ident.bag_recovery.Reader'),
-    ],
-)
-def test_too_little_memory_is_no_damage(tmp_path, monkeypatch, name, where):
-    def exhausted(*args: object) -> None:
-        raise MemoryError
-
-    path = tmp_path / name
-    write_record(record(), path)
-    monkeypatch.setattr(where, exhausted)
-    with pytest.raises(MemoryError):
-        read_record(path, recover=True)
-
-
 def test_matlab_73(tmp_path):
     path = tmp_path / 'r.mat'
     path.write_bytes(b'MATLAB 7.3 MAT-file'.ljust(512) + b'\x89HDF\r\n\x1a\n' + bytes(600))
