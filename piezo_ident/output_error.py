@@ -89,8 +89,9 @@ class OutputErrorFit:
         G, na = self.dynamics, self.dynamics.a.size
         J = np.eye(na + G.b.size)
         # b / g with the gain g = sum(b) / (1 + sum(a))
-        J[na:, :na] = (G.b / G.b.sum())[:, None]
-        J[na:, na:] -= (G.b / G.b.sum())[:, None]
+        share = (G.b / G.b.sum())[:, None]
+        J[na:, :na] = share
+        J[na:, na:] -= share
         J[na:, na:] /= G.gain
         return np.asarray(J @ self.covariance @ J.T)
 

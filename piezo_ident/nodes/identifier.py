@@ -92,7 +92,7 @@ class IdentifierNode(LabNode):
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
         self._captured = self.create_publisher(Float64MultiArray, 'captured', STREAM)
-        self._intake = Intake(self, self._take)
+        self._intake = Intake(self, lambda *block: self._held.append(block))
         for key in ('voltage', 'displacement', APPLIED):
             self._intake.listen(key, key)
         for topic in self.values['channels'].split():
@@ -122,22 +122,16 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        if not self._drive.is_starting:
-            while self._held:
-                self._keep(*self._held.popleft())
-        if self._intake.drain() and self._newest:
+        self._intake.drain()
+        # what was captured before a run is forgotten once it has begun, and kept if it does not
+        if self._drive.is_starting or not self._held:
+            return
+        while self._held:
+            self._take(*self._held.popleft())
+        if self._newest:
             self._answer()
 
     def _take(
-        self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
-    ) -> None:
-        # what was captured before a run is forgotten once it has begun, and kept if it does not
-        if self._drive.is_starting:
-            self._held.append((topic, key, message, info))
-        else:
-            self._keep(topic, key, message, info)
-
-    def _keep(
         self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
     ) -> None:
         try:
