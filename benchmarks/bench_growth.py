@@ -29,12 +29,12 @@ import time
 from growth_of_bags import BAG_BYTES, BAG_MEASURES, Measure, paper, RATE, sine, SPARE
 from growth_of_fits import base_model, beginnings, EFFECT, FIT_MEASURES, labelled, to_diagnose
 import numpy as np
-from piezo_ident.arx import arx_factor, scan_orders
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
-from piezo_ident.hysteresis import Hysteresis
-from piezo_ident.hysteresis_fit import Excerpt, factorise, fit_hysteresis
-from piezo_ident.model import StageModel
+from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders
+from piezo_ident.identification.step3_hysteresis import Excerpt, factorise, fit_hysteresis
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.hysteresis import Hysteresis
 from side_by_side import last_line, markdown, peak_memory, seconds, take_turns, versions
 
 #: points at the large end through which the exponent is drawn

@@ -24,17 +24,22 @@ import sys
 import time
 
 import numpy as np
-from piezo_ident.arx import arx_factor, excited_band, prefilter, scan_orders
-from piezo_ident.dynamics import Delay
-from piezo_ident.hysteresis_fit import even_thresholds, factorise, fit_hysteresis
-from piezo_ident.identification import identify
-from piezo_ident.program import parse_program
-from piezo_ident.record import Record
-from piezo_ident.results import Settings, silent
-from piezo_ident.runs import prepare, Run
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.three_steps import first_step, second_step, triangle_excerpts
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.prepare import prepare, Run
+from piezo_ident.identification.results import Settings, silent
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    excited_band,
+    prefilter,
+    scan_orders,
+)
+from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
+from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.operators.dynamics import Delay
+from piezo_ident.record.record import Record
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
 
 RUNS = 5

@@ -33,13 +33,13 @@ for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(name, '1')
 
 import numpy as np
-from piezo_ident.dynamics import Delay, Dynamics
-from piezo_ident.hysteresis import Hysteresis
-from piezo_ident.ledger import LEDGER
-from piezo_ident.model import Scaling, StageModel
-from piezo_ident.program import parse_program
-from piezo_ident.record_io import write_record
-from piezo_ident.simulation import Sensor, simulate, SimulatedStage
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.many.ledger import LEDGER
+from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
+from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.io import write_record
 from side_by_side import markdown, ratio, take_turns
 
 HOME = Path(__file__).resolve().parents[1]

@@ -28,12 +28,18 @@ from typing import Any
 import warnings
 
 import numpy as np
-from piezo_ident.arx import arx_factor, excited_band, prefilter, scan_orders, stabilised
-from piezo_ident.dynamics import Dynamics
-from piezo_ident.output_error import output_error, Stretch
-from piezo_ident.program import load_program
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.solvers.output_error import output_error, Stretch
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    excited_band,
+    prefilter,
+    scan_orders,
+    stabilised,
+)
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.operators.dynamics import Dynamics
 from scipy.signal import lfilter
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
 

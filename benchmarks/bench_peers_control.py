@@ -18,10 +18,10 @@ import sys
 import warnings
 
 import numpy as np
-from piezo_ident.dynamics import filter_arx
-from piezo_ident.record import Piece
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
+from piezo_ident.common.config import find_config
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.operators.dynamics import filter_arx
+from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
 from side_by_side import markdown, ratio, seconds, take_turns, versions
 

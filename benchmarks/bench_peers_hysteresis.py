@@ -34,14 +34,14 @@ import warnings
 
 from numba import njit
 import numpy as np
-from piezo_ident.identification import identify
-from piezo_ident.metrics import FORMULA
-from piezo_ident.program import load_program
-from piezo_ident.record import Record
-from piezo_ident.record_io import read_record
-from piezo_ident.results import Settings
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate, simulate_truth
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Record
 from side_by_side import markdown, seconds, take_turns, Turn, versions
 
 DATA = Path(

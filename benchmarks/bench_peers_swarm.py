@@ -26,14 +26,20 @@ import sys
 from typing import Any
 
 import numpy as np
-from piezo_ident.hysteresis_fit import even_thresholds, factorise, P1_BOX, P2_BOX, WEIGHT_BOX
-from piezo_ident.least_squares import bounded_least_squares
-from piezo_ident.program import load_program
-from piezo_ident.runs import prepare
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.swarm import particle_swarm, Quadratic
-from piezo_ident.three_steps import triangle_excerpts
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.prepare import prepare
+from piezo_ident.identification.solvers.least_squares import bounded_least_squares
+from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
+from piezo_ident.identification.step3_hysteresis import (
+    even_thresholds,
+    factorise,
+    P1_BOX,
+    P2_BOX,
+    WEIGHT_BOX,
+)
+from piezo_ident.identification.three_steps import triangle_excerpts
+from piezo_ident.model.simulated_stage import load_stage, simulate
 from scipy.optimize import Bounds, differential_evolution
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
 
@@ -200,7 +206,7 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     task = problem()
     tuned, book = {'w': 0.6, 'c': 1.7}, {'w': 0.7298, 'c': 1.49618}
     works = {
-        'piezo_ident.swarm': partial(ours, task),
+        'piezo_ident.identification.solvers.particle_swarm': partial(ours, task),
         'pyswarms, ring, tuned': partial(
             pyswarms, task, ring=True, bh_strategy='intermediate', **tuned
         ),

@@ -25,14 +25,14 @@ import sys
 
 from numba import njit
 import numpy as np
-from piezo_ident.block import Block
-from piezo_ident.live import Predictor
-from piezo_ident.model import CHUNK, EffectSetting, StageModel
-from piezo_ident.play import weighted_plays
-from piezo_ident.record import Piece
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
-from piezo_ident.wire_format import Samples
+from piezo_ident.common.config import find_config
+from piezo_ident.live.predictor import Predictor
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.stage_model import CHUNK, EffectSetting, StageModel
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.play import weighted_plays
+from piezo_ident.record.blocks import Samples
+from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
 from side_by_side import markdown, ratio, take_turns, Turn, versions
 
@@ -314,7 +314,7 @@ def plays(model: StageModel, n: int, short: int, runs: int) -> tuple[str, str]:
     base = 'kernel fused by hand'
     works = {
         base: (h.fused, n),
-        '`piezo_ident.play.weighted_plays`': (h.ours, n),
+        '`piezo_ident.operators.play.weighted_plays`': (h.ours, n),
         'NumPy, vectorised prefix scan': (h.prefix_scan, n // 4),
         'NumPy, loop over time': (h.numpy_loop, short),
         'Python, loops over time and plays': (h.python_loop, short),

@@ -30,18 +30,18 @@ from bench_identification import record_of_17_s
 from bench_prediction import BLOCK, fused_plays, voltage
 from numba import njit
 import numpy as np
-from piezo_ident.block import Block
-from piezo_ident.core_loops import coefficients, recursion, sum_of_plays
-from piezo_ident.dynamics import Dynamics, filter_arx
-from piezo_ident.filtered_plays import filtered_plays
-from piezo_ident.fused import STRETCH
-from piezo_ident.identification import identify
-from piezo_ident.model import StageModel
-from piezo_ident.output_error import _Problem, Stretch
-from piezo_ident.play import play_columns, weighted_plays
-from piezo_ident.record import Piece
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
+from piezo_ident.common.config import find_config
+from piezo_ident.identification.filtered_plays import filtered_plays
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.solvers.output_error import _Problem, Stretch
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+from piezo_ident.operators.fused import STRETCH
+from piezo_ident.operators.kernels import coefficients, recursion, sum_of_plays
+from piezo_ident.operators.play import play_columns, weighted_plays
+from piezo_ident.record.record import Piece
 from side_by_side import markdown, ratio, seconds, take_turns, versions
 
 RUNS = 5

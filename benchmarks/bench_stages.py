@@ -25,11 +25,11 @@ import time
 
 from bench_live import Fetcher, machine, RATE, Shares, sine
 import numpy as np
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.model_io import save_model
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.model.files import save_model
+from piezo_ident.model.simulated_stage import load_stage
 from piezo_ident.nodes.starter import Nodes
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
 
 SIZES = (20, 50, 100, 200, 500, 1000)
 #: stages that are tried at most

@@ -18,15 +18,15 @@ import shutil
 import time
 
 import numpy as np
-from piezo_ident.bag_io import read_bag, typestore, write_bag
-from piezo_ident.bag_recovery import opened_bag
 from piezo_ident.cli import main as piezo_ident
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import save_model
-from piezo_ident.record import Piece, Record
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
-from piezo_ident.wire_format import decode
+from piezo_ident.common.config import find_config
+from piezo_ident.model.files import save_model
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.bags.read import read_bag, typestore, write_bag
+from piezo_ident.record.bags.recover import opened_bag
+from piezo_ident.record.blocks import decode
+from piezo_ident.record.record import Piece, Record
 
 RATE = 20_000.0
 #: bytes that a second of voltage and displacement takes in a bag, and how much must stay free

@@ -22,15 +22,15 @@ import time
 from growth_of_bags import Measure, RATE
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis.beginnings import rest_of
-from piezo_ident.identification import identify
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, save_model
-from piezo_ident.program import load_program, parse_program
-from piezo_ident.record import Piece, Record, Segment
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.model.files import load_model, save_model
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Piece, Record, Segment
 from side_by_side import last_line, markdown, peak_memory, seconds
 
 __all__ = ['EFFECT', 'FIT_MEASURES', 'base_model', 'beginnings', 'labelled', 'to_diagnose']

@@ -30,13 +30,13 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
+from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.identification import identify
-from piezo_ident.model import StageModel
-from piezo_ident.prediction import predict_record
-from piezo_ident.program import load_program
-from piezo_ident.record import Piece, Record, Segment
-from piezo_ident.shipped import find_config
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Piece, Record, Segment
 from tqdm import tqdm
 from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, programme
 

@@ -24,15 +24,15 @@ import sys
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.identification import identify
-from piezo_ident.metrics import percent_of_stroke
-from piezo_ident.model import StageModel
-from piezo_ident.program import load_program
-from piezo_ident.record import Record
-from piezo_ident.results import Identification, Settings
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate, simulate_truth, SimulatedStage
-from piezo_ident.validation import sine_errors
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth, SimulatedStage
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import sine_errors
+from piezo_ident.record.record import Record
 import scipy
 from tqdm import tqdm
 

@@ -23,15 +23,15 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose
-from piezo_ident.identification import identify
-from piezo_ident.memory import start_memory
-from piezo_ident.metrics import percent_of_stroke
-from piezo_ident.model import StageModel
-from piezo_ident.program import load_program, parse_program
-from piezo_ident.record import Piece, Record, Segment
-from piezo_ident.shipped import find_config
-from piezo_ident.validation import sine_errors
+from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.model.initial_memory import start_memory
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import sine_errors
+from piezo_ident.record.record import Piece, Record, Segment
 from truths import table_one_sines
 from truths.table_one import table_one_stage
 

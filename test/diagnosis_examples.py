@@ -19,12 +19,12 @@ from piezo_ident.diagnosis.results import (
     Unexplained,
     Untestable,
 )
-from piezo_ident.dynamics import Delay, Dynamics
-from piezo_ident.hysteresis import Hysteresis
-from piezo_ident.model import EffectSetting, Scaling, StageModel
-from piezo_ident.program import parse_program
-from piezo_ident.record import Fault, Piece, Record, Segment
-from piezo_ident.validation import sine_frequency
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.validation import sine_frequency
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Fault, Piece, Record, Segment
 
 #: what a name in somebody's file may hold
 HOSTILE = '<script>alert("$x^$")</script>\x1b[31m'

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.block import Block
 from piezo_ident.effects import find_effect, View
-from piezo_ident.model import EffectSetting, StageModel
-from piezo_ident.simulation import load_stage
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.operators.chain import Block
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[1]

@@ -4,7 +4,7 @@
 """Residuals of known content for the tests of the residual: drives, noises, parts."""
 
 import numpy as np
-from piezo_ident.record import Piece, Segment
+from piezo_ident.record.record import Piece, Segment
 from piezo_ident.residual import ResidualPart
 from scipy.signal import lfilter
 

@@ -18,7 +18,7 @@ MODULES = [
 
 
 def test_there_are_modules():
-    assert 'piezo_ident.swarm' in MODULES
+    assert 'piezo_ident.identification.solvers.particle_swarm' in MODULES
 
 
 @pytest.mark.parametrize('name', MODULES)

@@ -31,8 +31,8 @@ import numpy as np
 HERE = Path(__file__).resolve()
 sys.path[:0] = [str(HERE.parent), str(HERE.parents[2] / 'test/nodes')]
 
-from piezo_ident.guard import GuardSettings
-from piezo_ident.wire_format import Samples
+from piezo_ident.live.guard import GuardSettings
+from piezo_ident.record.blocks import Samples
 from safety import check
 
 __all__ = ['Attack', 'bad_parameters', 'foreign_models', 'odd_blocks', 'odd_messages']

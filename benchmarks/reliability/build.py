@@ -54,15 +54,15 @@ TAIL = """
 ## Files from strangers
 
 Every reader compares what a file announces with the file itself before it takes memory for it;
-the limits stand in `piezo_ident/limits.py`. What a file unpacks to must stay below 100 times its
-size (64 MiB for small ones). YAML is read by the safe loader, without merge keys, with at most
-50,000 entries; aliases count as what they stand for. No pickle is loaded from a file: npz archives
-with Python objects are refused, MATLAB files are read by the package itself, since SciPy's reader
-takes memory for what an array announces and ends the process on some damaged files. Bags are
-looked at before rosbags opens them: links out of the folder, indexes that lead elsewhere, views,
-triggers and computed columns are refused, and so is a journal that names another file, which
-SQLite would delete. Labels and names are escaped in reports and cleaned of control characters
-before they reach a terminal.
+the limits stand in `piezo_ident/common/limits.py`. What a file unpacks to must stay below 100
+times its size (64 MiB for small ones). YAML is read by the safe loader, without merge keys, with
+at most 50,000 entries; aliases count as what they stand for. No pickle is loaded from a file: npz
+archives with Python objects are refused, MATLAB files are read by the package itself, since
+SciPy's reader takes memory for what an array announces and ends the process on some damaged
+files. Bags are looked at before rosbags opens them: links out of the folder, indexes that lead
+elsewhere, views, triggers and computed columns are refused, and so is a journal that names
+another file, which SQLite would delete. Labels and names are escaped in reports and cleaned of
+control characters before they reach a terminal.
 
 An effect plug-in is code that somebody installed; it can do what any program can.
 
@@ -82,8 +82,8 @@ further from the one before than the slew allows; where limits are moved, it goe
 the slew. Silence ends at rest by a ramp, a new stream is joined by one, a second publisher moves
 nothing.
 
-`benchmarks/reliability/safety.py` has it as code; `test/test_safety_property.py` tries some of it
-in every `make test`, and the runs of the graph in this table check it on `applied_voltage`.
+`benchmarks/reliability/safety.py` has it as code; `test/live/test_safety_property.py` tries some
+of it in every `make test`, and the runs of the graph in this table check it on `applied_voltage`.
 It holds while the process that drives the amplifier lives and its converter keeps its last value
 when it dies: against SIGKILL and power failure only a watchdog in the amplifier helps
 ([driver.md](driver.md)).

@@ -38,14 +38,14 @@ import warnings
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from piezo_ident.cli import main as piezo_ident
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.model_io import load_model, save_model
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.model.files import load_model, save_model
+from piezo_ident.model.simulated_stage import load_stage
 from piezo_ident.plots import draw  # noqa: F401 - loaded once, not in every copy
-from piezo_ident.record import Piece, Record
-from piezo_ident.record_io import read_record, write_record
+from piezo_ident.record.io import read_record, write_record
+from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.folder import put_in_place
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
 from reliability.rows import write_rows
 
 #: kills of a whole study

@@ -231,7 +231,7 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
     RuntimeError
         When the run does not come to an end, or a node ends.
     """
-    from piezo_ident.program import parse_program
+    from piezo_ident.excitation.program import parse_program
 
     with Hosts() as hosts:
         hosts.drop(percent)

@@ -31,9 +31,9 @@ import time
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.follower import Follower, Kind
-from piezo_ident.guard import Guard, GuardSettings
-from piezo_ident.wire_format import Samples
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.record.blocks import Samples
 
 __all__ = ['Broken', 'Drive', 'check', 'main', 'sequence']
 

@@ -17,8 +17,8 @@ import zipfile
 from hypothesis import strategies as st
 import numpy as np
 from piezo_ident.effects import catalogue
-from piezo_ident.model_io import parse_yaml
-from piezo_ident.signals import SIGNALS
+from piezo_ident.excitation.catalogue import SIGNALS
+from piezo_ident.model.files import parse_yaml
 from reliability.targets import seeds
 import scipy.io
 

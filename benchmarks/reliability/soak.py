@@ -34,9 +34,9 @@ import numpy as np
 HERE = Path(__file__).resolve()
 sys.path.insert(0, str(HERE.parent))
 
-from piezo_ident.bag_recovery import opened_bag
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.starter import Nodes
+from piezo_ident.record.bags.recover import opened_bag
 from rows import processors, shares, write_rows
 
 __all__ = ['Observer', 'Soak', 'soak']
@@ -339,7 +339,7 @@ def _stretches(x: np.ndarray, n: int) -> Iterator[tuple[np.ndarray, int]]:
 
 def recorded_samples(parts: list[Path]) -> dict[str, int]:
     """Return the samples of each stream in all parts together."""
-    from piezo_ident.bag_io import typestore
+    from piezo_ident.record.bags.read import typestore
 
     counts = dict.fromkeys(STREAMS, 0)
     for part in parts:

@@ -21,22 +21,22 @@ from unittest import mock
 import zipfile
 
 import numpy as np
-from piezo_ident import excitation
-from piezo_ident.bag_io import MESSAGE_TYPE, typestore
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.effects import catalogue, find_effect
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.join import join
-from piezo_ident.long_bag import read_long_bag
-from piezo_ident.long_record import LongRecord
-from piezo_ident.model import EffectSetting
-from piezo_ident.model_io import model_from_dict, parse_yaml
-from piezo_ident.program import parse_program
-from piezo_ident.record import Piece, Record, Segment
-from piezo_ident.record_io import read_record, write_record
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import stage_from_dict
-from piezo_ident.stream import Stream
-from piezo_ident.wire_format import decode, Dimension, encode, Samples
+from piezo_ident.excitation import signals as excitation
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.simulated_stage import stage_from_dict
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.blocks import decode, Dimension, encode, Samples
+from piezo_ident.record.io import read_record, write_record
+from piezo_ident.record.join import join
+from piezo_ident.record.long_bag import read_long_bag
+from piezo_ident.record.long_record import LongRecord
+from piezo_ident.record.record import Piece, Record, Segment
+from piezo_ident.record.stream import Stream
 
 __all__ = ['TARGETS', 'attempt', 'example', 'seeds']
 

@@ -26,17 +26,17 @@ import warnings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.identification import identify
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import model_from_dict, model_to_dict
-from piezo_ident.prediction import predict_record
-from piezo_ident.program import parse_program
-from piezo_ident.record import Piece, Record
-from piezo_ident.record_io import read_record
-from piezo_ident.results import Settings
-from piezo_ident.simulation import Sensor, simulate, SimulatedStage
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.files import model_from_dict, model_to_dict
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Piece, Record
 from reliability.rows import write_rows
 
 __all__ = ['CASES', 'EXPECTED', 'outcomes']

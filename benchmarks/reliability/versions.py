@@ -45,17 +45,17 @@ SOLVERS = ('least_squares', 'swarm')
 def make_data(path: Path, *, quick: bool) -> None:
     """Write the record that all identify, and the voltage that all predict."""
     if quick:
-        from piezo_ident.record_io import write_record
+        from piezo_ident.record.io import write_record
         from reliability import untrusted
 
         programme = untrusted.PROGRAMME.replace('CUTOFF', '500')
         write_record(untrusted.measured(programme), path / 'identification.npz')
         write_record(untrusted.measured(untrusted.CHECK), path / 'validation.npz')
         return
-    from piezo_ident.program import load_program
-    from piezo_ident.record_io import write_record
-    from piezo_ident.shipped import find_config
-    from piezo_ident.simulation import load_stage, simulate
+    from piezo_ident.common.config import find_config
+    from piezo_ident.excitation.program import load_program
+    from piezo_ident.model.simulated_stage import load_stage, simulate
+    from piezo_ident.record.io import write_record
 
     stage = load_stage(find_config('stage_paper', 'stage'))
     for name in ('identification', 'validation'):
@@ -67,10 +67,10 @@ def make_data(path: Path, *, quick: bool) -> None:
 def measure(path: Path) -> None:
     """Print what this interpreter makes of the data, as JSON."""
     import numba
-    from piezo_ident.identification import identify
-    from piezo_ident.model_io import model_to_dict
-    from piezo_ident.record_io import read_record
-    from piezo_ident.results import Settings
+    from piezo_ident.identification.identify import identify
+    from piezo_ident.identification.results import Settings
+    from piezo_ident.model.files import model_to_dict
+    from piezo_ident.record.io import read_record
     import scipy
 
     record = read_record(path / 'identification.npz')

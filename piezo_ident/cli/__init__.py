@@ -20,7 +20,7 @@ from typing import NoReturn
 
 from piezo_ident import __version__
 from piezo_ident.cli.interrupts import interrupts, MESSAGE, STATUS
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 
 __all__ = ['main']
 

@@ -16,13 +16,13 @@ from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
 from piezo_ident.cli.outputs import check_apart, check_folder, check_link
-from piezo_ident.errors import ConfigError
-from piezo_ident.long_record import LongRecord
-from piezo_ident.program import load_program
-from piezo_ident.record import Record
-from piezo_ident.record_io import write_record
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.program import load_program
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.record.io import write_record
+from piezo_ident.record.long_record import LongRecord
+from piezo_ident.record.record import Record
 
 __all__ = ['run']
 

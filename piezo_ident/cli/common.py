@@ -13,14 +13,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from piezo_ident import record_io
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
-from piezo_ident.errors import ConfigError, DataError, PiezoIdentError
-from piezo_ident.ledger import LEDGER
-from piezo_ident.long_record import LongRecord, Progress
-from piezo_ident.record import Record
-from piezo_ident.record_io import read_record
+from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.many.ledger import LEDGER
+from piezo_ident.record import io as record_io
+from piezo_ident.record.io import read_record
+from piezo_ident.record.long_record import LongRecord, Progress
+from piezo_ident.record.record import Record
 
 __all__ = [
     'RECORD_FILES',

@@ -14,8 +14,8 @@ import sys
 from typing import Any
 
 from piezo_ident.cli.interrupts import interrupts
-from piezo_ident.model_io import plain
-from piezo_ident.results import Progress
+from piezo_ident.identification.results import Progress
+from piezo_ident.model.files import plain
 
 __all__ = ['Console']
 

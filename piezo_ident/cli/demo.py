@@ -17,19 +17,19 @@ import time
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.errors import ConfigError, PiezoIdentError
-from piezo_ident.identification import identify
-from piezo_ident.metrics import FORMULA
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.simulated_stage import load_stage, simulate, SimulatedStage
+from piezo_ident.model.validation import sine_errors, SineError
 from piezo_ident.nodes.starter import rclpy_is_there
-from piezo_ident.prediction import predict_record
-from piezo_ident.program import load_program
-from piezo_ident.record import Record
-from piezo_ident.record_io import read_record
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Record
 from piezo_ident.report import text_summary, write_report
-from piezo_ident.results import Identification, Settings
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate, SimulatedStage
-from piezo_ident.validation import sine_errors, SineError
 
 __all__ = ['demo', 'find_measured']
 

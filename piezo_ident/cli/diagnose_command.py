@@ -17,15 +17,16 @@ from piezo_ident.cli.effects_command import effect_names
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import check_order, MODEL_FILES
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis.diagnosis_json import to_json
 from piezo_ident.effects import catalogue
-from piezo_ident.errors import ConfigError
-from piezo_ident.metrics import FORMULA
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, save_model
-from piezo_ident.prediction import predict_record
-from piezo_ident.record import Record
+from piezo_ident.model.files import load_model, save_model
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import sine_errors
+from piezo_ident.record.record import Record
 from piezo_ident.report import (
     changes,
     check_diagnosis_folder,
@@ -33,7 +34,6 @@ from piezo_ident.report import (
     Unseen,
     write_diagnosis_report,
 )
-from piezo_ident.validation import sine_errors
 
 __all__ = ['diagnose_command']
 

@@ -18,15 +18,15 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.graph_demo import _ask, _follow, _set, lab_graph
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.diagnosis import diagnose
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.identification import identify
+from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.simulated_stage import load_stage, simulate
 from piezo_ident.nodes.starter import Nodes
-from piezo_ident.prediction import predict_record
-from piezo_ident.program import load_program, parse_program
-from piezo_ident.record import Record
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
+from piezo_ident.record.record import Record
 
 if TYPE_CHECKING:
     from piezo_ident.nodes.client import Client

@@ -16,19 +16,19 @@ import shutil
 import tempfile
 from typing import Any
 
-from piezo_ident.batch import Diagnose, failed, fingerprint, Identify, Outcome, Reading, Row
-from piezo_ident.batch_table import columns_of, unit_of, write_tables
 from piezo_ident.cli.common import check_bag_options, check_limits, expand
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_folder
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.diagnosis.results import DiagnosisSettings
-from piezo_ident.errors import ConfigError, DataError
-from piezo_ident.executors import cluster, cores, Places, run_all
-from piezo_ident.ledger import Ledger, unwritable
-from piezo_ident.model_io import load_model, model_to_yaml, write_text
-from piezo_ident.results import Settings
-from piezo_ident.spread import in_order, QUANTITIES, Spread, spread_of
+from piezo_ident.identification.results import Settings
+from piezo_ident.many.executors import cluster, cores, Places, run_all
+from piezo_ident.many.ledger import Ledger, unwritable
+from piezo_ident.many.run import Diagnose, failed, fingerprint, Identify, Outcome, Reading, Row
+from piezo_ident.many.spread import in_order, QUANTITIES, Spread, spread_of
+from piezo_ident.many.table import columns_of, unit_of, write_tables
+from piezo_ident.model.files import load_model, model_to_yaml, write_text
 
 __all__ = ['check_each', 'diagnose_each', 'identify_each']
 

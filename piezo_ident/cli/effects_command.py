@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.cli.console import Console
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.effects import catalogue, Effect, Parameter
-from piezo_ident.errors import ConfigError
 
 __all__ = ['effect_name', 'effect_names', 'effects_command']
 

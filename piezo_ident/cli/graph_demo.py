@@ -22,19 +22,19 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
-from piezo_ident.bridging import bridged
 from piezo_ident.cli.console import Console
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.identification import identify
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import model_from_dict, parse_yaml
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.excitation.program import load_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import FreeRun, SineError, sines_of
 from piezo_ident.nodes.starter import Nodes
-from piezo_ident.program import load_program
-from piezo_ident.record import Record
-from piezo_ident.record_io import read_record
-from piezo_ident.results import Identification, Settings
-from piezo_ident.shipped import find_config
-from piezo_ident.validation import FreeRun, SineError, sines_of
+from piezo_ident.record.gaps import bridged
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Record
 
 if TYPE_CHECKING:
     from piezo_ident.nodes.client import Client

@@ -27,19 +27,19 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, identify_each
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
-from piezo_ident.errors import ConfigError
-from piezo_ident.identification import identify
-from piezo_ident.long_prediction import predict_long
-from piezo_ident.long_record import LongRecord, NeedsWhole, Progress
-from piezo_ident.metrics import FORMULA
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, save_model
-from piezo_ident.output import temporary_output
-from piezo_ident.prediction import predict_record, RecordPrediction
-from piezo_ident.record import Piece, Record
-from piezo_ident.results import Settings
-from piezo_ident.table_io import Table, WRITERS
-from piezo_ident.table_parts import PART_WRITERS
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import temporary_output
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.files import load_model, save_model
+from piezo_ident.model.free_run import predict_record, RecordPrediction
+from piezo_ident.model.long_prediction import predict_long
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.long_record import LongRecord, NeedsWhole, Progress
+from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.table_parts import PART_WRITERS
+from piezo_ident.record.tables import Table, WRITERS
 
 __all__ = ['MODEL_FILES', 'check_order', 'identify_command', 'predict_command']
 
@@ -135,8 +135,8 @@ class _Check:
 
 
 def _validate(model: StageModel, record: Record) -> _Check:
+    from piezo_ident.model.validation import sine_errors
     from piezo_ident.report import table_one
-    from piezo_ident.validation import sine_errors
 
     free_run = predict_record(model, record)
     text = [f'{record.name}, not fitted:', *_error_lines(free_run)]

@@ -10,9 +10,9 @@ import os
 from pathlib import Path
 import tempfile
 
-from piezo_ident.errors import ConfigError, DataError
-from piezo_ident.output import check_replaceable
-from piezo_ident.yaml_io import broken_link
+from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.common.files import check_replaceable
+from piezo_ident.common.yaml_io import broken_link
 
 __all__ = [
     'check_apart',

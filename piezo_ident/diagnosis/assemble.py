@@ -31,7 +31,7 @@ from piezo_ident.diagnosis.verdict import (
 )
 from piezo_ident.diagnosis.whole import Whole
 from piezo_ident.effects import find_effect
-from piezo_ident.model import StageModel
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.residual.faults import FaultSearch
 from piezo_ident.residual.floor import NoiseFloor
 

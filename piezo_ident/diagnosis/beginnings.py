@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.diagnosis.verdict import SMALLEST
 from piezo_ident.effects import find_effect
-from piezo_ident.memory import memories_of
-from piezo_ident.model import StageModel
-from piezo_ident.record import Piece, Record
-from piezo_ident.runs import same_rate
+from piezo_ident.identification.prepare import same_rate
+from piezo_ident.model.initial_memory import memories_of
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Piece, Record
 
 __all__ = ['Rest', 'beginnings', 'rest_of', 'said_of', 'share_of']
 
@@ -97,7 +97,7 @@ def rest_of(
     records, used : sequence of Record
         Whole records, and their beginnings.
     tick : callable, optional
-        Called window by window; may raise `piezo_ident.errors.Cancelled`.
+        Called window by window; may raise `piezo_ident.common.errors.Cancelled`.
 
     Raises
     ------

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.gain import (
     block_products,
     chance_errors,
@@ -28,7 +29,6 @@ from piezo_ident.diagnosis.gain import (
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
-from piezo_ident.errors import ModelError
 
 __all__ = ['Scored', 'score_trials', 'started', 'view_of']
 

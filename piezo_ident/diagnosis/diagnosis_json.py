@@ -15,7 +15,7 @@ from typing import Any
 
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Diagnosis, Errors, FORMULA, FoundParameter
-from piezo_ident.model_io import plain
+from piezo_ident.model.files import plain
 
 __all__ = ['JSON_VERSION', 'diagnosis_schema', 'json_text', 'to_json']
 

@@ -11,9 +11,9 @@ from piezo_ident.diagnosis.fit import Fitted
 from piezo_ident.diagnosis.gain import gram_of, solve
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.model.validation import sine_frequency
 from piezo_ident.residual.faults import FaultSearch
 from piezo_ident.residual.floor import NoiseFloor
-from piezo_ident.validation import sine_frequency
 
 __all__ = ['errors_of', 'held_out_residual', 'row_noise']
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.gain import gram_of, held_out_errors
 from piezo_ident.diagnosis.handles import Handle, handles_of
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.errors import ModelError
-from piezo_ident.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
 __all__ = [
@@ -177,7 +177,7 @@ def fit_jointly(
         Of its thresholds.
     iterations : int, optional
     tick : callable, optional
-        Called between the steps; may raise `piezo_ident.errors.Cancelled`.
+        Called between the steps; may raise `piezo_ident.common.errors.Cancelled`.
     """
     rows = simulator.rows
     handles = handles_of(state, len(rows.names))

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.assemble import assemble
 from piezo_ident.diagnosis.beginnings import beginnings, said_of, share_of
 from piezo_ident.diagnosis.errors_of import row_noise
@@ -37,15 +38,14 @@ from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import judge, PASSES, SMALLEST, takes
 from piezo_ident.diagnosis.whole import fitted_to_all, Whole
 from piezo_ident.effects import catalogue, find_effect
-from piezo_ident.errors import IdentificationError, ModelError
-from piezo_ident.model import StageModel
-from piezo_ident.record import Record
+from piezo_ident.identification.prepare import same_rate
+from piezo_ident.identification.results import Progress, silent
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.floor import noise_floor
 from piezo_ident.residual.lines import find_lines, without_lines
 from piezo_ident.residual.stretches import ResidualPart, stretches_of
-from piezo_ident.results import Progress, silent
-from piezo_ident.runs import same_rate
 
 __all__ = ['diagnose']
 
@@ -75,7 +75,7 @@ def diagnose(
     Parameters
     ----------
     model : StageModel
-        From `piezo_ident.identification.identify`; it may hold effects already.
+        From `piezo_ident.identification.identify.identify`; it may hold effects already.
     records : sequence of Record, or Record
         Measured data that the model was not identified from, of its sampling rate.
     settings : DiagnosisSettings, optional

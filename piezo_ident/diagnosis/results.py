@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.effects import find_effect
-from piezo_ident.errors import ConfigError, ModelError
-from piezo_ident.model import StageModel
-from piezo_ident.record import Fault, Piece
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Fault, Piece
 
 __all__ = [
     'FORMULA',

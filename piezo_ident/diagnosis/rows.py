@@ -15,14 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.effects import find_effect
-from piezo_ident.errors import IdentificationError
-from piezo_ident.memory import fit_memory, is_at_rest
-from piezo_ident.metrics import strokes
-from piezo_ident.model import StageModel
-from piezo_ident.play import initial_memory
-from piezo_ident.record import Record
-from piezo_ident.runs import Run, runs_of
+from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.model.initial_memory import fit_memory, is_at_rest
+from piezo_ident.model.metrics import strokes
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.play import initial_memory
+from piezo_ident.record.record import Record
 
 __all__ = ['Rows', 'centred', 'make_rows']
 

@@ -16,12 +16,12 @@ import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
 from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted, ITERATIONS
 from piezo_ident.diagnosis.gain import gram_of
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
-from piezo_ident.errors import ModelError
 
 __all__ = ['Contender', 'Round', 'Tick', 'afresh', 'drop_needless', 'polished', 'search_round']
 

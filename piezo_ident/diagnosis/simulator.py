@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.block import Block, Operator
 from piezo_ident.diagnosis.rows import means, Rows
-from piezo_ident.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
 from piezo_ident.effects import Effect, find_effect
-from piezo_ident.hysteresis import Hysteresis, HysteresisOperator
-from piezo_ident.model import EffectSetting, StageModel
-from piezo_ident.play import play_columns
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.operators.chain import Block, Operator
+from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
+from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
+from piezo_ident.operators.play import play_columns
 
 __all__ = ['Added', 'Simulator', 'State', 'retuned']
 

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.beginnings import rest_of
 from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import make_rows, Rows
 from piezo_ident.diagnosis.search import afresh
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.effects import Effect
-from piezo_ident.errors import IdentificationError
-from piezo_ident.model import StageModel
-from piezo_ident.record import Record
-from piezo_ident.results import Progress
+from piezo_ident.identification.results import Progress
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
 
 __all__ = ['Whole', 'fitted_to_all']
 

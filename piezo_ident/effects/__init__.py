@@ -11,13 +11,14 @@ from importlib.metadata import entry_points
 import reprlib
 from types import MappingProxyType
 
+from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.amplifier_lag import AmplifierLag
 from piezo_ident.effects.backlash import Backlash
-from piezo_ident.effects.base import Effect, Parameter
 from piezo_ident.effects.changed_dynamics import ChangedDynamics
 from piezo_ident.effects.creep import Creep
 from piezo_ident.effects.cross_coupling import CrossCoupling
 from piezo_ident.effects.delay_change import DelayChange
+from piezo_ident.effects.effect import Effect, Parameter
 from piezo_ident.effects.even_nonlinearity import EvenNonlinearity
 from piezo_ident.effects.gain_drift import GainDrift
 from piezo_ident.effects.input_feedthrough import InputFeedthrough
@@ -30,7 +31,6 @@ from piezo_ident.effects.sensor_nonlinearity import SensorNonlinearity
 from piezo_ident.effects.slew_limit import SlewLimit
 from piezo_ident.effects.thermal_drift import ThermalDrift
 from piezo_ident.effects.trials import Trial, View
-from piezo_ident.errors import ModelError
 
 __all__ = ['Effect', 'Parameter', 'Trial', 'View', 'catalogue', 'find_effect']
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, Parameter, Trial, View
+from piezo_ident.effects.effect import Effect, Parameter, Trial, View
+from piezo_ident.operators.chain import Block, Slot
 
 __all__ = ['DelayChange']
 

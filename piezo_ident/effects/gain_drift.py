@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.errors import ModelError
+from piezo_ident.common.errors import ModelError
+from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.operators.chain import Block, Slot
 
 __all__ = ['GainDrift']
 

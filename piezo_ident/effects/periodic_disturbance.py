@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
+from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.chain import Block, Slot
 
 __all__ = ['PeriodicDisturbance']
 

@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, NAN, Parameter, Trial, View
-from piezo_ident.hysteresis import HysteresisOperator
-from piezo_ident.kernel import alive, kernel
+from piezo_ident.common.kernel import alive, kernel
+from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.hysteresis import HysteresisOperator
 
 __all__ = ['RateDependentHysteresis']
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.errors import ModelError
-from piezo_ident.kernel import alive, kernel
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import alive, kernel
 
 __all__ = ['Section', 'slope_of_mode']
 

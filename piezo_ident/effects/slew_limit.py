@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.block import Block, Slot
-from piezo_ident.effects.base import Effect, Parameter, Trial, View
+from piezo_ident.common.kernel import kernel
+from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.kernel import kernel
+from piezo_ident.operators.chain import Block, Slot
 
 __all__ = ['SlewLimit']
 

@@ -17,8 +17,8 @@ import threading
 import time
 from typing import Any
 
-from piezo_ident.errors import PiezoIdentError
-from piezo_ident.flow import FlowControl
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.live.flow import FlowControl
 from piezo_ident.nodes.taps import Aside, between_turns, topics_problem
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy

@@ -23,7 +23,7 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, QUESTIONS
 from rcl_interfaces.msg import (

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.wire import LATCHED, QUESTIONS, STREAM
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters

@@ -16,16 +16,16 @@ import functools
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.capture import Snapshot
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import model_to_yaml
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.files import model_to_yaml
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.jobs import save_job, Tick
-from piezo_ident.record import Piece, Record
+from piezo_ident.record.capture import Snapshot
+from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import write_diagnosis_report
-from piezo_ident.results import Identification
 
 __all__ = ['Judgement', 'diagnose_job', 'records_of_runs', 'save_both_job']
 

@@ -35,16 +35,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.errors import ConfigError, PiezoIdentError
-from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.excitation.program import load_program, parse_program, Program, Sequence
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.pacing import BlockClock
 from piezo_ident.nodes.answers import Answers, answers_problem
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.taps import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
-from piezo_ident.pacing import BlockClock
-from piezo_ident.program import load_program, parse_program, Program, Sequence
-from piezo_ident.shipped import find_config
-from piezo_ident.wire_format import cut_blocks, Samples
+from piezo_ident.record.blocks import cut_blocks, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 

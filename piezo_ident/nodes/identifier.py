@@ -14,15 +14,15 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.capture import APPLIED, Capture
 from piezo_ident.cli.outputs import check_folder
-from piezo_ident.errors import Cancelled, DataError, PiezoIdentError
-from piezo_ident.helper import Helper
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, model_to_yaml
+from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
+from piezo_ident.identification.results import Steps
+from piezo_ident.model.files import load_model, model_to_yaml
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.diagnosis_jobs import Judgement, save_both_job
 from piezo_ident.nodes.drive import Drive, Streams
+from piezo_ident.nodes.helper import Helper
 from piezo_ident.nodes.inquiry import Inquiry
 from piezo_ident.nodes.intake import Intake
 from piezo_ident.nodes.jobs import (
@@ -34,9 +34,9 @@ from piezo_ident.nodes.jobs import (
     warm_up,
 )
 from piezo_ident.nodes.wire import from_message, LATCHED, STREAM, to_message
-from piezo_ident.results import Steps
-from piezo_ident.wire_format import Samples
-from piezo_ident.worker import Worker
+from piezo_ident.nodes.worker import Worker
+from piezo_ident.record.blocks import Samples
+from piezo_ident.record.capture import APPLIED, Capture
 from std_msgs.msg import Float64MultiArray, String
 
 __all__ = ['IdentifierNode', 'main']

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from piezo_ident.capture import Capture
+from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
-from piezo_ident.errors import DataError, PiezoIdentError
-from piezo_ident.model import StageModel
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.diagnosis_jobs import diagnose_job, Judgement
 from piezo_ident.nodes.jobs import Tick
+from piezo_ident.record.capture import Capture
 
 __all__ = ['Host', 'Inquiry']
 

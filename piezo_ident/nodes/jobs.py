@@ -16,18 +16,18 @@ import functools
 import json
 
 import numpy as np
-from piezo_ident.capture import refuse_incomplete, Snapshot
-from piezo_ident.errors import ConfigError
-from piezo_ident.identification import identify
-from piezo_ident.model_io import model_to_yaml
-from piezo_ident.program import parse_program
-from piezo_ident.record import Record
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings, Steps
+from piezo_ident.identification.single_steps import find_delay, find_dynamics, find_hysteresis
+from piezo_ident.model.files import model_to_yaml
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.validation import free_runs
+from piezo_ident.record.capture import refuse_incomplete, Snapshot
+from piezo_ident.record.record import Record
 from piezo_ident.report import steps_to_json, to_json, verdict, write_report
-from piezo_ident.results import Identification, Settings, Steps
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.single_steps import find_delay, find_dynamics, find_hysteresis
-from piezo_ident.validation import free_runs
 
 __all__ = ['Outcome', 'identify_job', 'save_job', 'settings_of', 'share_of', 'warm_up']
 

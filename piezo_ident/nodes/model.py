@@ -13,14 +13,14 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.errors import DataError, PiezoIdentError
-from piezo_ident.live import expected_error, Predictor, warm_up
-from piezo_ident.live_statistics import LiveError, Matched, Matcher, Preview, PreviewBin
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import load_model, model_from_dict, parse_yaml
+from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
+from piezo_ident.live.predictor import expected_error, Predictor, warm_up
+from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 

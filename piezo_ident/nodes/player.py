@@ -26,14 +26,14 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.bag_io import MESSAGE_TYPE, typestore
-from piezo_ident.bag_recovery import Bag, damage_as_data_error, opened_bag, Stored
-from piezo_ident.errors import DataError, PiezoIdentError
+from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.live.replay import chosen_topics, ReplayClock
 from piezo_ident.nodes.answers import Answers, answers_problem
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.taps import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.replay import chosen_topics, ReplayClock
+from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.bags.recover import Bag, damage_as_data_error, opened_bag, Stored
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 

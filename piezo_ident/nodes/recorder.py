@@ -24,10 +24,10 @@ import time
 from typing import Any
 
 import piezo_ident
-from piezo_ident.bag_writer import PartWriter
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.taps import Taps, topics_problem
+from piezo_ident.record.bags.write import PartWriter
 
 __all__ = ['RecorderNode', 'main']
 

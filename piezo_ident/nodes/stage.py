@@ -5,8 +5,8 @@
 """
 The stage node: a simulated stage, sample-exact whatever the block size.
 
-Each block of `voltage` passes the guard (`piezo_ident.guard`), drives the stage, and comes back as
-`displacement` with the same t and segment; `applied_voltage` is what the guard made of the
+Each block of `voltage` passes the guard (`piezo_ident.live.guard`), drives the stage, and comes
+back as `displacement` with the same t and segment; `applied_voltage` is what the guard made of the
 command, before the converter rounds it.  Where the two differ the guard had reason to: the
 displacement is published all the same, so that nothing is lost.
 
@@ -50,14 +50,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.errors import DataError, PiezoIdentError
-from piezo_ident.follower import Follower, Kind
-from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.model.simulated_stage import load_stage
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, STREAM, to_message
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
-from piezo_ident.wire_format import BLOCK_SIZE, Samples
+from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 

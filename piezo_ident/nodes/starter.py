@@ -21,7 +21,7 @@ import time
 from types import TracebackType
 from typing import Any
 
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
 import yaml
 
 __all__ = ['Nodes', 'rclpy_is_there']

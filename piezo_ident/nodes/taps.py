@@ -16,11 +16,11 @@ import threading
 import time
 from typing import Any
 
-from piezo_ident.bag_writer import knows_type, LossCount
-from piezo_ident.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.live.pacing import LogClock
 from piezo_ident.nodes.interfaces import ARRAY, TOPICS
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.pacing import LogClock
+from piezo_ident.record.bags.write import knows_type, LossCount
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node

@@ -1,14 +1,14 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Between messages and blocks of samples: `piezo_ident.wire_format` on std_msgs, and the QoS."""
+"""Between messages and blocks of samples: `piezo_ident.record.blocks` on std_msgs, and the QoS."""
 
 from __future__ import annotations
 
 from array import array
 
-from piezo_ident.errors import DataError
-from piezo_ident.wire_format import decode, encode, Samples
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.blocks import decode, encode, Samples
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 

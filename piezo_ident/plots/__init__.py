@@ -12,9 +12,11 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
-from piezo_ident.errors import ConfigError
-from piezo_ident.model import Prediction
-from piezo_ident.output import temporary_output
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import temporary_output
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.stage_model import Prediction
+from piezo_ident.model.validation import FreeRun, sine_frequency, sines_of
 from piezo_ident.plots.errors import (
     loops_figure,
     overview_figure,
@@ -28,9 +30,7 @@ from piezo_ident.plots.steps import (
     weights_figure,
 )
 from piezo_ident.plots.style import NothingToDraw, Picture
-from piezo_ident.record import Record
-from piezo_ident.results import Identification
-from piezo_ident.validation import FreeRun, sine_frequency, sines_of
+from piezo_ident.record.record import Record
 
 __all__ = [
     'NAMES',
@@ -134,7 +134,7 @@ def draw(
     ----------
     identification : Identification
     runs : sequence of FreeRun
-        From `piezo_ident.validation.free_runs`.
+        From `piezo_ident.model.validation.free_runs`.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
 

@@ -10,8 +10,8 @@ from functools import cache
 
 from matplotlib.figure import Figure
 import numpy as np
+from piezo_ident.common.errors import DataError
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.errors import DataError
 from piezo_ident.plots import Drawn
 from piezo_ident.plots.refinement_bars import errors_figure, frequencies_figure, ranking_figure
 from piezo_ident.plots.residual import residual_spectrum_figure

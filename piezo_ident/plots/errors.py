@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.model.validation import FreeRun, sine_frequency, SineError
 from piezo_ident.plots.style import (
     COLOURS,
     envelope,
@@ -27,8 +28,7 @@ from piezo_ident.plots.style import (
     SMALL,
     tidy,
 )
-from piezo_ident.record import Segment
-from piezo_ident.validation import FreeRun, sine_frequency, SineError
+from piezo_ident.record.record import Segment
 
 __all__ = ['loops_figure', 'overview_figure', 'segments_figure', 'sines_figure']
 

@@ -26,7 +26,7 @@ from piezo_ident.plots.style import (
     SMALL,
     tidy,
 )
-from piezo_ident.record import Piece
+from piezo_ident.record.record import Piece
 
 __all__ = ['STATES', 'differ', 'residual_figure']
 

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.batch import Row
-from piezo_ident.output import temporary_output
+from piezo_ident.common.files import temporary_output
+from piezo_ident.many.run import Row
+from piezo_ident.many.spread import dates, in_order, QUANTITIES, Quantity, standing_out, values_of
 from piezo_ident.plots.style import (
     BLUE,
     COLOURS,
@@ -31,7 +32,6 @@ from piezo_ident.plots.style import (
     tidy,
     VERMILION,
 )
-from piezo_ident.spread import dates, in_order, QUANTITIES, Quantity, standing_out, values_of
 
 __all__ = [
     'PICTURES',

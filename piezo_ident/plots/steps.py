@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.delay import delay_from_steps, StepDelay
-from piezo_ident.frequency_response import FrequencyResponse
+from piezo_ident.identification.frequency_response import FrequencyResponse
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
+from piezo_ident.model.validation import FreeRun
 from piezo_ident.plots.style import (
     COLOURS,
     figure,
@@ -29,8 +31,6 @@ from piezo_ident.plots.style import (
     SMALL,
     tidy,
 )
-from piezo_ident.results import Identification
-from piezo_ident.validation import FreeRun
 
 __all__ = ['delay_figure', 'orders_figure', 'response_figure', 'weights_figure']
 

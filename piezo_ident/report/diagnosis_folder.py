@@ -11,10 +11,10 @@ from pathlib import Path
 
 from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.identification.results import Progress, silent
 from piezo_ident.report.diagnosis_page import diagnosis_page
 from piezo_ident.report.diagnosis_tables import Unseen
 from piezo_ident.report.folder import check_own, PAGE, put_in_place, rendered
-from piezo_ident.results import Progress, silent
 
 __all__ = ['check_diagnosis_folder', 'write_diagnosis_report']
 

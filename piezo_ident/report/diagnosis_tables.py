@@ -14,7 +14,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter
 from piezo_ident.effects import find_effect
-from piezo_ident.model import EffectSetting, StageModel
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.report.numbers import length, moves, number
 from piezo_ident.report.tables import Table
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.record import Record
+from piezo_ident.identification.results import Identification
+from piezo_ident.record.record import Record
 from piezo_ident.report.diagnosis_folder import write_diagnosis_report
 from piezo_ident.report.folder import write_report
-from piezo_ident.results import Identification
 
 __all__ = ['diagnosis_files', 'identification_files']
 

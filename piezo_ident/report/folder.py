@@ -14,15 +14,15 @@ import shutil
 import tempfile
 from typing import TYPE_CHECKING
 
-from piezo_ident.errors import DataError
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import save_model
-from piezo_ident.record import Record
+from piezo_ident.common.errors import DataError
+from piezo_ident.identification.results import Identification, Progress, silent
+from piezo_ident.model.files import save_model
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import free_runs, sines_of
+from piezo_ident.record.record import Record
 from piezo_ident.report.html import Shown
 from piezo_ident.report.numbers import to_json
 from piezo_ident.report.page import page
-from piezo_ident.results import Identification, Progress, silent
-from piezo_ident.validation import free_runs, sines_of
 
 if TYPE_CHECKING:
     from piezo_ident.plots import Picture

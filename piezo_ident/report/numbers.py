@@ -13,12 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident import __version__
-from piezo_ident.dynamics import Dynamics
-from piezo_ident.metrics import FORMULA
-from piezo_ident.model_io import plain
-from piezo_ident.record import Record
-from piezo_ident.results import DelayResult, DynamicsResult, ErrorRow, Identification, Steps
-from piezo_ident.validation import FreeRun, sines_of
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    ErrorRow,
+    Identification,
+    Steps,
+)
+from piezo_ident.model.files import plain
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.validation import FreeRun, sines_of
+from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.record.record import Record
 
 __all__ = [
     'JSON_VERSION',

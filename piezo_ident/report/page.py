@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from piezo_ident.record import Record
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.validation import SineError
+from piezo_ident.record.record import Record
 from piezo_ident.report.html import cards, document, figures, listed, Shown, table
 from piezo_ident.report.numbers import verdict
 from piezo_ident.report.tables import (
@@ -18,8 +20,6 @@ from piezo_ident.report.tables import (
     hysteresis_tables,
     origin_tables,
 )
-from piezo_ident.results import Identification
-from piezo_ident.validation import SineError
 
 __all__ = ['page']
 

@@ -11,11 +11,11 @@ import math
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.metrics import FORMULA
-from piezo_ident.record import Record
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.validation import SineError
+from piezo_ident.record.record import Record
 from piezo_ident.report.numbers import fit_share, KINDS, length, modes, moves, number
-from piezo_ident.results import Identification
-from piezo_ident.validation import SineError
 
 __all__ = [
     'PAPER_GAIN',

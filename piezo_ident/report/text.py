@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 import textwrap
 
-from piezo_ident.model import StageModel
-from piezo_ident.record import Record
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.validation import sine_errors, SineError
+from piezo_ident.record.record import Record
 from piezo_ident.report.numbers import fit_share, KINDS, length, moves, number, verdict
-from piezo_ident.results import Identification
-from piezo_ident.validation import sine_errors, SineError
 
 __all__ = ['error_table_for_sines', 'table_one', 'text_summary']
 
@@ -44,7 +44,7 @@ def table_one(rows: Sequence[SineError]) -> str:
     Parameters
     ----------
     rows : sequence of SineError
-        From `piezo_ident.validation.sine_errors`.
+        From `piezo_ident.model.validation.sine_errors`.
     """
     if not rows:
         return 'no sine segment is long enough for its steady state'

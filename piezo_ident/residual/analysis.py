@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.errors import DataError
-from piezo_ident.record import Fault
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.record import Fault
 from piezo_ident.residual.dependence import Curve, curves_of
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.floor import noise_floor, NoiseFloor

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.record import Fault
+from piezo_ident.record.record import Fault
 from piezo_ident.residual.scatter import Scatter, scatter_of
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from scipy.ndimage import binary_dilation, maximum_filter1d

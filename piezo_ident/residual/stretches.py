@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.errors import DataError
-from piezo_ident.metrics import strokes
-from piezo_ident.record import Piece, Segment
+from piezo_ident.common.errors import DataError
+from piezo_ident.model.metrics import strokes
+from piezo_ident.record.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import (
     binary_dilation,

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.metrics import percent_of_stroke
-from piezo_ident.record import Segment
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.validation import sine_frequency
+from piezo_ident.record.record import Segment
 from piezo_ident.residual.floor import NoiseFloor
 from piezo_ident.residual.stretches import find_repeats, ResidualPart, strokes_of
-from piezo_ident.validation import sine_frequency
 
 __all__ = ['FrequencyRow', 'RecordRow', 'SegmentRow', 'frequency_rows', 'record_rows', 'rows_of']
 
@@ -34,7 +34,7 @@ class RecordRow:
     stroke : float
         ``max y - min y`` [m].
     percent : float
-        `piezo_ident.metrics.percent_of_stroke`.
+        `piezo_ident.model.metrics.percent_of_stroke`.
     mean : float
         Of the residual [m].
     explainable : float or None

@@ -16,13 +16,13 @@ import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.model import StageModel
-from piezo_ident.model_io import model_from_dict, parse_yaml
-from piezo_ident.program import parse_program
-from piezo_ident.record import Record
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.wire_format import cut_blocks, Samples
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.blocks import cut_blocks, Samples
+from piezo_ident.record.record import Record
 import yaml
 
 FS = 20_000.0

@@ -43,7 +43,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from piezo_ident.nodes.interfaces import STATES
 from piezo_ident.nodes.taps import between_turns
 from piezo_ident.nodes.wire import from_message, LATCHED, QUESTIONS, STREAM, to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.blocks import Samples
 from processes import alive, best_of_three, Handle, in_time, Late, LIMIT, take_domain
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 import rclpy

@@ -19,9 +19,9 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph
-from piezo_ident.model_io import load_model, model_from_dict, parse_yaml
-from piezo_ident.program import parse_program
-from piezo_ident.shipped import find_config
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
 import yaml
 
 TRUTHS = ('creep', 'rate_dependent_hysteresis')

@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph, Handle
-from piezo_ident.program import parse_program
-from piezo_ident.wire_format import Samples
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.record.blocks import Samples
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / 'examples/daq_driver.py'

@@ -7,10 +7,10 @@
 from course import column, FS, HIGH, SHORT
 from graph import best_of_three, Graph, Late
 import numpy as np
-from piezo_ident.program import parse_program
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage, simulate
-from piezo_ident.wire_format import cut_blocks
+from piezo_ident.common.config import find_config
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.record.blocks import cut_blocks
 import pytest
 from std_msgs.msg import Float64MultiArray
 

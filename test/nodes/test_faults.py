@@ -24,7 +24,7 @@ from course import (
 from graph import alive, Graph
 import numpy as np
 from piezo_ident.nodes.wire import STREAM, to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.blocks import Samples
 import pytest
 from std_msgs.msg import Float64MultiArray
 

@@ -14,13 +14,13 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph
-from piezo_ident.bag_io import MESSAGE_TYPE
-from piezo_ident.bag_writer import BagWriter
-from piezo_ident.model_io import save_model
+from piezo_ident.common.config import find_config
+from piezo_ident.model.files import save_model
+from piezo_ident.model.simulated_stage import load_stage
 from piezo_ident.nodes.wire import to_message
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.bags.read import MESSAGE_TYPE
+from piezo_ident.record.bags.write import BagWriter
+from piezo_ident.record.blocks import Samples
 from rclpy.serialization import serialize_message
 
 FS = 20_000.0

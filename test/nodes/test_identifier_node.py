@@ -20,11 +20,11 @@ from course import (
 )
 from graph import best_of_three, Graph, in_time
 import numpy as np
-from piezo_ident.bag_io import read_bag, write_bag
-from piezo_ident.identification import identify
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
 from piezo_ident.nodes.wire import LATCHED, to_message
-from piezo_ident.results import Settings
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.blocks import Samples
 import pytest
 from std_msgs.msg import String
 

@@ -9,9 +9,9 @@ import time
 from course import FS, model_of, paper
 from graph import Graph
 import numpy as np
-from piezo_ident.model_io import load_model, model_to_yaml
+from piezo_ident.model.files import load_model, model_to_yaml
 from piezo_ident.nodes.wire import to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.blocks import Samples
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState

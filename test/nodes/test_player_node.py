@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import best_of_three, Graph, Late
-from piezo_ident.bag_io import MESSAGE_TYPE, SAMPLE_QOS, typestore
-from piezo_ident.bag_writer import BagWriter
 from piezo_ident.nodes.wire import to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.bags.read import MESSAGE_TYPE, SAMPLE_QOS, typestore
+from piezo_ident.record.bags.write import BagWriter
+from piezo_ident.record.blocks import Samples
 from rclpy.serialization import serialize_message
 from rosbags.interfaces import QosDurability
 

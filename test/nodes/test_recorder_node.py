@@ -15,11 +15,11 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import best_of_three, Graph, Late
-from piezo_ident.bag_io import read_bag
-from piezo_ident.bag_recovery import is_unfinished, opened_bag
 from piezo_ident.cli import main
 from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.recover import is_unfinished, opened_bag
+from piezo_ident.record.blocks import Samples
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message

@@ -9,11 +9,11 @@ from dataclasses import replace
 from course import block, column, FS, level
 from graph import Graph
 import numpy as np
-from piezo_ident.guard import Guard, GuardSettings
+from piezo_ident.common.config import find_config
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.model.simulated_stage import load_stage
 from piezo_ident.nodes.wire import STREAM, to_message
-from piezo_ident.shipped import find_config
-from piezo_ident.simulation import load_stage
-from piezo_ident.wire_format import Samples
+from piezo_ident.record.blocks import Samples
 import pytest
 from std_msgs.msg import Float64MultiArray
 

@@ -11,10 +11,10 @@ from course import HIGH, model_of, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, in_time
 import numpy as np
-from piezo_ident.bag_io import read_bag
 from piezo_ident.nodes.interfaces import DIAGNOSTICS, SERVICES, STATES, TOPICS
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED
+from piezo_ident.record.bags.read import read_bag
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 

@@ -1,0 +1,85 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The stages and programmes that come with the package, wherever it was installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import difflib
+import os
+from pathlib import Path
+import site
+import sys
+import sysconfig
+
+from piezo_ident.common.errors import ConfigError
+
+__all__ = ['find_config', 'shipped_names']
+
+_SHARE = Path('share', 'piezo_ident', 'config')
+_SOURCE = Path(__file__).resolve().parents[2] / 'config'
+
+
+def _folders() -> Iterator[Path]:
+    """Yield where the files may be: a ROS workspace, an environment, the source tree."""
+    # what ament_index_python would do, without needing it
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        if prefix:
+            yield Path(prefix) / _SHARE
+    yield Path(sys.prefix) / _SHARE
+    # pip install --user, and distributions whose pip installs below /usr/local
+    yield Path(sysconfig.get_path('data')) / _SHARE
+    if site.ENABLE_USER_SITE:
+        yield Path(site.getuserbase()) / _SHARE
+    yield _SOURCE
+
+
+def shipped_names(prefix: str = '') -> list[str]:
+    """
+    Return the names of the shipped files, without `prefix` and suffix.
+
+    Parameters
+    ----------
+    prefix : {'program_', 'stage_', ''}
+        Which files.
+    """
+    found = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
+    return sorted(name.removeprefix(prefix) for name in found)
+
+
+def find_config(name: str | os.PathLike[str], kind: str) -> Path:
+    """
+    Return the file that a name or a path stands for.
+
+    Parameters
+    ----------
+    name : path
+        ``identification`` is the shipped ``program_identification.yaml``.  A path is taken as it
+        is; where nothing stands there, the shipped file of the same name is.
+    kind : {'program', 'stage'}
+        What is looked for.
+
+    Raises
+    ------
+    ConfigError
+        When there is no such file; the message names those that there are.
+    """
+    path = Path(name)
+    plain = path.suffix == '' and path.name == str(name)
+    if path.is_file() and not plain:
+        return path
+    wanted = [path.name] if not plain else [f'{kind}_{name}.yaml', f'{name}.yaml']
+    for folder in _folders():
+        for file in wanted:
+            if (folder / file).is_file():
+                return folder / file
+    if path.is_file():
+        return path
+    known = shipped_names(f'{kind}_')
+    stem = path.stem.removeprefix(f'{kind}_')
+    close = difflib.get_close_matches(stem, known, n=1)
+    guess = f'did you mean {close[0]}? ' if close else ''
+    raise ConfigError(
+        f'{name}: no such {kind}; {guess}give a file, or one of {", ".join(known) or "none"}'
+    )

@@ -1,0 +1,342 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The catalogue of signals: their names in a programme, their options, and how they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import math
+import reprlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation import signals as excitation
+
+__all__ = ['REQUIRED', 'SIGNALS', 'Option', 'Part', 'Setting', 'Signal']
+
+#: default of an option that must be given
+REQUIRED = object()
+
+
+@dataclass(frozen=True)
+class Option:
+    """
+    One option of a signal and the values it may take.
+
+    Attributes
+    ----------
+    unit : str
+    default : object
+        `REQUIRED` without one, None for an option that may be absent.
+    many : bool
+        Whether a list of numbers is expected; one number stands for a list of one.
+    whole : bool
+        Whether the numbers must be whole and at least one.
+    positive : bool
+        Whether the numbers must be greater than zero.
+    choices : tuple of str
+        Words to choose from; the option is then no number.
+    """
+
+    unit: str
+    default: Any = REQUIRED
+    many: bool = False
+    whole: bool = False
+    positive: bool = False
+    choices: tuple[str, ...] = ()
+
+    def read(self, value: Any) -> Any:
+        """
+        Return the checked value.
+
+        Raises
+        ------
+        ConfigError
+            When it is of another type, not finite, or out of range.
+        """
+        if self.choices:
+            if value not in self.choices:
+                raise ConfigError(f'{reprlib.repr(value)} is none of {", ".join(self.choices)}')
+            return value
+        if self.many:
+            values = value if isinstance(value, list) else [value]
+            if not values:
+                raise ConfigError('the list is empty; give at least one number')
+            return [self._number(x) for x in values]
+        return self._number(value)
+
+    def _number(self, value: Any) -> float | int:
+        # YAML 1.1 reads 2e-5 as text; people write it all the same
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise ConfigError(f'{reprlib.repr(value)} is not a number; give it in {self.unit}')
+        if self.whole and (number < 1 or number != int(number)):
+            raise ConfigError(f'{number:g} must be a whole number of at least 1')
+        if self.positive and number <= 0:
+            raise ConfigError(f'{number:g} {self.unit} must be greater than zero')
+        return int(number) if self.whole else number
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What every signal may need to know: the rate [Hz], limits and rest [V], and chance."""
+
+    sample_rate: float
+    limits: tuple[float, float]
+    rest: float
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """
+    A piece of a programme that is played without a ramp inside.
+
+    Attributes
+    ----------
+    v : ndarray, shape (n,)
+        [V]
+    end : float
+        Level at which the signal would go on after its last sample [V].
+    name : str
+        What tells it from others of its kind; may be empty.
+    """
+
+    v: NDArray[np.float64]
+    end: float
+    name: str = ''
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal of the catalogue: the kind of its segments, its options and its maker."""
+
+    kind: str
+    options: Mapping[str, Option]
+    make: Callable[[Setting, Mapping[str, Any]], list[Part]]
+
+
+def _periodic(v: NDArray[np.float64], name: str = '') -> list[Part]:
+    return [Part(v, float(v[0]), name)]
+
+
+def _idle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    return _periodic(excitation.constant(s.rest, o['duration'], s.sample_rate))
+
+
+def _hold(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    v = excitation.constant(o['level'], o['duration'], s.sample_rate)
+    return _periodic(v, f'{o["level"]:g}V')
+
+
+def _step(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    v = excitation.steps(o['bias'], o['size'], o['hold'], o['count'], s.sample_rate)
+    return [Part(v, float(v[-1]))]
+
+
+def _staircase(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    levels, hold = o['levels'], o['hold']
+    if len(hold) == 1:
+        hold = hold * len(levels)
+    if len(hold) != len(levels):
+        raise ConfigError(
+            f'{len(levels)} levels and {len(hold)} holds; give one hold, or one each'
+        )
+    v = excitation.staircase(levels, hold, s.sample_rate)
+    return [Part(v, float(v[-1]))]
+
+
+def _settle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    return _periodic(
+        excitation.settling_sweep(
+            o['bias'], o['amplitude'], o['cycles'], o['frequency'], s.sample_rate
+        )
+    )
+
+
+def _noise(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    v = excitation.noise(
+        o['bias'],
+        o['amplitude'],
+        o['cutoff'],
+        o['duration'],
+        s.sample_rate,
+        s.rng,
+        crest=o['crest'],
+    )
+    # the noise fades to its bias, which is where it goes on
+    return [Part(v, o['bias'])]
+
+
+def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    low, high = s.limits
+    if o['preset'] == 'paper':
+        own = [n for n in ('peaks', 'base') if o[n] is not None]
+        own += ['slope'] if o['slope'] != _SLOPE.default else []
+        if own:
+            raise ConfigError(
+                f'preset: paper has its own {" and ".join(own)}; leave out the one or the other'
+            )
+        peaks, base, slope = excitation.PAPER_PEAKS, 0.0, excitation.PAPER_SLOPE
+        name = 'paper'
+    else:
+        base = low if o['base'] is None else o['base']
+        # the last peak reaches the end of the range, or thresholds up there stay unexcited
+        peaks = o['peaks'] or (low + (high - low) / 3, low + 2 * (high - low) / 3, high)
+        slope, name = o['slope'], ''
+    return _periodic(excitation.triangle(peaks, base, slope, s.sample_rate), name)
+
+
+def _decaying_triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    v = excitation.decaying_triangle(
+        o['bias'], o['amplitude'], o['cycles'], o['slope'], s.sample_rate
+    )
+    return _periodic(v, 'decaying')
+
+
+def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    # before as many corners are listed; each leg has a sample
+    excitation.sample_count(2 * len(o['biases']) * o['cycles'] / s.sample_rate, s.sample_rate)
+
+    def loops(bias: float) -> NDArray[np.float64]:
+        levels = [bias, *[bias + o['amplitude'], bias - o['amplitude']] * o['cycles'], bias]
+        return excitation.corners(levels, o['slope'], s.sample_rate)
+
+    return [part for b in o['biases'] for part in _periodic(loops(b), f'minor-{b:g}V')]
+
+
+def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    f = o['frequency']
+    if (o['periods'] is None) == (o['duration'] is None):
+        raise ConfigError('give either periods or duration')
+    # rounded first: 1.4 s of 10 Hz are 14 periods, not 15
+    if o['duration']:
+        excitation.sample_count(o['duration'], s.sample_rate)
+    periods = o['periods'] or math.ceil(round(o['duration'] * f, 6))
+    v = excitation.sine(o['bias'], o['amplitude'], f, periods, s.sample_rate, o['phase'])
+    return _periodic(v, f'{f:g}Hz')
+
+
+def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
+    period, count = o['period'], o['realisations']
+    # all of it, before any is made
+    excitation.sample_count(period * o['periods'] * count, s.sample_rate)
+    for end in ('lowest', 'highest'):
+        if o[end] > s.sample_rate / 2:
+            raise ConfigError(
+                f'{end} = {o[end]:g} Hz is above half the sampling rate ({s.sample_rate / 2:g} Hz)'
+            )
+    lowest = max(1, math.ceil(round(o['lowest'] * period, 6)))
+    highest = math.floor(round(o['highest'] * period, 6))
+    parts = []
+    for number in range(1, count + 1):
+        lines = excitation.odd_lines(lowest, highest, s.rng)
+        v = excitation.multisine(
+            o['bias'], o['amplitude'], lines, period, o['periods'], s.sample_rate, s.rng
+        )
+        parts += _periodic(v, str(number) if count > 1 else '')
+    return parts
+
+
+_LEVEL = Option('V')
+_SIZE = Option('V', positive=True)
+_TIME = Option('s', positive=True)
+_FREQUENCY = Option('Hz', positive=True)
+_SLOPE = Option('V/s', default=excitation.PAPER_SLOPE, positive=True)
+
+
+def _count(default: Any = REQUIRED) -> Option:
+    return Option('1', default=default, whole=True)
+
+
+#: every signal that a programme may use
+SIGNALS: dict[str, Signal] = {
+    'idle': Signal('idle', {'duration': _TIME}, _idle),
+    'hold': Signal('hold', {'level': _LEVEL, 'duration': _TIME}, _hold),
+    'step': Signal(
+        'step', {'bias': _LEVEL, 'size': _SIZE, 'hold': _TIME, 'count': _count()}, _step
+    ),
+    'staircase': Signal(
+        'staircase',
+        {'levels': Option('V', many=True), 'hold': Option('s', many=True, positive=True)},
+        _staircase,
+    ),
+    'settle': Signal(
+        'settle',
+        {
+            'bias': _LEVEL,
+            'amplitude': _SIZE,
+            'cycles': _count(20),
+            'frequency': Option('Hz', default=20.0, positive=True),
+        },
+        _settle,
+    ),
+    'noise': Signal(
+        'noise',
+        {
+            'bias': _LEVEL,
+            'amplitude': _SIZE,
+            'cutoff': _FREQUENCY,
+            'duration': _TIME,
+            'crest': Option('1', default=2.5, positive=True),
+        },
+        _noise,
+    ),
+    'triangle': Signal(
+        'triangle',
+        {
+            'preset': Option('', default='range', choices=('range', 'paper')),
+            'peaks': Option('V', default=None, many=True),
+            'base': Option('V', default=None),
+            'slope': _SLOPE,
+        },
+        _triangle,
+    ),
+    'decaying_triangle': Signal(
+        'triangle',
+        {'bias': _LEVEL, 'amplitude': _SIZE, 'cycles': _count(), 'slope': _SLOPE},
+        _decaying_triangle,
+    ),
+    'minor_loops': Signal(
+        'triangle',
+        {
+            'biases': Option('V', many=True),
+            'amplitude': _SIZE,
+            'cycles': _count(),
+            'slope': _SLOPE,
+        },
+        _minor_loops,
+    ),
+    'sine': Signal(
+        'sine',
+        {
+            'bias': _LEVEL,
+            'amplitude': _SIZE,
+            'frequency': _FREQUENCY,
+            'periods': _count(None),
+            'duration': Option('s', default=None, positive=True),
+            'phase': Option('rad', default=0.0),
+        },
+        _sine,
+    ),
+    'multisine': Signal(
+        'multisine',
+        {
+            'bias': _LEVEL,
+            'amplitude': _SIZE,
+            'lowest': _FREQUENCY,
+            'highest': _FREQUENCY,
+            'period': _TIME,
+            'periods': _count(),
+            'realisations': _count(1),
+        },
+        _multisine,
+    ),
+}

@@ -1,0 +1,351 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Programmes: named input signals in a row, with soft ramps between them, written as YAML.
+
+    limits: [0, 10]          # V; no sample may leave them
+    sample_rate: 20000       # Hz; the caller's when absent
+    seed: 1
+    segments:
+      - {signal: idle, duration: 0.3}
+      - {signal: sine, bias: 5, amplitude: 5, frequency: 10, duration: 1.5}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain
+import math
+import os
+import re
+import reprlib
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.yaml_io import load_yaml, parse_yaml
+from piezo_ident.excitation import signals as excitation
+from piezo_ident.excitation.catalogue import Option, Part, REQUIRED, Setting, SIGNALS
+from piezo_ident.record.record import Segment
+
+__all__ = ['Entry', 'Program', 'Sequence', 'load_program', 'parse_program']
+
+_HEAD = {
+    'limits': Option('V', many=True),
+    'sample_rate': Option('Hz', default=None, positive=True),
+    'seed': Option('1', default=0.0),
+    'rest': Option('V', default=0.0),
+    'slew': Option('V/s', default=20.0, positive=True),
+}
+_NAME = re.compile(r'[\w.+-]+')
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """
+    The command voltage of a whole programme.
+
+    Attributes
+    ----------
+    v : ndarray, shape (n,)
+        [V]
+    sample_rate : float
+        [Hz]
+    segments : tuple of Segment
+        They cover every sample, and no two neighbours share a label.
+    name : str
+    """
+
+    v: NDArray[np.float64]
+    sample_rate: float
+    segments: tuple[Segment, ...]
+    name: str = 'program'
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'v', frozen_array(self.v))
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return int(self.v.size)
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return self.n / self.sample_rate
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """Time of each sample [s], from zero."""
+        return np.arange(self.n) / self.sample_rate
+
+    def describe(self) -> str:
+        """Return one line a segment: start, length, label and voltages."""
+        return '\n'.join(
+            f'{s.start / self.sample_rate:9.3f} s {s.n / self.sample_rate:9.3f} s  {s.label:20s} '
+            f'{self.v[s.start : s.stop].min():7.3f} .. {self.v[s.start : s.stop].max():.3f} V'
+            for s in self.segments
+        )
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One item of a programme: a signal with its options, perhaps under a name of its own."""
+
+    signal: str
+    options: Mapping[str, Any]
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Program:
+    """
+    A checked programme.
+
+    Attributes
+    ----------
+    name : str
+        File or source, for messages.
+    entries : tuple of Entry
+    limits : tuple of float
+        Lowest and highest voltage [V].
+    sample_rate : float or None
+        [Hz]; None leaves it to the caller.
+    seed : int
+        Of the random signals.
+    rest : float
+        Voltage before and after [V].
+    slew : float
+        Largest speed of the ramps [V/s].
+    """
+
+    name: str
+    entries: tuple[Entry, ...]
+    limits: tuple[float, float]
+    sample_rate: float | None = None
+    seed: int = 0
+    rest: float = 0.0
+    slew: float = 20.0
+
+    def build(
+        self,
+        sample_rate: float | None = None,
+        rng: np.random.Generator | None = None,
+        limits: tuple[float, float] | None = None,
+    ) -> Sequence:
+        """
+        Return the voltage of the programme, from rest to rest.
+
+        Parameters
+        ----------
+        sample_rate : float, optional
+            [Hz]; needed when the programme names none, and wins over it.
+        rng : numpy.random.Generator, optional
+            For the random signals; one from the programme's seed when absent.
+        limits : tuple of float, optional
+            Further limits, say of the amplifier [V]; the narrower hold.
+
+        Raises
+        ------
+        ConfigError
+            When a sample leaves the limits, or a signal cannot be made at this rate.
+        """
+        rate = self.sample_rate if sample_rate is None else float(sample_rate)
+        if rate is None or not (math.isfinite(rate) and rate > 0):
+            raise ConfigError(
+                f'{self.name}: sample_rate must be positive; add `sample_rate: 20000`'
+            )
+        low, high = self.limits
+        if limits is not None:
+            low, high = max(low, limits[0]), min(high, limits[1])
+        if not low <= self.rest <= high:
+            raise ConfigError(
+                f'{self.name}: the rest voltage {self.rest:g} V lies outside the limits '
+                f'{low:g} .. {high:g} V'
+            )
+        setting = Setting(
+            rate, (low, high), self.rest, np.random.default_rng(self.seed) if rng is None else rng
+        )
+        return self._join(
+            chain.from_iterable(
+                self._parts(number, entry, setting) for number, entry in enumerate(self.entries, 1)
+            ),
+            setting,
+        )
+
+    def _parts(self, number: int, entry: Entry, setting: Setting) -> list[tuple[str, Part]]:
+        signal, where = SIGNALS[entry.signal], _where(self.name, number, entry.signal)
+        try:
+            parts = signal.make(setting, entry.options)
+        except ConfigError as error:
+            raise ConfigError(f'{where}: {error}') from None
+        low, high = setting.limits
+        slack = 1e-9 * (high - low)
+        labelled = []
+        for part in parts:
+            least, most = float(part.v.min()), float(part.v.max())
+            # a sample that is no number passes no comparison
+            if not (low - slack <= least and most <= high + slack):
+                raise ConfigError(
+                    f'{where}: reaches {least:g} .. {most:g} V, outside the limits '
+                    f'{low:g} .. {high:g} V; lower its amplitude or move its bias'
+                )
+            name = entry.name or ''
+            if part.name and (not name or len(parts) > 1):
+                name = f'{name}-{part.name}' if name else part.name
+            label = f'{signal.kind}:{name}' if name else signal.kind
+            # what is cut off here is rounding, not signal
+            labelled.append((label, replace(part, v=np.clip(part.v, low, high))))
+        return labelled
+
+    def _join(self, parts: Iterable[tuple[str, Part]], setting: Setting) -> Sequence:
+        low, high = setting.limits
+        pieces: list[NDArray[np.float64]] = []
+        segments: list[Segment] = []
+        level, n = self.rest, 0
+
+        def append(label: str, v: NDArray[np.float64]) -> None:
+            nonlocal n
+            if segments and segments[-1].label == label:
+                label += '-2' if ':' in label else ':2'
+            if n + v.size > excitation.MAX_SAMPLES:
+                raise ConfigError(
+                    f'{self.name}: more than {excitation.MAX_SAMPLES} samples in all; '
+                    'split the programme'
+                )
+            pieces.append(v)
+            segments.append(Segment(label, n, n + v.size))
+            n += v.size
+
+        def go_to(target: float) -> None:
+            if abs(target - level) > 1e-9 * (high - low):
+                v = excitation.ramp(level, target, self.slew, setting.sample_rate)
+                append('ramp', np.clip(v, low, high))
+
+        for label, part in parts:
+            go_to(float(part.v[0]))
+            append(label, part.v)
+            level = min(max(part.end, low), high)
+        go_to(self.rest)
+        # a last sample at rest, so that whoever holds the last value holds the rest voltage
+        if segments[-1].kind == 'ramp':
+            pieces.append(np.array([self.rest]))
+            segments[-1] = replace(segments[-1], stop=n + 1)
+        return Sequence(np.concatenate(pieces), setting.sample_rate, tuple(segments), self.name)
+
+
+def _where(name: str, number: int, signal: object) -> str:
+    return f'{name}: segment {number} ({reprlib.repr(signal).strip(chr(39))})'
+
+
+def load_program(path: str | os.PathLike[str]) -> Program:
+    """
+    Read a programme file.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read, or as `parse_program` says.
+    """
+    return _program(load_yaml(path), str(path))
+
+
+def parse_program(text: str, name: str = 'program') -> Program:
+    """
+    Read a programme from text.
+
+    Parameters
+    ----------
+    text : str
+        YAML.
+    name : str, optional
+        What to call it in messages.
+
+    Raises
+    ------
+    ConfigError
+        When a key is unknown, missing, of the wrong type or out of range.
+
+    Examples
+    --------
+    >>> program = parse_program('''
+    ... limits: [0, 10]
+    ... segments:
+    ...   - {signal: sine, bias: 5, amplitude: 2, frequency: 10, periods: 5}
+    ... ''')
+    >>> [s.label for s in program.build(sample_rate=1000).segments]
+    ['ramp', 'sine:10Hz', 'ramp']
+    """
+    return _program(parse_yaml(text, name), name)
+
+
+def _program(data: Mapping[str, Any], name: str) -> Program:
+    _known(data, (*_HEAD, 'segments'), name)
+    values = {}
+    for key, option in _HEAD.items():
+        try:
+            values[key] = _read(data, key, option)
+        except ConfigError as error:
+            raise ConfigError(f'{name}: {error}') from None
+    limits = values['limits']
+    if len(limits) != 2 or limits[0] >= limits[1]:
+        raise ConfigError(
+            f'{name}: limits must be [lowest, highest] voltage, got {reprlib.repr(limits)}'
+        )
+    if not limits[0] <= values['rest'] <= limits[1]:
+        raise ConfigError(f'{name}: rest = {values["rest"]:g} V lies outside the limits {limits}')
+    if values['seed'] < 0 or values['seed'] != int(values['seed']):
+        raise ConfigError(f'{name}: seed must be a whole number, not negative')
+    items = data.get('segments')
+    if not isinstance(items, list) or not items:
+        raise ConfigError(f'{name}: segments must be a list with at least one signal')
+    return Program(
+        name=name,
+        entries=tuple(_entry(item, number, name) for number, item in enumerate(items, 1)),
+        limits=(limits[0], limits[1]),
+        sample_rate=values['sample_rate'],
+        seed=int(values['seed']),
+        rest=values['rest'],
+        slew=values['slew'],
+    )
+
+
+def _entry(item: Any, number: int, name: str) -> Entry:
+    kind = item.get('signal') if isinstance(item, Mapping) else None
+    where = _where(name, number, kind)
+    if not isinstance(kind, str) or kind not in SIGNALS:
+        raise ConfigError(f'{where}: signal must be one of {", ".join(SIGNALS)}')
+    options = SIGNALS[kind].options
+    _known(item, ('signal', 'name', *options), where)
+    try:
+        values = {key: _read(item, key, option) for key, option in options.items()}
+    except ConfigError as error:
+        raise ConfigError(f'{where}: {error}') from None
+    label = item.get('name')
+    if label is not None and not (isinstance(label, str) and _NAME.fullmatch(label)):
+        raise ConfigError(
+            f'{where}: name {reprlib.repr(label)} must be a word of letters, digits and . + - _'
+        )
+    return Entry(kind, MappingProxyType(values), label)
+
+
+def _known(data: Mapping[str, Any], keys: Iterable[str], where: str) -> None:
+    strange = [str(key)[:40] for key in data if key not in keys]
+    if strange:
+        raise ConfigError(f'{where}: unknown {", ".join(strange[:8])}; it knows {", ".join(keys)}')
+
+
+def _read(data: Mapping[str, Any], key: str, option: Option) -> Any:
+    if data.get(key) is None:
+        if option.default is REQUIRED:
+            raise ConfigError(f'{key} is missing; give it in {option.unit}')
+        return option.default
+    try:
+        return option.read(data[key])
+    except ConfigError as error:
+        raise ConfigError(f'{key}: {error}') from None

@@ -1,0 +1,337 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The input signals, each a vector of volts.
+
+Every signal is half-open: its next sample would continue it at its first value again (a staircase
+at its last), so that signals and the ramps between them follow one another without a repeated
+sample.  Randomness comes only from the generator passed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Many
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ConfigError
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+
+__all__ = [
+    'PAPER_PEAKS',
+    'PAPER_SLOPE',
+    'constant',
+    'corners',
+    'crest_factor',
+    'decaying_triangle',
+    'multisine',
+    'noise',
+    'odd_lines',
+    'ramp',
+    'sample_count',
+    'settling_sweep',
+    'sine',
+    'staircase',
+    'steps',
+    'triangle',
+]
+
+#: eq. (7) of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868: peaks [V], slope [V/s]
+PAPER_PEAKS = (3.0, 6.0, 9.0)
+PAPER_SLOPE = 6.0
+
+#: longest signal; more would not fit into the memory of a lab computer
+MAX_SAMPLES = 50_000_000
+
+
+def sample_count(seconds: float, sample_rate: float) -> int:
+    """
+    Return how many samples a signal has.
+
+    Raises
+    ------
+    ConfigError
+        When it has less than one, or more than a signal may have.
+    """
+    n = seconds * sample_rate
+    if n < 0.5:
+        raise ConfigError(f'{seconds:g} s is shorter than one sample; make it longer')
+    if not n <= MAX_SAMPLES:
+        raise ConfigError(f'{seconds:g} s are more than {MAX_SAMPLES} samples; make it shorter')
+    return round(n)
+
+
+def _below_nyquist(frequency: float, sample_rate: float) -> None:
+    if not 0.0 < frequency < sample_rate / 2:
+        raise ConfigError(
+            f'{frequency:g} Hz does not lie between 0 and half the sampling rate '
+            f'({sample_rate / 2:g} Hz)'
+        )
+
+
+def crest_factor(x: NDArray[np.float64]) -> float:
+    """Return the largest magnitude over the rms of a signal."""
+    return float(np.abs(x).max() / np.sqrt(np.mean(x**2)))
+
+
+def constant(level: float, duration: float, sample_rate: float) -> NDArray[np.float64]:
+    """Return a level held for a duration [s]."""
+    return np.full(sample_count(duration, sample_rate), float(level))
+
+
+def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[np.float64]:
+    """
+    Return a soft way from one level to another; `stop` is the sample after the last.
+
+    The speed is a raised cosine, so it starts and ends at zero and its largest value is `slew`.
+
+    Parameters
+    ----------
+    start, stop : float
+        Levels [V].
+    slew : float
+        Largest speed [V/s].
+    sample_rate : float
+        [Hz]
+    """
+    seconds = max(1.0 / sample_rate, 2.0 * abs(stop - start) / slew)
+    sample_count(seconds, sample_rate)
+    n = max(1, int(np.ceil(seconds * sample_rate)))
+    tau = np.arange(n) / n
+    return start + (stop - start) * (tau - np.sin(2 * np.pi * tau) / (2 * np.pi))
+
+
+def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDArray[np.float64]:
+    """
+    Return levels that are jumped to and held.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        [V]
+    hold : sequence of float
+        Time on each level [s].
+    sample_rate : float
+        [Hz]
+    """
+    n = [sample_count(t, sample_rate) for t in hold]
+    sample_count(sum(n) / sample_rate, sample_rate)
+    return np.repeat(np.asarray(levels, dtype=np.float64), n)
+
+
+def steps(
+    bias: float, size: float, hold: float, count: int, sample_rate: float
+) -> NDArray[np.float64]:
+    """
+    Return a train of `count` steps, up and down in turn, about a bias.
+
+    The train begins on the lower level and is held for `hold` seconds on each.
+    """
+    # before as many levels are listed
+    sample_count(hold, sample_rate)
+    sample_count(hold * (count + 1), sample_rate)
+    low, high = bias - size / 2, bias + size / 2
+    levels = [low if k % 2 == 0 else high for k in range(count + 1)]
+    return staircase(levels, [hold] * len(levels), sample_rate)
+
+
+def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np.float64]:
+    """
+    Return straight lines through a list of levels.
+
+    Every leg takes a whole number of samples, so that each corner is met exactly; the slope is
+    met within that rounding.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        Corners [V], the first and last included.
+    slope : float
+        Magnitude of the speed on every leg [V/s].
+    sample_rate : float
+        [Hz]
+    """
+    v = np.asarray(levels, dtype=np.float64)
+    seconds = np.abs(np.diff(v)) / slope
+    sample_count(float(seconds.sum()), sample_rate)
+    n = np.maximum(1, np.rint(seconds * sample_rate).astype(np.int64))
+    at = np.concatenate([[0], np.cumsum(n)])
+    return np.interp(np.arange(at[-1]), at, v)
+
+
+def triangle(
+    peaks: Many[float], base: float, slope: float, sample_rate: float
+) -> NDArray[np.float64]:
+    """
+    Return triangles from a base to each of the peaks and back.
+
+    Examples
+    --------
+    Equation (7) of the paper: six seconds.
+
+    >>> triangle(PAPER_PEAKS, 0.0, PAPER_SLOPE, 1000.0).size
+    6000
+    """
+    levels = [base]
+    for peak in peaks:
+        levels += [peak, base]
+    return corners(levels, slope, sample_rate)
+
+
+def decaying_triangle(
+    bias: float, amplitude: float, cycles: int, slope: float, sample_rate: float
+) -> NDArray[np.float64]:
+    """Return triangles about a bias whose amplitude shrinks linearly to nothing."""
+    sample_count(2 * cycles / sample_rate, sample_rate)
+    levels = [bias]
+    for k in range(cycles):
+        size = amplitude * (1.0 - k / cycles)
+        levels += [bias + size, bias - size]
+    return corners([*levels, bias], slope, sample_rate)
+
+
+def settling_sweep(
+    bias: float, amplitude: float, cycles: int, frequency: float, sample_rate: float
+) -> NDArray[np.float64]:
+    """
+    Return sine cycles about a bias that die out linearly after a full first one.
+
+    Every play narrower than the sweep is left in the middle of its band, every wider one at rest:
+    noise a little smaller than the sweep then moves neither towards new extremes.
+    """
+    _below_nyquist(frequency, sample_rate)
+    n = sample_count(cycles / frequency, sample_rate)
+    tau = np.arange(n) / n
+    envelope = np.minimum(1.0, (1.0 - tau) * cycles / max(1.0, cycles - 1.0))
+    return bias + amplitude * envelope * np.sin(2 * np.pi * cycles * tau)
+
+
+def sine(
+    bias: float,
+    amplitude: float,
+    frequency: float,
+    periods: int,
+    sample_rate: float,
+    phase: float = 0.0,
+) -> NDArray[np.float64]:
+    """
+    Return a whole number of periods of ``bias + amplitude sin(2 pi f t + phase)``.
+
+    The length is rounded to a sample where the periods do not fall on one.
+    """
+    _below_nyquist(frequency, sample_rate)
+    n = sample_count(periods / frequency, sample_rate)
+    angle = 2 * np.pi * frequency * (np.arange(n) / sample_rate)
+    return bias + amplitude * np.sin(angle + phase)
+
+
+def noise(
+    bias: float,
+    amplitude: float,
+    cutoff: float,
+    duration: float,
+    sample_rate: float,
+    rng: np.random.Generator,
+    crest: float = 2.5,
+    fade: float = 0.01,
+) -> NDArray[np.float64]:
+    """
+    Return Gaussian noise with a flat spectrum up to a cut-off and limited peaks.
+
+    Clipping lowers the peaks and widens the spectrum, filtering restores the spectrum and raises
+    the peaks a little: repeated in turn, both settle.
+
+    Parameters
+    ----------
+    bias, amplitude : float
+        Mean and largest deviation from it [V].
+    cutoff : float
+        End of the flat band [Hz]; a raised cosine leads to nothing at 1.2 times this frequency.
+    duration : float
+        [s]
+    sample_rate : float
+        [Hz]
+    rng : numpy.random.Generator
+        Draws the noise.
+    crest : float, optional
+        Crest factor that is aimed at; about 2 is the least that can be reached.
+    fade : float, optional
+        Time in which the noise rises from the bias and falls back to it [s].
+    """
+    _below_nyquist(cutoff, sample_rate)
+    n = sample_count(duration, sample_rate)
+    m = next_fast_len(max(n, 2), real=True)
+    over = rfftfreq(m, 1.0 / sample_rate) / cutoff
+    shape = 0.5 + 0.5 * np.cos(np.pi * np.clip((over - 1.0) / 0.2, 0.0, 1.0))
+    shape[0] = 0.0
+    if not shape.any():
+        raise ConfigError(
+            f'{duration:g} s hold no whole period below {cutoff:g} Hz; make the noise longer'
+        )
+    x = irfft(rfft(rng.standard_normal(m)) * shape, m)
+    for _ in range(30):
+        limit = crest * np.sqrt(np.mean(x**2))
+        if np.abs(x).max() <= 1.01 * limit:
+            break
+        x = irfft(rfft(np.clip(x, -limit, limit)) * (shape > 0), m)
+    x = x[:n]
+    edge = np.minimum(np.arange(n), n - np.arange(n)) / max(1.0, fade * sample_rate)
+    x = x * (0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, edge)))
+    peak = float(np.abs(x).max())
+    scaled: NDArray[np.float64] = bias + amplitude * x / max(peak, np.finfo(float).tiny)
+    return scaled
+
+
+def odd_lines(
+    lowest: int, highest: int, rng: np.random.Generator, group: int = 4
+) -> NDArray[np.int64]:
+    """
+    Return odd harmonic numbers, with one of every group left out at random.
+
+    Odd and even lines that are not excited detect odd and even nonlinearity: the random-odd
+    multisine of Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012.
+    """
+    odd = np.arange(lowest | 1, highest + 1, 2)
+    keep = np.ones(odd.size, dtype=bool)
+    for start in range(0, odd.size - group + 1, group):
+        keep[start + rng.integers(group)] = False
+    return odd[keep]
+
+
+def multisine(
+    bias: float,
+    amplitude: float,
+    lines: NDArray[np.int64],
+    period: float,
+    periods: int,
+    sample_rate: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """
+    Return whole periods of a random-phase multisine with equal lines.
+
+    Parameters
+    ----------
+    bias, amplitude : float
+        Mean and largest deviation from it [V].
+    lines : ndarray of int
+        Harmonic numbers of ``1 / period``; see `odd_lines`.
+    period : float
+        [s], rounded to a sample.
+    periods : int
+        How often the period is repeated.
+    sample_rate : float
+        [Hz]
+    rng : numpy.random.Generator
+        Draws the phases.
+    """
+    n = sample_count(period, sample_rate)
+    sample_count(n * periods / sample_rate, sample_rate)
+    if lines.size == 0:
+        raise ConfigError('no odd line lies between the two frequencies; widen the band')
+    _below_nyquist(float(lines[-1]) * sample_rate / n, sample_rate)
+    spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
+    spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
+    x = irfft(spectrum, n)
+    return bias + amplitude * np.tile(x / np.abs(x).max(), periods)

@@ -1,0 +1,4 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""From records to a model, in the three steps of the paper."""

@@ -1,0 +1,345 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Records made ready for fitting: one rate, one scaling, normalised runs with their masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.model.initial_memory import forgotten
+from piezo_ident.model.stage_model import Scaling
+from piezo_ident.record.faults import suspicions
+from piezo_ident.record.gaps import bridged
+from piezo_ident.record.record import Piece, Record
+
+__all__ = [
+    'Prepared',
+    'Run',
+    'common_rate',
+    'drive_creep',
+    'noise_floor',
+    'prepare',
+    'refuse_closed_loop',
+    'runs_of',
+    'same_rate',
+    'scaling_of',
+]
+
+#: share of a triangle that is one block of held-out data, and how many blocks share one
+BLOCKS, EVERY = 60, 5
+#: share at the end of every noise and step segment that is not fitted
+END_HELD = 0.2
+#: a record starts from a known memory when its voltage starts within this share of the lowest
+REST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """
+    One piece, normalised.
+
+    Attributes
+    ----------
+    record : str
+        Name of the record it belongs to.
+    piece : Piece
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement.
+    known : ndarray of bool, shape (n,)
+        Sound samples at which the memory of the start no longer matters, or was known.
+    sound : ndarray of bool, shape (n,)
+        Samples that were measured, away from a gap that was bridged.
+    """
+
+    record: str
+    piece: Piece
+    u: NDArray[np.float64]
+    x: NDArray[np.float64]
+    known: NDArray[np.bool_]
+    sound: NDArray[np.bool_]
+
+    def mask(self, *kinds: str) -> NDArray[np.bool_]:
+        """Return which samples belong to segments of these kinds."""
+        chosen = np.zeros(self.piece.n, dtype=bool)
+        for s in self.piece.segments:
+            if s.kind in kinds:
+                chosen[s.start : s.stop] = True
+        return chosen
+
+    def unbroken(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """
+        Return the stretches between two samples that hold no long gap.
+
+        A sample or two that were bridged do no harm where a regression runs through them; a
+        straight line of many does.
+        """
+        unsound = np.concatenate([[0], (~self.sound[start:stop]).astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(unsound))
+        long = 0.0125 * self.piece.sample_rate
+        breaks = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > long]
+        ends = [0, *(int(x) for pair in breaks for x in pair), stop - start]
+        return [
+            (start + a, start + b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b > a
+        ]
+
+    def held_out(self) -> NDArray[np.bool_]:
+        """
+        Return which samples of triangle, noise and steps are kept from every fit.
+
+        Of a triangle every fifth block that holds no turning point, of the others the end.
+        """
+        held = np.zeros(self.piece.n, dtype=bool)
+        for s in self.piece.segments:
+            if s.kind in ('noise', 'step'):
+                held[s.stop - int(END_HELD * s.n) : s.stop] = True
+            elif s.kind == 'triangle':
+                edges = np.linspace(s.start, s.stop, BLOCKS + 1).astype(int)
+                for start, stop in zip(edges[2::EVERY], edges[3::EVERY], strict=False):
+                    dv = np.diff(self.u[start:stop])
+                    if dv.size and (np.all(dv >= 0) or np.all(dv <= 0)):
+                        held[start:stop] = True
+        return held
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """
+    Records ready for the steps.
+
+    Attributes
+    ----------
+    rate : float
+        [Hz]
+    scaling : Scaling
+    pieces : list of Piece
+        Of this rate.
+    runs : list of Run
+        The pieces, normalised.
+    warnings : list of str
+        Faults of the data, and what is left out.
+    """
+
+    rate: float
+    scaling: Scaling
+    pieces: list[Piece]
+    runs: list[Run]
+    warnings: list[str]
+
+    @property
+    def labelled(self) -> bool:
+        """Whether there are noise and a triangle, so that the three steps can be taken."""
+        return {'noise', 'triangle'} <= {s.kind for p in self.pieces for s in p.segments}
+
+
+def prepare(records: Sequence[Record]) -> Prepared:
+    """
+    Make records ready for the steps.
+
+    Raises
+    ------
+    IdentificationError
+        When they carry no response of a stage to a voltage.
+    """
+    if not records:
+        raise IdentificationError('no record was given')
+    for record in records:
+        refuse_closed_loop(record)
+    rate, left = common_rate(records)
+    pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
+    scaling = scaling_of(pieces)
+    faults = [f'{record.name}: {fault}' for record in records for fault in record.faults]
+    for record in records:
+        parts = bridged(record)
+        gaps, filled = sum(p.gaps for p in parts), sum(p.filled for p in parts)
+        if gaps:
+            faults.append(
+                f'{record.name}: {gaps} short gaps ({filled} samples) were bridged by straight '
+                'lines; neither they nor the moment after each were fitted or judged'
+            )
+    faults += [said for record in records for said in suspicions(record)]
+    return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
+
+
+def same_rate(one: float, other: float) -> bool:
+    """Return whether two sampling rates differ by no more than rounding (1e-6)."""
+    return abs(one / other - 1.0) < 1e-6
+
+
+def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
+    """
+    Return the sampling rate that carries the most voltage travel, and what is left out.
+
+    Raises
+    ------
+    IdentificationError
+        When the voltage never moves.
+    """
+    travel: dict[float, float] = {}
+    time: dict[float, float] = {}
+    for record in records:
+        for piece in record:
+            rate = next((r for r in travel if same_rate(r, piece.sample_rate)), piece.sample_rate)
+            travel[rate] = travel.get(rate, 0.0) + float(np.abs(np.diff(piece.v)).sum())
+            time[rate] = time.get(rate, 0.0) + piece.duration
+    best = max(travel, key=lambda rate: travel[rate])
+    names = ', '.join(record.name for record in records)
+    if travel[best] == 0.0:
+        raise IdentificationError(
+            f'{names}: the voltage never moves; record the stage while it is driven'
+        )
+    left = [
+        f'{time[rate]:.3g} s sampled at {rate:g} Hz are left out: the model holds for one rate, '
+        f'{best:g} Hz'
+        for rate in travel
+        if rate != best
+    ]
+    return best, left
+
+
+def scaling_of(pieces: Sequence[Piece]) -> Scaling:
+    """
+    Return the normalisation: voltage range and stroke to 1, the sign of the gain in Y.
+
+    Raises
+    ------
+    IdentificationError
+        When voltage or displacement never move.
+    """
+    low = min(float(p.v.min()) for p in pieces)
+    high = max(float(p.v.max()) for p in pieces)
+    if high <= low:
+        raise IdentificationError('the voltage is constant; record the stage while it is driven')
+    stroke = max(float(p.y.max()) for p in pieces) - min(float(p.y.min()) for p in pieces)
+    if stroke == 0.0:
+        raise IdentificationError('the displacement is constant; is the sensor connected?')
+    covariance = sum(float(np.sum((p.v - p.v.mean()) * (p.y - p.y.mean()))) for p in pieces)
+    sign = 1.0 if covariance >= 0.0 else -1.0
+    widest = max(pieces, key=lambda p: float(np.ptp(p.v)))
+    y0 = float(widest.y[np.argmin(widest.v)])
+    return Scaling(v0=low, V=high - low, y0=y0, Y=sign * stroke, range=(low, high))
+
+
+def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Run]:
+    """Return the pieces of one rate, joined over short gaps and normalised."""
+    runs = []
+    for record in records:
+        for part in bridged(record):
+            piece = part.piece
+            if not same_rate(piece.sample_rate, rate):
+                continue
+            u = scaling.u(piece.v)
+            known = part.sound.copy()
+            if abs(u[0]) > REST:
+                known[: forgotten(u)] = False
+            runs.append(Run(record.name, piece, u, scaling.x(piece.y), known, part.sound))
+    return runs
+
+
+def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
+    """
+    Return the rms of the sensor noise [m] and where it was read.
+
+    Stretches of constant voltage of at least 50 ms and 200 samples count, after half of each has
+    passed; a line is taken out of each.  The quietest quarter of that time is taken: the rest may
+    still ring or creep.
+    """
+    found: list[tuple[float, int]] = []
+    for piece in pieces:
+        moves = np.concatenate([[True], piece.v[1:] != piece.v[:-1], [True]])
+        # a stretch begins with the last sample that moves, and ends before the next one that does
+        begins = np.flatnonzero(moves[:-1] & ~moves[1:])
+        ends = np.flatnonzero(~moves[:-1] & moves[1:]) + 1
+        for begin, end in zip(begins, ends, strict=True):
+            middle = (begin + end) // 2
+            if end - middle < max(100, 0.025 * piece.sample_rate):
+                continue
+            y = piece.y[middle:end]
+            k = np.arange(y.size)
+            rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
+            found.append((float(rest @ rest) / (y.size - 2), y.size))
+    if not found:
+        return None, 'unknown: the voltage never rests'
+    found.sort()
+    variance, n = np.array([v for v, _ in found]), np.array([n for _, n in found])
+    quiet = np.cumsum(n) - n < 0.25 * n.sum()
+    floor = float(np.sqrt(np.average(variance[quiet], weights=n[quiet])))
+    return floor, 'the quietest stretches of constant voltage'
+
+
+def refuse_closed_loop(record: Record) -> None:
+    """
+    Refuse a record in which the drive moves and the position does not.
+
+    A stage under voltage control cannot do that; a position controller that makes up for creep
+    does exactly that, and then the voltage is the answer and the position the command.  How far
+    it creeps is read from the drive.
+
+    Raises
+    ------
+    IdentificationError
+    """
+    span = np.ptp(record.voltage_range)
+    if span == 0.0 or record.stroke == 0.0:
+        return
+    for piece in record:
+        window = max(16, int(0.5 * piece.sample_rate))
+        if piece.n < 4 * window:
+            continue
+        n = piece.n // window
+        v = piece.v[: n * window].reshape(n, window).mean(axis=1)
+        y = piece.y[: n * window].reshape(n, window).mean(axis=1)
+        still = np.abs(np.diff(y)) < 1e-4 * record.stroke
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            moved = abs(v[stop] - v[start]) / span
+            followed = abs(y[stop] - y[start]) / record.stroke
+            if stop - start >= 4 and moved > 0.005 and followed < 0.05 * moved:
+                t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
+                creep = drive_creep(piece, start * window, stop * window)
+                said = (
+                    ''
+                    if creep is None
+                    else '; there the drive makes up for '
+                    f'creep of {creep:.2g} V a decade of time, '
+                    f'{100.0 * creep / span:.2g} % of its range'
+                )
+                cause = 'a position controller was on'
+                if np.ptp(piece.y[(start + 1) * window : stop * window]) == 0.0:
+                    cause += ', or the sensor is at its stop, as it reads one value there'
+                raise IdentificationError(
+                    f'{record.name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by '
+                    f'{moved:.1%} of its range while the position moves by {followed:.2%} of its '
+                    f'stroke: {cause}, so the position is no response to the voltage{said}; '
+                    'record in open loop'
+                )
+
+
+def drive_creep(piece: Piece, start: int, stop: int) -> float | None:
+    """
+    Return by how much the drive moves a decade of time while the position is held [V].
+
+    Parameters
+    ----------
+    piece : Piece
+    start, stop : int
+        The hold.
+
+    Returns
+    -------
+    float or None
+        None where a straight line in time describes the drive as well: that is drift.
+    """
+    t, v = piece.t[start:stop] - piece.t[start] + 1.0 / piece.sample_rate, piece.v[start:stop]
+    left, slope = {}, {}
+    # a second, and a tenth of the whole, for what the controller does at first
+    late = t > min(1.0, 0.1 * t[-1])
+    for name, x in (('log', np.log10(t)), ('line', t)):
+        fit = np.polynomial.Polynomial.fit(x[late], v[late], 1)
+        left[name] = float(np.sum((v[late] - fit(x[late])) ** 2))
+        slope[name] = float(fit.convert().coef[-1])
+    return abs(slope['log']) if left['log'] < 0.5 * left['line'] else None

@@ -1,0 +1,284 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What an identification is asked for, and what it gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.identification.frequency_response import FrequencyResponse
+from piezo_ident.identification.step1_delay import StepDelay
+from piezo_ident.identification.step2_dynamics import OrderTable
+from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.dynamics import Dynamics
+from scipy.optimize import OptimizeResult
+
+__all__ = [
+    'DelayResult',
+    'DynamicsResult',
+    'ErrorRow',
+    'Identification',
+    'Progress',
+    'Settings',
+    'Steps',
+    'rms_percent',
+    'silent',
+]
+
+#: called with the name of the step and the share of it that is done; raises `Cancelled` to stop
+Progress = Callable[[str, float], None]
+
+
+def silent(step: str, share: float) -> None:
+    """Report no progress."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How to identify.
+
+    Attributes
+    ----------
+    thresholds : int
+        Number of plays of H, that at r = 0 included, evenly spaced over the excited range.
+    refine : bool
+        Choose number and places of the thresholds by held-out error instead.
+    solver : {'swarm', 'least_squares'}
+        How the weights are found.
+    max_order : int
+        Largest na and nb that are tried.
+    order : tuple of int, optional
+        (na, nb) instead of a search.
+    delay : int, optional
+        Delay [samples] instead of the one found.
+    swarm_size, swarm_iterations : int
+        Size of the swarm, and most iterations.
+    hold_out : float, optional
+        Seconds at the end of an unlabelled record that are not fitted; a fifth of it, at least
+        1.5 s and at most a quarter, when absent.
+    seed : int
+        For everything that is drawn by chance.
+
+    Raises
+    ------
+    ConfigError
+        When a value is out of range.
+    """
+
+    thresholds: int = 10
+    refine: bool = False
+    solver: Solver = 'swarm'
+    max_order: int = 15
+    order: tuple[int, int] | None = None
+    delay: int | None = None
+    swarm_size: int = 40
+    swarm_iterations: int = 20_000
+    hold_out: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.thresholds <= 400:
+            raise ConfigError(f'thresholds must be 2 to 400, got {self.thresholds}')
+        if self.solver not in ('swarm', 'least_squares'):
+            raise ConfigError(f'solver must be swarm or least_squares, got {self.solver!r}')
+        if not 1 <= self.max_order <= 50:
+            raise ConfigError(f'max_order must be 1 to 50, got {self.max_order}')
+        sizes = list(self.order or (1, 1))
+        if len(sizes) != 2 or not all(1 <= n <= 50 for n in sizes):
+            raise ConfigError(f'order must be two numbers of 1 to 50, got {self.order}')
+        if self.delay is not None and not 0 <= self.delay <= 10_000:
+            raise ConfigError(f'delay must be 0 to 10000 samples, got {self.delay}')
+        if self.swarm_size < 2:
+            raise ConfigError(f'swarm_size must be at least 2, got {self.swarm_size}')
+        if self.swarm_iterations < 1:
+            raise ConfigError(f'swarm_iterations must be positive, got {self.swarm_iterations}')
+        if self.hold_out is not None and not 0.0 < self.hold_out < float('inf'):
+            raise ConfigError(f'hold_out must be a positive time, got {self.hold_out} s')
+        if self.seed < 0:
+            raise ConfigError(f'seed must not be negative, got {self.seed}')
+
+
+@dataclass(frozen=True, eq=False)
+class DelayResult:
+    """
+    Result of step 1.
+
+    Attributes
+    ----------
+    samples : int
+    std : float
+        [samples]; infinite when the data do not tell.
+    source : {'steps', 'scan', 'given', 'none'}
+    step : StepDelay or None
+    loss : ndarray or None
+        One-step ARX loss for d = 0, 1, ...
+    scan : int or None
+        Delay that the scan points to.
+    """
+
+    samples: int
+    std: float
+    source: str
+    step: StepDelay | None = None
+    loss: NDArray[np.float64] | None = None
+    scan: int | None = None
+
+    @property
+    def agree(self) -> bool | None:
+        """Whether steps and scan agree within a sample; None when one is missing."""
+        if self.step is None or self.step.samples is None or self.scan is None:
+            return None
+        return abs(self.step.samples - self.scan) <= 1
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsResult:
+    """
+    Result of step 2.
+
+    Attributes
+    ----------
+    order : tuple of int
+        (na, nb); (0, 1) stands for G = 1.
+    table : OrderTable or None
+        Least squares at every order, with the hysteresis undone.
+    methods : dict of str to float
+        Held-out free-run error of least squares, instrumental variables and output error at the
+        order chosen, in % of the rms of the held-out output; infinite when unstable.
+    covariance : ndarray, shape (na + nb, na + nb)
+        Of (a, b).
+    response : FrequencyResponse or None
+        Measured, from voltage to displacement, normalised.
+    bias : float
+        Voltage around which it was measured, normalised.
+    slope_measured, slope_model : float
+        Small-signal gain of the measured displacement at this bias, and that of H, normalised.
+    band : float
+        Highest frequency with power in the input [Hz].
+    """
+
+    order: tuple[int, int]
+    table: OrderTable | None
+    methods: dict[str, float]
+    covariance: NDArray[np.float64]
+    response: FrequencyResponse | None = None
+    bias: float = float('nan')
+    slope_measured: float = float('nan')
+    slope_model: float = float('nan')
+    band: float = float('nan')
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """
+    What single steps have found so far.
+
+    Attributes
+    ----------
+    delay : DelayResult or None
+    dynamics : tuple of (DynamicsResult, Dynamics) or None
+    """
+
+    delay: DelayResult | None = None
+    dynamics: tuple[DynamicsResult, Dynamics] | None = None
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """
+    Free-run error of one stretch of data.
+
+    Attributes
+    ----------
+    record, segment : str
+    percent : float
+        `piezo_ident.model.metrics.percent_of_stroke`, by the stroke of the whole record.
+    static_percent : float
+        The same for the hysteresis alone.
+    fit : float
+        `piezo_ident.model.metrics.fit_percent`.
+    n : int
+        Samples.
+    data : {'fitted', 'held out', 'selection'}
+        Whether these samples were fitted; 'selection' was not fitted but chose between models.
+    """
+
+    record: str
+    segment: str
+    percent: float
+    static_percent: float
+    fit: float
+    n: int
+    data: str
+
+
+def rms_percent(rows: Sequence[ErrorRow]) -> float:
+    """Return the error over some rows together, weighted by samples; NaN without rows."""
+    n = sum(row.n for row in rows)
+    return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / n)) if n else float('nan')
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """
+    Result of an identification.
+
+    Attributes
+    ----------
+    model : StageModel
+    delay : DelayResult
+    dynamics : DynamicsResult
+    hysteresis : HysteresisFit
+    errors : tuple of ErrorRow
+    noise_floor : float or None
+        Rms of the sensor noise, % of stroke.
+    noise_source : str
+    stroke : float
+        [m]
+    warnings : tuple of str
+        What a reader has to know.
+    not_identified : tuple of (str, str)
+        What these data could not tell, and why.
+    settings : Settings
+    memories : mapping of (str, float) to ndarray
+        Fitted play outputs at the start of a piece, by record name and start time.
+    """
+
+    model: StageModel
+    delay: DelayResult
+    dynamics: DynamicsResult
+    hysteresis: HysteresisFit
+    errors: tuple[ErrorRow, ...]
+    noise_floor: float | None
+    noise_source: str
+    stroke: float
+    warnings: tuple[str, ...]
+    not_identified: tuple[tuple[str, str], ...]
+    settings: Settings
+    memories: Mapping[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
+
+    @property
+    def swarm(self) -> OptimizeResult | None:
+        """What the swarm reported."""
+        return self.hysteresis.swarm
+
+    def error(self, data: str) -> float:
+        """
+        Return the error over all rows of a kind of data, weighted by samples; NaN if none.
+
+        Ramps and rests do not count: they are easy, and would flatter.
+        """
+        easy = ('idle', 'ramp')
+        rows = [
+            row
+            for row in self.errors
+            if row.data == data and row.segment.partition(':')[0] not in easy
+        ]
+        return rms_percent(rows)

@@ -1,0 +1,237 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Refinement of G by output error: the parameters that simulate best, not those that predict a step.
+
+Gauss-Newton with Levenberg's damping on  sum (y - B/A z^-d w - offset)^2.  With w_f = w/A and
+y_f = y_sim/A the gradients are shifts of two filtered signals:
+
+    d y_sim / d b_j = w_f(k-d-j+1),      d y_sim / d a_i = - y_f(k-i)
+
+after Ljung, System Identification, 2nd ed. (1999), section 10.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.identification.solvers.lag_products import lag_products, lag_sums, stretches_of
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+
+__all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
+
+#: poles beyond this radius count as unstable: they would ring for longer than any record
+RADIUS = 0.99999
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """
+    Data for one simulation.
+
+    Attributes
+    ----------
+    w, y : ndarray, shape (n,)
+        Input, already delayed by d, and output; the run starts in equilibrium with ``w[0]``.
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    """
+
+    w: NDArray[np.float64]
+    y: NDArray[np.float64]
+    use: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class OutputErrorFit:
+    """
+    Result of the refinement.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+    covariance : ndarray, shape (na + nb, na + nb)
+        Of (a, b), for white output noise.
+    rms : float
+        Root mean square of the simulation error.
+    offsets : ndarray
+        Constant added to each stretch.
+    iterations : int
+    improved : bool
+        Whether anything better than the start was found.
+    """
+
+    dynamics: Dynamics
+    covariance: NDArray[np.float64]
+    rms: float
+    offsets: NDArray[np.float64]
+    iterations: int
+    improved: bool
+
+    @property
+    def normalised_covariance(self) -> NDArray[np.float64]:
+        """Covariance of (a, b) of ``dynamics.normalised()``, whose b depend on the gain."""
+        G, na = self.dynamics, self.dynamics.a.size
+        J = np.eye(na + G.b.size)
+        # b / g with the gain g = sum(b) / (1 + sum(a))
+        share = (G.b / G.b.sum())[:, None]
+        J[na:, :na] = share
+        J[na:, na:] -= share
+        J[na:, na:] /= G.gain
+        return np.asarray(J @ self.covariance @ J.T)
+
+
+Stretches = list[tuple[int, int]]
+
+
+def _mean(x: NDArray[np.float64], stretches: Stretches) -> float:
+    total = sum(float(np.sum(x[start:stop])) for start, stop in stretches)
+    return total / sum(stop - start for start, stop in stretches)
+
+
+def _past(
+    x: NDArray[np.float64], stretches: Stretches, count: int, negative: bool = False
+) -> NDArray[np.float64]:
+    # before the record the stage was at rest; a constant has no part in what is eliminated with
+    # the offsets, and without it the sums lose no digits
+    level = _mean(x, stretches)
+    past = np.empty(count + x.size)
+    if negative:
+        np.subtract(level, x, out=past[count:])
+    else:
+        np.subtract(x, level, out=past[count:])
+    past[:count] = past[count]
+    return past
+
+
+class _Problem:
+    """Normal equations of the linearised problem, offsets eliminated stretch by stretch."""
+
+    def __init__(self, stretches: Sequence[Stretch], na: int, nb: int) -> None:
+        self.stretches, self.na, self.nb = stretches, na, nb
+        self.n = int(sum(s.use.sum() for s in stretches))
+        self.used = [stretches_of(s.use) for s in stretches]
+
+    def errors(self, model: Dynamics) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+        """Return what the free run leaves of each stretch, without its mean, and the means."""
+        found, offsets = [], []
+        for s, used in zip(self.stretches, self.used, strict=True):
+            e = filter_arx(model.a, model.b, s.w)
+            np.subtract(s.y, e, out=e)
+            offsets.append(_mean(e, used))
+            e -= offsets[-1]
+            found.append(e)
+        return found, np.array(offsets)
+
+    def loss(self, errors: Sequence[NDArray[np.float64]]) -> float:
+        total = 0.0
+        for e, used in zip(errors, self.used, strict=True):
+            total += sum(float(np.sum(np.square(e[start:stop]))) for start, stop in used)
+        return total / self.n
+
+    def normal(
+        self, model: Dynamics, errors: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        na, p = self.na, self.na + self.nb
+        H, g = np.zeros((p, p)), np.zeros(p)
+        one = np.ones(1)
+        for s, e, used in zip(self.stretches, errors, self.used, strict=True):
+            # what is y(k-1), y(k-2), ... and w(k), w(k-1), ... to the products
+            groups = []
+            if na:
+                # the simulated output but for a constant, which `_past` takes out
+                y_f = _past(filter_arx(model.a, one, s.y - e), used, p, negative=True)
+                groups.append((y_f, p - 1, slice(0, na), na))
+            w_f = _past(filter_arx(model.a, one, s.w), used, p)
+            groups.append((w_f, p, slice(na, p), p - na))
+            sums, n = np.zeros(p), 0
+            for start, stop in used:
+                n += stop - start
+                here = stop - start
+                for x, x_at, rows, n_x in groups:
+                    at = start + x_at
+                    g[rows] += lag_products(x, e, at, start, here, n_x, 1)[:, 0]
+                    sums[rows] += lag_sums(x, at, here, n_x)
+                    for z, z_at, columns, n_z in groups:
+                        if columns.start >= rows.start:
+                            H[rows, columns] += lag_products(
+                                x, z, at, start + z_at, here, n_x, n_z
+                            )
+            H -= np.outer(sums, sums) / n
+        H[na:, :na] = H[:na, na:].T
+        return H, g
+
+
+def simulation_error(stretches: Sequence[Stretch], model: Dynamics) -> float:
+    """Return the rms of the free-run error, an offset taken out of each stretch."""
+    problem = _Problem(stretches, model.a.size, model.b.size)
+    return float(np.sqrt(problem.loss(problem.errors(model)[0])))
+
+
+def output_error(
+    stretches: Sequence[Stretch],
+    start: Dynamics,
+    maxiter: int = 30,
+    tol: float = 1e-7,
+    tick: Callable[[], None] | None = None,
+) -> OutputErrorFit:
+    """
+    Refine dynamics by free-run simulation error.
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+    start : Dynamics
+        Stable start; its orders are kept.
+    maxiter : int, optional
+    tol : float, optional
+        Stop when the loss falls by less than this share.
+    tick : callable, optional
+        Called once an iteration; may raise to stop the work.
+
+    Returns
+    -------
+    OutputErrorFit
+        Always stable; the start itself when nothing better was found.
+    """
+    na, nb = start.a.size, start.b.size
+    problem = _Problem(stretches, na, nb)
+    model = start
+    errors, offsets = problem.errors(model)
+    loss = first_loss = problem.loss(errors)
+    damping, iterations = 1e-3, 0
+    while iterations < maxiter:
+        iterations += 1
+        if tick is not None:
+            tick()
+        H, g = problem.normal(model, errors)
+        diagonal = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+        scaled = H / np.outer(diagonal, diagonal)
+        accepted = False
+        while damping < 1e8:
+            step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
+            trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
+            if trial.radius < RADIUS:
+                new_errors, new_offsets = problem.errors(trial)
+                new = problem.loss(new_errors)
+                if new < loss:
+                    accepted = True
+                    break
+            damping *= 4.0
+        if not accepted:
+            break
+        fall = 1.0 - new / loss
+        model, loss, errors, offsets = trial, new, new_errors, new_offsets
+        damping = max(damping / 10.0, 1e-12)
+        if fall < tol or loss == 0.0:
+            break
+    H, _ = problem.normal(model, errors)
+    covariance = np.asarray(
+        loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
+    )
+    rms = float(np.sqrt(loss))
+    return OutputErrorFit(model, covariance, rms, offsets, iterations, loss < first_loss)

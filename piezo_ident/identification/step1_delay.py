@@ -1,0 +1,205 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Step 1: the pure delay, from steps, checked against a scan of the ARX loss.
+
+All step responses are turned the same way, scaled and averaged; the delay is the first sample at
+which the average leaves the noise.  The scan asks the same of the noise record: the largest delay
+that does not cost loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record.record import Piece
+
+__all__ = ['StepDelay', 'average_step', 'delay_from_loss', 'delay_from_steps', 'find_jumps']
+
+#: the average response counts as risen at this many standard deviations of its noise
+THRESHOLD = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class StepDelay:
+    """
+    Delay found from steps.
+
+    Attributes
+    ----------
+    samples : int or None
+        Delay d; None when no response rose above the noise.
+    std : float
+        Standard deviation over repeats [samples]: each repeat left out once (jackknife), at
+        least the resolution of the sampling clock, 1/sqrt(12).
+    repeats : int
+        Number of steps averaged.
+    noise : float
+        Standard deviation of the averaged response before the step [m/V].
+    threshold : float
+        Level at which the response counts as risen [m/V].
+    lag, response : ndarray, shape (n,)
+        Samples after the step, and the averaged response there [m/V].
+    """
+
+    samples: int | None
+    std: float
+    repeats: int
+    noise: float
+    threshold: float
+    lag: NDArray[np.int64]
+    response: NDArray[np.float64]
+
+
+def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.int64]:
+    """
+    Return the samples at which v jumps out of a quiet stretch.
+
+    A jump is a difference that exceeds a quarter of the largest one, and twenty times every
+    difference within `before` samples ahead of it.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Voltage [V].
+    before, after : int
+        Samples needed ahead of and behind a jump.
+
+    Returns
+    -------
+    ndarray of int
+        Index of the first sample after each jump.
+    """
+    dv = np.abs(np.diff(v))
+    if dv.size == 0 or dv.max() == 0.0:
+        return np.empty(0, dtype=np.int64)
+    large = np.flatnonzero(dv > 0.25 * dv.max()) + 1
+    large = large[(large >= before) & (large + after <= v.size)]
+    if large.size == 0 or before < 2:
+        return np.asarray(large, dtype=np.int64)
+    # ahead[k] is the largest difference between the samples k - before .. k - 1
+    ahead = np.lib.stride_tricks.sliding_window_view(dv, before - 1).max(axis=1)
+    quiet = ahead[large - before] < 0.05 * dv[large - 1]
+    return np.asarray(large[quiet], dtype=np.int64)
+
+
+def _responses(
+    pieces: Sequence[Piece], before: int, after: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rows, heights = [], []
+    for piece in pieces:
+        for k in find_jumps(piece.v, before, after):
+            height = piece.v[k] - piece.v[k - 1]
+            y = piece.y[k - before : k + after]
+            # the stage may still be settling; what it did before the step goes on under it
+            line = np.polynomial.Polynomial.fit(np.arange(before), y[:before], 1)
+            rows.append((y - line(np.arange(before + after))) / height)
+            heights.append(abs(height))
+    return np.array(rows).reshape(-1, before + after), np.array(heights)
+
+
+def average_step(
+    pieces: Sequence[Piece], before: int = 100, after: int = 60
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """
+    Return the step responses [m/V], one a row, and the height of each step [V].
+
+    Parameters
+    ----------
+    pieces : sequence of Piece
+    before, after : int, optional
+        Samples ahead of and behind each step.
+
+    Returns
+    -------
+    responses : ndarray, shape (repeats, before + after)
+    heights : ndarray, shape (repeats,)
+    """
+    return _responses(pieces, before, after)
+
+
+def _first_rise(
+    mean: NDArray[np.float64], before: int, rounding: float
+) -> tuple[int | None, float, float]:
+    noise = float(np.std(mean[:before], ddof=2))
+    # a quantised, noise-free record still has its last digit
+    threshold = THRESHOLD * max(noise, rounding, 1e-6 * float(np.abs(mean[before:]).max()))
+    sign = np.sign(mean[before:].sum())
+    risen = sign * mean[before:] > threshold
+    # one sample may be chance, two in a row are not
+    both = np.flatnonzero(risen[:-1] & risen[1:])
+    return (int(both[0]) if both.size else None), noise, threshold
+
+
+def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60) -> StepDelay:
+    """
+    Find the pure delay from steps.
+
+    Parameters
+    ----------
+    pieces : sequence of Piece
+        Stretches that hold the steps.
+    before, after : int, optional
+        Samples ahead of and behind each step that are looked at.
+
+    Returns
+    -------
+    StepDelay
+        With ``samples=None`` when there is no step, or none that rises above the noise.
+    """
+    responses, heights = _responses(pieces, before, after)
+    lag = np.arange(-before, after)
+    n = heights.size
+    if n == 0:
+        empty = np.zeros(before + after)
+        return StepDelay(None, float('inf'), 0, float('nan'), float('nan'), lag, empty)
+    # the noise of a response in m/V falls with its height, so weights go with the square of it
+    weight = heights**2 / np.sum(heights**2)
+    mean = weight @ responses
+    # what taking out a line leaves of a displacement that never moves
+    largest = max(float(np.abs(piece.y).max()) for piece in pieces)
+    rounding = 1e-12 * largest / float(heights.max())
+    samples, noise, threshold = _first_rise(mean, before, rounding)
+    std = 1.0 / np.sqrt(12.0)
+    if samples is None:
+        std = float('inf')
+    elif n > 2:
+        left_out = [
+            _first_rise(
+                np.delete(weight, i) @ np.delete(responses, i, 0) / (1 - weight[i]),
+                before,
+                rounding,
+            )
+            for i in range(n)
+        ]
+        found = np.array([s if s is not None else after for s, _, _ in left_out], dtype=float)
+        jackknife = np.sqrt((n - 1) / n * np.sum((found - found.mean()) ** 2))
+        std = max(std, float(jackknife))
+    return StepDelay(samples, std, n, noise, threshold, lag, mean)
+
+
+def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int | None:
+    """
+    Return the delay that a scan of the ARX loss points to.
+
+    A model with a smaller delay contains the one with the true delay as long as it has enough
+    numerator coefficients, so the loss stays low up to the true delay and rises behind it.
+
+    Parameters
+    ----------
+    loss : ndarray, shape (n,)
+        One-step loss for d = 0, 1, ...
+    tolerance : float, optional
+        Rise over the smallest loss that counts as none.
+
+    Returns
+    -------
+    int or None
+        None when the loss has not risen at the largest delay tried: then it tells nothing.
+    """
+    low = np.flatnonzero(loss <= (1.0 + tolerance) * loss.min())
+    return int(low[-1]) if low[-1] < loss.size - 1 else None

@@ -1,0 +1,350 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Step 2: ARX dynamics of every order from one factorisation, and instrumental variables.
+
+    y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j u(k-d-j+1) + e(k)             (eqs. 4-5)
+
+The data matrix of the largest order is reduced once to its triangular factor R, a few dozen rows.
+Every smaller order, and every delay, is a choice of columns of R:
+
+        [ y(k-1) .. y(k-na_max) | u(k) .. u(k-d_max-nb_max+1) | y(k) ]   =   Q R
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.solvers.lag_products import lag_products
+from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+from scipy import signal
+from scipy.linalg import solve_triangular
+
+__all__ = [
+    'ArxFactor',
+    'OrderTable',
+    'arx_factor',
+    'excited_band',
+    'instrumental_variables',
+    'prefilter',
+    'scan_orders',
+    'stabilised',
+]
+
+#: what is left of a column of unit length, once those before it are taken off, must be more
+INDEPENDENT = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class ArxFactor:
+    """
+    Triangular factor of the ARX data matrix.
+
+    Attributes
+    ----------
+    R : ndarray, shape (p, p)
+        ``p = na_max + n_lags + 1``; columns as in the module's drawing.
+    n : int
+        Number of rows that went in.
+    na_max, n_lags : int
+        Lags of the output, and of the input from lag 0 on.
+    """
+
+    R: NDArray[np.float64]
+    n: int
+    na_max: int
+    n_lags: int
+
+    def _columns(
+        self, na: int, nb: int, d: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        # those of an order, and their lengths
+        A = self.R[:, [*range(na), *range(self.na_max + d, self.na_max + d + nb)]]
+        scale = np.linalg.norm(A, axis=0)
+        scale[scale == 0.0] = 1.0
+        return A, scale
+
+    def fit(self, na: int, nb: int, d: int) -> tuple[NDArray[np.float64], float]:
+        """
+        Solve one order by least squares.
+
+        Returns
+        -------
+        theta : ndarray, shape (na + nb,)
+            a_1 .. a_na, b_1 .. b_nb.
+        loss : float
+            Mean square of the one-step prediction error.
+        """
+        (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
+        x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
+        loss = float(np.sum((y - A @ x) ** 2)) / self.n
+        theta = x.copy()
+        theta[:na] *= -1.0
+        return theta, loss
+
+    def fits(self, na: int, nb_max: int, d: int) -> list[tuple[NDArray[np.float64], float]]:
+        """
+        Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
+
+        Returns
+        -------
+        list of (theta, loss)
+            As from `fit`, which is asked where the data do not tell the columns apart.
+        """
+        A, scale = self._columns(na, nb_max, d)
+        both = np.column_stack([A / scale, self.R[:, -1]])
+        R = np.asarray(np.linalg.qr(both, mode='r'))
+        left = np.square(R[:, -1])
+        size = np.abs(np.diag(R))
+        found = []
+        for p in range(na + 1, na + nb_max + 1):
+            if size[:p].min() < INDEPENDENT:
+                found.append(self.fit(na, p - na, d))
+                continue
+            theta = solve_triangular(R[:p, :p], R[:p, -1], check_finite=False) / scale[:p]
+            theta[:na] *= -1.0
+            found.append((theta, float(np.sum(left[p:])) / self.n))
+        return found
+
+
+def arx_factor(
+    u: NDArray[np.float64], y: NDArray[np.float64], na_max: int, n_lags: int
+) -> ArxFactor:
+    """
+    Reduce input and output to the triangular factor of their lags.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+        Input and output without their means.
+    na_max, n_lags : int
+        Lags 1..na_max of y and 0..n_lags-1 of u.
+
+    Raises
+    ------
+    IdentificationError
+        When there are fewer samples than lags.
+    """
+    first = max(na_max, n_lags - 1)
+    n = y.size - first
+    p = na_max + n_lags + 1
+    if n < 2 * p:
+        raise IdentificationError(
+            f'{y.size} samples are too few for {na_max} + {n_lags} lags; measure longer'
+        )
+    windows_y = np.lib.stride_tricks.sliding_window_view(y, na_max + 1)
+    windows_u = np.lib.stride_tricks.sliding_window_view(u, n_lags)
+
+    def rows() -> Iterator[NDArray[np.float64]]:
+        for start in range(first, y.size, ROWS):
+            k = np.arange(start, min(start + ROWS, y.size))
+            past_y = windows_y[k - na_max][:, ::-1]
+            past_u = windows_u[k - n_lags + 1][:, ::-1]
+            yield np.hstack([past_y[:, 1:], past_u, past_y[:, :1]])
+
+    R = triangular_factor(rows(), p)
+    return ArxFactor(R, n, na_max, n_lags)
+
+
+@dataclass(frozen=True, eq=False)
+class OrderTable:
+    """
+    Every order side by side; arrays have shape (na_max, nb_max), entry [na-1, nb-1].
+
+    Attributes
+    ----------
+    loss : ndarray
+        One-step loss on the fitted part.
+    aic, bic, fpe : ndarray
+        Akaike's and Schwarz's criterion and Akaike's final prediction error.
+    held_out : ndarray
+        Free-run rms error on the held-out part, infinite for an unstable model.
+    dynamics : tuple of tuple of Dynamics
+    """
+
+    loss: NDArray[np.float64]
+    aic: NDArray[np.float64]
+    bic: NDArray[np.float64]
+    fpe: NDArray[np.float64]
+    held_out: NDArray[np.float64]
+    dynamics: tuple[tuple[Dynamics, ...], ...]
+
+    def best(self, criterion: str) -> tuple[int, int]:
+        """Return (na, nb) of the smallest ``aic``, ``bic``, ``fpe`` or ``held_out``."""
+        table = getattr(self, criterion)
+        i, j = np.unravel_index(int(np.argmin(table)), table.shape)
+        return int(i) + 1, int(j) + 1
+
+    def ranked(self, slack: float = 0.0) -> list[tuple[int, int]]:
+        """Return the orders by held-out error, rounded up in steps of `slack`, then by size."""
+        order = []
+        best = float(self.held_out.min())
+        for i, j in np.ndindex(self.held_out.shape):
+            error = float(self.held_out[i, j])
+            if np.isfinite(error):
+                excess = error / best - 1.0 if best > 0.0 else 0.0
+                step = int(excess / slack) if slack > 0.0 else excess
+                order.append((step, i + j + 2, error, (i + 1, j + 1)))
+        return [orders for *_, orders in sorted(order)]
+
+
+def scan_orders(
+    factor: ArxFactor,
+    d: int,
+    nb_max: int,
+    u_held: NDArray[np.float64],
+    y_held: NDArray[np.float64],
+    tick: Callable[[float], None] | None = None,
+) -> OrderTable:
+    """
+    Fit all orders up to (na_max, nb_max), and judge each by free run on held-out data.
+
+    Parameters
+    ----------
+    factor : ArxFactor
+    d : int
+        Delay [samples].
+    nb_max : int
+    u_held, y_held : ndarray, shape (n,)
+        Data that were not fitted; the first fifth is left for the transient.
+    tick : callable, optional
+        Called with the share of the work done; may raise to stop it.
+    """
+    shape = (factor.na_max, nb_max)
+    loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
+    size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
+    delayed = np.concatenate([np.zeros(d), u_held[: u_held.size - d]])
+    skip = y_held.size // 5
+    models = []
+    for na in range(1, shape[0] + 1):
+        row = []
+        for nb, (theta, one_step) in enumerate(factor.fits(na, nb_max, d), 1):
+            loss[na - 1, nb - 1] = one_step
+            model = Dynamics(a=theta[:na], b=theta[na:])
+            row.append(model)
+            if model.is_stable:
+                simulated = filter_arx(model.a, model.b, delayed, at_rest=False)
+                e = (y_held - simulated)[skip:]
+                held[na - 1, nb - 1] = np.sqrt(np.mean((e - e.mean()) ** 2))
+        models.append(tuple(row))
+        if tick is not None:
+            tick(na / shape[0])
+    log_loss = factor.n * np.log(np.maximum(loss, np.finfo(float).tiny))
+    return OrderTable(
+        loss=loss,
+        aic=log_loss + 2.0 * size,
+        bic=log_loss + np.log(factor.n) * size,
+        fpe=loss * (factor.n + size) / (factor.n - size),
+        held_out=held,
+        dynamics=tuple(models),
+    )
+
+
+def stabilised(dynamics: Dynamics, radius: float = 0.9995) -> Dynamics:
+    """Return the dynamics with poles outside the circle mirrored into it, same static gain."""
+    poles = dynamics.poles
+    if poles.size == 0 or np.abs(poles).max() < 1.0:
+        return dynamics
+    outside = np.abs(poles) >= 1.0
+    poles[outside] = 1.0 / np.conj(poles[outside])
+    size = np.abs(poles)
+    poles = np.where(size > radius, poles * radius / np.maximum(size, radius), poles)
+    a = np.real(np.poly(poles))[1:]
+    gain = dynamics.gain
+    b = dynamics.b
+    if np.isfinite(gain) and b.sum() != 0.0:
+        b = b * (gain * (1.0 + a.sum()) / b.sum())
+    return Dynamics(a=a, b=b)
+
+
+_Lags = tuple[NDArray[np.float64], int, float, int]
+
+
+def _inner(one: _Lags, other: _Lags, n: int) -> NDArray[np.float64]:
+    """Return the sums of products of two groups of lags, each (signal, first row, sign, lags)."""
+    (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
+    return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
+
+
+def instrumental_variables(
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    start: Dynamics,
+    d: int,
+    iterations: int = 3,
+) -> Dynamics:
+    """
+    Refine an ARX model by instrumental variables.
+
+    Instruments are the lags of the input and of the simulated output; data and instruments are
+    filtered by 1/A of the model before, which removes the bias that output noise gives to least
+    squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+        Without their means.
+    start : Dynamics
+        Least-squares model; made stable first.
+    d : int
+        Delay [samples].
+    iterations : int, optional
+
+    Returns
+    -------
+    Dynamics
+        Possibly unstable: the caller judges.
+    """
+    na, nb = start.a.size, start.b.size
+    model = stabilised(start)
+    delayed = np.concatenate([np.zeros(d), u[: u.size - d]])
+    first = max(na, nb)
+
+    n = u.size - first
+    for _ in range(iterations):
+        one = np.ones(1)
+        y_sim = filter_arx(model.a, model.b, delayed, at_rest=False)
+        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, delayed, y_sim))
+        u_lags = (uf, first, 1.0, nb)
+        z, phi = ((sf, first - 1, -1.0, na), u_lags), ((yf, first - 1, -1.0, na), u_lags)
+        A = np.block([[_inner(x, other, n) for other in phi] for x in z])
+        right = np.concatenate([_inner(x, (yf, first, 1.0, 1), n) for x in z])[:, 0]
+        scale = np.sqrt(np.concatenate([np.diag(_inner(x, x, n)) for x in z]))
+        scale[scale == 0.0] = 1.0
+        theta = np.linalg.lstsq(A / scale[:, None], right / scale, rcond=None)[0]
+        candidate = Dynamics(a=theta[:na], b=theta[na:])
+        if not candidate.is_stable:
+            return candidate
+        model = candidate
+    return model
+
+
+def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3) -> float:
+    """
+    Return the highest frequency at which the input still has power [Hz].
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+    sample_rate : float
+        [Hz]
+    depth : float, optional
+        Share of the largest spectral density that counts as power.
+    """
+    f, power = signal.welch(u, sample_rate, nperseg=min(u.size, 2048))
+    return float(f[np.flatnonzero(power >= depth * power.max())[-1]])
+
+
+def prefilter(x: NDArray[np.float64], sample_rate: float, cutoff: float) -> NDArray[np.float64]:
+    """Return x without its mean and without what lies above the cut-off; shape (n,)."""
+    centred = np.asarray(x - x.mean())
+    if cutoff >= 0.45 * sample_rate:
+        return centred
+    sos = signal.butter(4, cutoff, fs=sample_rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, centred))

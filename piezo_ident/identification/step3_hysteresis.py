@@ -1,0 +1,378 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Step 3: the weights of H, by particle swarm as in the paper, or by bounded least squares.
+
+With thresholds and dynamics fixed, the output is linear in what is sought,
+
+    y = offset + sum_i q_i (G F_ri[v]) + p1 (G v^3) + p2 (G v),        q_i >= 0,
+
+so the filtered plays are columns.  They are reduced once to the triangular factor R, with the
+offsets in front; the rows below the offsets then hold the problem without them, and their Gram
+matrix is all that the swarm needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+import functools
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.kernel import kernel
+from piezo_ident.identification.filtered_plays import filtered_plays
+from piezo_ident.identification.solvers.lag_products import stretches_of
+from piezo_ident.identification.solvers.least_squares import (
+    bounded_least_squares,
+    triangular_factor,
+)
+from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.play import initial_memory, weighted_plays
+from scipy.optimize import Bounds, OptimizeResult
+
+__all__ = [
+    'Excerpt',
+    'HysteresisFit',
+    'even_thresholds',
+    'factorise',
+    'fine_thresholds',
+    'fit_hysteresis',
+    'merged',
+]
+
+Solver = Literal['swarm', 'least_squares']
+
+#: box in which the swarm starts and stays, in units of full stroke over full voltage range
+WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
+#: a play that moves less than this share of what it is cannot be told from the offset
+STILL = 1e-8
+#: what may be left of the start of G where the samples used begin
+FORGOTTEN = 1e-13
+#: how far the voltage may move within one averaged row, as a share of its range
+ROW_SPAN = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """
+    Data for fitting H: one uniformly sampled run, and which of its samples count.
+
+    Attributes
+    ----------
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement of the whole run; the plays need all of it.
+    use : ndarray of bool, shape (n,)
+        Samples that are fitted.
+    memory : callable, optional
+        Play outputs before the first sample, as a function of the thresholds; that of a stage
+        which last came down to zero when absent.
+    """
+
+    u: NDArray[np.float64]
+    x: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def start(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the play outputs before the first sample."""
+        if self.memory is None:
+            return initial_memory(float(self.u[0]), thresholds)
+        return self.memory(thresholds)
+
+    @functools.cached_property
+    def row(self) -> int:
+        """Samples that one row of the fit may average."""
+        if not self.use.any():
+            return 1
+        speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
+        span = ROW_SPAN * float(np.ptp(self.u[self.use]))
+        return max(
+            1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
+        )
+
+    @property
+    def rows(self) -> int:
+        """Rows that these samples become; white noise is independent from row to row."""
+        return sum((stop - start) // self.row for start, stop in stretches_of(self.use))
+
+
+def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
+    """
+    Return `count` evenly spaced thresholds from 0 over the excited swing, without the 0.
+
+    The play at r = 0 is the linear term, so `count` operators have ``count - 1`` thresholds.
+
+    Raises
+    ------
+    IdentificationError
+        When there is no swing.
+    """
+    if not swing > 0.0:
+        raise IdentificationError(
+            'hysteresis: the voltage never moves in the data fitted; record a triangle over the '
+            'range'
+        )
+    return swing * np.arange(1, count) / count
+
+
+def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
+    """
+    Return thresholds for an H that only serves to find G.
+
+    Forty over the swing, and a dozen within the excursion of the noise: what H does inside the
+    noise would otherwise be taken for slow dynamics.
+
+    Parameters
+    ----------
+    swing, excursion : float
+        Normalised peak-to-peak voltage of the whole record and of the noise.
+    """
+    fine = excursion * np.arange(1, 13) / 12.0
+    return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
+
+
+@kernel
+def _bin(
+    x: NDArray[np.float64], stretches: NDArray[np.int64], row: int, out: NDArray[np.float64]
+) -> None:
+    # averages never reach across a hole in the mask; the last incomplete row is left out
+    share = 1.0 / np.sqrt(row)
+    place = 0
+    for m in range(stretches.shape[0]):
+        for i in range((stretches[m, 1] - stretches[m, 0]) // row):
+            start = stretches[m, 0] + i * row
+            total = 0.0
+            for k in range(row):
+                total += x[start + k]
+            out[place] = share * total
+            place += 1
+
+
+def factorise(
+    excerpts: Sequence[Excerpt],
+    thresholds: NDArray[np.float64],
+    dynamics: Dynamics,
+    delay: Delay,
+) -> NDArray[np.float64]:
+    """
+    Reduce the data to the factor R of ``[offsets | G F_r | G v^3 | G v | y]``.
+
+    Parameters
+    ----------
+    excerpts : sequence of Excerpt
+        Each gets an offset of its own.
+    thresholds : ndarray, shape (m,)
+    dynamics, delay
+        What the plays pass before they are seen.
+
+    Returns
+    -------
+    ndarray, shape (k + m + 3, k + m + 3)
+        k is the number of excerpts.
+    """
+    k, m = len(excerpts), thresholds.size
+    # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
+    part = np.array([1.0 - delay.fraction, delay.fraction])
+    G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
+
+    def rows() -> Iterator[NDArray[np.float64]]:
+        for i, excerpt in enumerate(excerpts):
+            row, memory = excerpt.row, excerpt.start(thresholds)
+            stretches = np.array(stretches_of(excerpt.use), dtype=np.int64).reshape(-1, 2)
+            n = int(np.sum((stretches[:, 1] - stretches[:, 0]) // row))
+            block = np.zeros((k + m + 3, n))
+            block[i] = np.sqrt(row)
+            # the plays need all that came before the samples used, G only what it remembers
+            begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
+            begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
+            stretches -= begin
+            before, u = excerpt.u[:begin], excerpt.u[begin:end]
+            memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
+            u = Delay(delay.samples).apply(u)
+            # the play at r = 0 is the voltage itself
+            some, linear = np.append(thresholds, 0.0), np.append(memory, u[0])
+            columns = filtered_plays(u, some, linear, G, stretches, row)
+            block[k : k + m], block[k + m + 1] = columns[:-1], columns[-1]
+            block[k + m] = filtered_plays(u**3, some[-1:], linear[-1:] ** 3, G, stretches, row)
+            _bin(np.array(excerpt.x[begin:end]), stretches, row, block[-1])
+            yield block.T
+
+    return triangular_factor(rows(), k + m + 3)
+
+
+def _independent(A: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """
+    Return which columns of ``[F_r | v^3 | v]`` the data tell apart.
+
+    A voltage that only takes two levels makes every play and the cubic a multiple of v: then the
+    linear term is kept, and weights of any size cannot cancel each other.
+    """
+    m = A.shape[1] - 2
+    keep, basis = np.zeros(m + 2, dtype=bool), np.empty((A.shape[0], 0))
+    for j in (m + 1, m, *range(m)):
+        size = np.linalg.norm(A[:, j])
+        if size == 0.0:
+            continue
+        rest = A[:, j] / size
+        for _ in range(2):
+            rest = rest - basis @ (basis.T @ rest)
+        size = np.linalg.norm(rest)
+        if size > STILL:
+            keep[j] = True
+            basis = np.column_stack([basis, rest / size])
+    return keep
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisFit:
+    """
+    Result of step 3.
+
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+    offsets : ndarray
+        Displacement at u = 0 of each excerpt, normalised.
+    solver : str
+    loss : float
+        Sum of squares of the returned weights, over `n` samples.
+    swarm_loss : float or None
+        Sum of squares that the swarm reached before polishing.
+    optimum_loss : float
+        Sum of squares of bounded least squares.
+    n : int
+        Samples fitted.
+    std : ndarray, shape (m + 2,)
+        Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound, and
+        where the data do not excite the play.
+    swarm : scipy.optimize.OptimizeResult or None
+    """
+
+    hysteresis: Hysteresis
+    offsets: NDArray[np.float64]
+    solver: str
+    loss: float
+    swarm_loss: float | None
+    optimum_loss: float
+    n: int
+    std: NDArray[np.float64]
+    swarm: OptimizeResult | None
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual, averaged over the rows of the fit, normalised."""
+        return float(np.sqrt(self.loss / self.n))
+
+
+def fit_hysteresis(
+    R: NDArray[np.float64],
+    thresholds: NDArray[np.float64],
+    n: int,
+    *,
+    solver: Solver = 'least_squares',
+    rows: int | None = None,
+    rng: np.random.Generator | None = None,
+    swarm_size: int = 40,
+    maxiter: int = 20_000,
+    callback: Callable[[OptimizeResult], Any] | None = None,
+) -> HysteresisFit:
+    """
+    Find the weights of H from factorised data.
+
+    Parameters
+    ----------
+    R : ndarray
+        From `factorise`.
+    thresholds : ndarray, shape (m,)
+    n : int
+        Number of samples behind R.
+    solver : {'least_squares', 'swarm'}
+        The swarm is polished by bounded least squares; both losses are kept.
+    rows : int, optional
+        Number of rows that the samples were averaged to (`Excerpt.rows`); `n` when absent.
+    rng : numpy.random.Generator
+        Needed by the swarm.
+    swarm_size, maxiter, callback
+        As in `piezo_ident.identification.solvers.particle_swarm.particle_swarm`.
+
+    Raises
+    ------
+    IdentificationError
+        When the swarm is asked for without `rng`, or the data hold nothing.
+    """
+    m = thresholds.size
+    k = R.shape[0] - m - 3
+    inner = R[k:, k:].copy()
+    # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
+    still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
+    inner[:, :m][:, still] = 0.0
+    inner[:, :-1][:, ~_independent(inner[:, :-1])] = 0.0
+    if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
+        raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
+    lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
+    x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
+    x[np.linalg.norm(inner[:, :-1], axis=0) == 0.0] = 0.0
+    swarm = None
+    swarm_loss = None
+    if solver == 'swarm':
+        if rng is None:
+            raise IdentificationError('hysteresis: the swarm needs a random generator')
+        box = np.array([WEIGHT_BOX] * m + [P1_BOX, P2_BOX])
+        A, y = inner[:, :-1], inner[:, -1]
+        swarm = particle_swarm(
+            Quadratic(A.T @ A, A.T @ y, float(y @ y)),
+            Bounds(box[:, 0], box[:, 1]),
+            rng=rng,
+            swarm_size=swarm_size,
+            maxiter=maxiter,
+            tol=1e-3,
+            callback=callback,
+        )
+        # from the factor, not from the Gram matrix: the difference of large squares loses digits
+        swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
+    offsets = np.linalg.solve(R[:k, :k], R[:k, -1] - R[:k, k:-1] @ x)
+    free = (x > lower) & inner[:, :-1].any(axis=0)
+    std = np.zeros(m + 2)
+    gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
+    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum
+    variance /= max((n if rows is None else rows) - m - 2, 1)
+    std[free] = np.sqrt(np.maximum(variance, 0.0))
+    h = Hysteresis(thresholds, x[:m], float(x[m]), float(x[m + 1]))
+    return HysteresisFit(
+        hysteresis=h,
+        offsets=np.asarray(offsets),
+        solver=solver,
+        loss=optimum,
+        swarm_loss=swarm_loss,
+        optimum_loss=optimum,
+        n=n,
+        std=std,
+        swarm=swarm,
+    )
+
+
+def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
+    """
+    Return fewer thresholds in better places, from a fit on a fine grid.
+
+    On a grid finer than the truth, least squares puts a weight on the two neighbours of each true
+    threshold and zero elsewhere; each such group becomes one threshold at its centre of weight.
+    """
+    r, q = hysteresis.thresholds, hysteresis.weights
+    alive = q > 1e-6 * max(float(q.max(initial=0.0)), 1e-12)
+    places = []
+    i = 0
+    while i < r.size:
+        if not alive[i]:
+            i += 1
+            continue
+        pair = slice(i, i + 2 if i + 1 < r.size and alive[i + 1] else i + 1)
+        places.append(float(r[pair] @ q[pair] / q[pair].sum()))
+        i = pair.stop
+    return np.array(places)

@@ -1,0 +1,389 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The three steps on labelled records: delay from steps, G from noise, H from a triangle.
+
+Small noise does not make H a constant slope: its plays are dragged along inside the noise, and a
+linear fit takes that for slow dynamics.  So the steps are taken twice.  After a first G, an H with
+fine thresholds is fitted to the triangle and undone in the noise, w = H[v], and G is found again
+from w to y, where it is alone.  The H that is returned is fitted last, with the thresholds asked
+for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.frequency_response import frequency_response
+from piezo_ident.identification.prepare import END_HELD, Run
+from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
+from piezo_ident.identification.solvers.least_squares import triangular_factor
+from piezo_ident.identification.solvers.output_error import (
+    output_error,
+    OutputErrorFit,
+    simulation_error,
+    Stretch,
+)
+from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_steps
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    ArxFactor,
+    excited_band,
+    instrumental_variables,
+    prefilter,
+    scan_orders,
+    stabilised,
+)
+from piezo_ident.identification.step3_hysteresis import (
+    Excerpt,
+    factorise,
+    fine_thresholds,
+    fit_hysteresis,
+)
+from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.operators.hysteresis import Hysteresis
+from scipy import signal
+
+__all__ = ['first_step', 'second_step', 'triangle_excerpts']
+
+#: delays that the scan tries [samples]
+MAX_DELAY = 30
+#: na and nb of the scan
+SCAN_ORDER = 8
+#: orders within this share of the best held-out error count as equal; smaller ones go first
+SLACK = 0.05
+#: share by which a larger order must lower the held-out error
+GAIN = 0.005
+#: samples of simulation ahead of the first that counts
+WARM_UP = 2000
+#: candidates that are refined and judged again
+CANDIDATES = 5
+#: what is slower than this is creep, not dynamics: it is filtered out before G is refined [Hz]
+SLOWEST = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """One noise segment: input (voltage or w) and output, prefiltered, fitted part first."""
+
+    u: NDArray[np.float64]
+    y: NDArray[np.float64]
+    n_fit: int
+    band: float
+
+
+def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
+    rate = run.piece.sample_rate
+    if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
+        raise IdentificationError(
+            f'{run.record}: voltage or displacement is constant in the noise segment'
+        )
+    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
+    u = prefilter(signal[start:stop], rate, band)
+    y = prefilter(run.x[start:stop], rate, band)
+    settle = min(500, u.size // 20)
+    n_fit = u.size - int(END_HELD * u.size) - settle
+    return _Noise(u[settle:], y[settle:], n_fit, band)
+
+
+def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
+    found = [
+        (stop - start, run, start, stop)
+        for run in runs
+        for s in run.piece.find('noise')
+        for start, stop in run.unbroken(s.start, s.stop)
+    ]
+    n, run, start, stop = max(found, key=lambda item: item[0])
+    if n < 2000:
+        raise IdentificationError(
+            f'{run.record}: the noise segment has {n} samples; at least 2000 are needed'
+        )
+    return run, start, stop
+
+
+def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
+    """
+    Find the delay.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    settings : Settings
+    progress : callable
+
+    Returns
+    -------
+    DelayResult
+        From the steps when there are any, else from the scan of the ARX loss over the noise.
+    """
+    progress('delay', 0.0)
+    if settings.delay is not None:
+        return DelayResult(settings.delay, 0.0, 'given')
+    pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
+    step = delay_from_steps(pieces) if pieces else None
+    # steps have power at all frequencies; noise up to f leaves a doubt of half a period of f
+    loss = _scan(runs, 'step') if pieces else None
+    if loss is None:
+        loss = _scan(runs, 'noise')
+    scan = None if loss is None else delay_from_loss(loss)
+    progress('delay', 1.0)
+    if step is not None and step.samples is not None:
+        return DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+    if scan is None:
+        what = 'too short to scan' if loss is None else 'that hides it below 30 samples'
+        raise IdentificationError(
+            f'delay: no step rises above the sensor noise, and a drive {what}; add larger steps, '
+            'or set --delay'
+        )
+    run, start, stop = _longest_noise(runs)
+    rate = run.piece.sample_rate
+    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
+    return DelayResult(scan, 0.5 * rate / band, 'scan', step, loss, scan)
+
+
+def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:
+    """Return the one-step loss over the delay, from all segments of a kind."""
+    width = SCAN_ORDER + SCAN_ORDER + MAX_DELAY + 1
+    factors, n = [], 0
+    for run in runs:
+        for s in run.piece.find(kind):
+            if s.n < 4 * width:
+                continue
+            u, y = run.u[s.start : s.stop], run.x[s.start : s.stop]
+            factor = arx_factor(u - u[0], y - y[:20].mean(), SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
+            factors.append(factor.R)
+            n += factor.n
+    if not factors:
+        return None
+    R = triangular_factor(factors, width)
+    both = ArxFactor(R, n, SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
+    return np.array([both.fit(SCAN_ORDER, SCAN_ORDER, d)[1] for d in range(MAX_DELAY)])
+
+
+def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
+    """Return the triangles for fitting H, without (or only) their held-out blocks."""
+    excerpts = []
+    for run in runs:
+        out = run.held_out()
+        triangle = run.mask('triangle') & run.known
+        # the same runs either way, so that each keeps its offset
+        if np.any(triangle & ~out):
+            excerpts.append(Excerpt(run.u, run.x, triangle & (out if held else ~out)))
+    return excerpts
+
+
+def _held_error(noise: _Noise, model: Dynamics, delay: int) -> float:
+    """Free-run error on the held-out noise in % of its rms, infinite when unstable."""
+    if not model.is_stable:
+        return float('inf')
+    u, y = noise.u[noise.n_fit :], noise.y[noise.n_fit :]
+    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
+    e = (y - filter_arx(model.a, model.b, delayed, at_rest=False))[u.size // 5 :]
+    return float(100.0 * e.std() / y.std())
+
+
+def _refined_on_noise(
+    noise: _Noise, start: Dynamics, delay: int, maxiter: int, tick: Callable[[], None]
+) -> OutputErrorFit:
+    use = np.ones(noise.n_fit, dtype=bool)
+    use[: noise.n_fit // 50] = False
+    u = noise.u[: noise.n_fit]
+    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
+    stretch = Stretch(delayed, noise.y[: noise.n_fit], use)
+    return output_error([stretch], start, maxiter=maxiter, tick=tick)
+
+
+def _factor(noise: _Noise, settings: Settings, delay: int) -> ArxFactor:
+    size = max(settings.max_order, *(settings.order or (1, 1)))
+    return arx_factor(noise.u[: noise.n_fit], noise.y[: noise.n_fit], size, size + delay)
+
+
+def _orders(
+    noise: _Noise,
+    settings: Settings,
+    delay: int,
+    candidates: int,
+    progress: Callable[[float], None],
+) -> list[tuple[DynamicsResult, Dynamics]]:
+    """Search the orders and refine the best few."""
+    factor = _factor(noise, settings, delay)
+    table = scan_orders(
+        factor,
+        delay,
+        settings.max_order,
+        noise.u[noise.n_fit :],
+        noise.y[noise.n_fit :],
+        lambda share: progress(0.5 * share),
+    )
+    orders = [settings.order] if settings.order else table.ranked(SLACK)[:candidates]
+    if not orders:
+        raise IdentificationError(
+            'dynamics: no order up to '
+            f'({settings.max_order}, {settings.max_order}) gave a stable model; '
+            'is the noise segment really noise, and is the displacement its answer?'
+        )
+    found = []
+    for i, (na, nb) in enumerate(orders):
+        theta, _ = factor.fit(na, nb, delay)
+        ls = Dynamics(a=theta[:na], b=theta[na:])
+        u, y = noise.u[: noise.n_fit], noise.y[: noise.n_fit]
+        iv = instrumental_variables(u, y, ls, delay)
+        errors = {
+            'least squares': _held_error(noise, ls, delay),
+            'instrumental variables': _held_error(noise, iv, delay),
+        }
+        start = iv if errors['instrumental variables'] < errors['least squares'] else ls
+        # ticks repeat the share, so that the work can be stopped within an iteration
+        tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
+        fit = _refined_on_noise(noise, stabilised(start), delay, 10, tick)
+        errors['output error'] = _held_error(noise, fit.dynamics, delay)
+        if np.isfinite(errors['output error']):
+            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
+            found.append((result, fit.dynamics))
+        progress(0.5 + 0.5 * (i + 1) / len(orders))
+    if not found:
+        raise IdentificationError('dynamics: no stable model was found; set --order')
+    return found
+
+
+def second_step(
+    runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress
+) -> tuple[DynamicsResult, Dynamics]:
+    """
+    Find G, with the hysteresis undone.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        With noise and triangle segments.
+    delay : Delay
+    settings : Settings
+    progress : callable
+
+    Returns
+    -------
+    result : DynamicsResult
+    dynamics : Dynamics
+        With G(1) = 1, stable.
+
+    Raises
+    ------
+    IdentificationError
+        When no order gives a stable model.
+    """
+    d = delay.samples
+    run, start, stop = _longest_noise(runs)
+    progress('dynamics', 0.0)
+    # only good enough to undo the hysteresis
+    raw = _noise(run, run.u, start, stop)
+    [(_, first)] = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
+    rate, band = run.piece.sample_rate, raw.band
+    del raw  # of an hour's record it is a gigabyte
+    G = first.without_slow_poles(SLOWEST, rate).normalised()
+
+    excerpts = triangle_excerpts(runs)
+    n = int(sum(e.use.sum() for e in excerpts))
+    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    excursion = float(np.ptp(run.u[start:stop]))
+    r = fine_thresholds(swing, excursion)
+
+    def undo(G: Dynamics) -> Hysteresis:
+        return fit_hysteresis(factorise(excerpts, r, G, delay), r, n).hysteresis
+
+    H = undo(G)
+    progress('dynamics', 0.45)
+    undone = _noise(run, H(run.u), start, stop)
+    found = _orders(
+        undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.2 * share)
+    )
+    del undone
+    result, G = _best_in_free_run(found, runs, H, delay, progress)
+    H = undo(G)
+    tick = functools.partial(progress, 'dynamics', 0.85)
+    fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
+    G = fit.dynamics.normalised()
+    progress('dynamics', 0.95)
+    # the same regression on the measured and on the modelled answer: the plays that the noise
+    # drags along count in both
+    noise = slice(max(0, start - WARM_UP), stop)
+    g_u, g_w = (
+        filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :] for z in (run.u, H(run.u))
+    )
+    g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[start:stop]))
+    slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
+    bias = float(run.u[start:stop].mean())
+    response = frequency_response(
+        run.u[start:stop], run.x[start:stop], run.piece.sample_rate, band
+    )
+    progress('dynamics', 1.0)
+    return (
+        DynamicsResult(
+            order=result.order,
+            table=result.table,
+            methods=result.methods,
+            covariance=fit.normalised_covariance,
+            response=response,
+            bias=bias,
+            slope_measured=slope_measured,
+            slope_model=slope_model,
+            band=band,
+        ),
+        G,
+    )
+
+
+def _best_in_free_run(
+    found: Sequence[tuple[DynamicsResult, Dynamics]],
+    runs: Sequence[Run],
+    H: Hysteresis,
+    delay: Delay,
+    progress: Progress,
+) -> tuple[DynamicsResult, Dynamics]:
+    """Refine each G by its free run, and return the best on what was held out."""
+    # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
+    stretches, held = _stretches(runs, H, delay)
+    rate = runs[0].piece.sample_rate
+    best, (result, G) = float('inf'), found[0]
+    G = G.without_slow_poles(SLOWEST, rate).normalised()
+    for i, (candidate, start) in enumerate(found):
+        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
+        fast = start.without_slow_poles(SLOWEST, rate).normalised()
+        fit = output_error(stretches, fast, maxiter=6, tick=tick)
+        score = simulation_error(held, fit.dynamics)
+        # a larger model comes later, and must earn its size
+        if score < best / (1.0 + GAIN):
+            best, result = score, candidate
+            G = fit.dynamics.without_slow_poles(SLOWEST, rate).normalised()
+        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
+    return result, G
+
+
+def _stretches(
+    runs: Sequence[Run], H: Hysteresis, delay: Delay
+) -> tuple[list[Stretch], list[Stretch]]:
+    """Return what G is refined on, and the same with only what was held out."""
+    fitted: list[Stretch] = []
+    held: list[Stretch] = []
+    for run in runs:
+        out = run.held_out()
+        use = run.mask('step', 'settle', 'noise') & run.sound
+        if use.any():
+            # what lies before the first sample used only has to let the start die away
+            first, last = np.flatnonzero(use)[[0, -1]]
+            part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
+            w, y = delay.apply(H(run.u))[part], run.x[part]
+            w, y = w - w[0], y - y[:20].mean()
+            if run.piece.sample_rate > 2.0 * SLOWEST:
+                # both sides pass the same filter, so G is still what leads from one to the other
+                sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
+                w, y = signal.sosfilt(sos, w), signal.sosfilt(sos, y)
+            for stretches, mask in ((fitted, use & ~out), (held, use & out)):
+                if mask.any():
+                    stretches.append(Stretch(w, y, mask[part]))
+    return fitted, held

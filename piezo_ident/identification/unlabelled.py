@@ -1,0 +1,297 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Records without labelled segments: everything that one record excites, by free-run error.
+
+H and G are fitted in turn: H by bounded least squares with the plays seen through G, G by output
+error from w = H[v].  What the record does not excite is left at its neutral value and said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.prepare import Run
+from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
+from piezo_ident.identification.solvers.output_error import output_error, OutputErrorFit, Stretch
+from piezo_ident.identification.step1_delay import delay_from_steps, find_jumps
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    excited_band,
+    instrumental_variables,
+    stabilised,
+)
+from piezo_ident.identification.step3_hysteresis import (
+    even_thresholds,
+    Excerpt,
+    factorise,
+    fit_hysteresis,
+)
+from piezo_ident.model.initial_memory import fit_memory
+from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from scipy import ndimage, signal
+
+__all__ = ['JointFit', 'joint_fit']
+
+#: orders (na, nb) tried on a record with little dynamic content, from none upwards
+ORDERS = ((1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (5, 4), (5, 5), (6, 6))
+#: time after a jump in which the dynamics are looked for [s]
+WINDOW = 0.1
+#: below this the signals are taken away before dynamics are fitted to jumps: slow errors of H and
+#: of the unknown start would be larger than a ring [Hz]
+HIGH_PASS = 30.0
+#: rms above that frequency from which the voltage excites the dynamics throughout, normalised
+FAST = 2e-3
+#: samples of such a record that the search uses
+MOST = 40_000
+#: how often H and G are fitted in turn
+TURNS = 4
+#: dynamics must lower the loss in their windows by this share to be believed
+GAIN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """
+    What one unlabelled run gave.
+
+    Attributes
+    ----------
+    delay : DelayResult
+    dynamics : DynamicsResult
+    G : Dynamics
+    memory : ndarray or None
+        Play outputs before the first sample, for the thresholds of `hysteresis`.
+    hysteresis : Hysteresis
+        The H that went with the search for G.
+    not_identified : tuple of (str, str)
+        What stayed at its neutral value, and why.
+    """
+
+    delay: DelayResult
+    dynamics: DynamicsResult
+    G: Dynamics
+    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None
+    hysteresis: Hysteresis
+    not_identified: tuple[tuple[str, str], ...]
+
+
+def _memory_rule(
+    thresholds: NDArray[np.float64], memory: NDArray[np.float64], u0: float
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Carry a fitted memory over to other thresholds: it is a smooth curve over r."""
+
+    def rule(r: NDArray[np.float64]) -> NDArray[np.float64]:
+        curve = np.interp(r, np.concatenate([[0.0], thresholds]), np.concatenate([[u0], memory]))
+        return np.asarray(np.clip(curve, u0 - r, u0))
+
+    return rule
+
+
+def _windows(run: Run, n_fit: int) -> NDArray[np.bool_]:
+    """Return the samples behind each jump of the voltage in the fitted part."""
+    rate = run.piece.sample_rate
+    use = np.zeros(n_fit, dtype=bool)
+    before = min(50, n_fit // 10)
+    for k in find_jumps(run.u[:n_fit], before, min(20, n_fit // 10)):
+        use[max(0, k - before) : k + int(WINDOW * rate)] = True
+    return use
+
+
+def _find_delay(run: Run, n_fit: int, settings: Settings) -> tuple[DelayResult, str | None]:
+    if settings.delay is not None:
+        return DelayResult(settings.delay, 0.0, 'given'), None
+    before = min(100, n_fit // 10)
+    step = delay_from_steps([run.piece.cut(0, n_fit)], before, min(60, n_fit // 10))
+    if step.samples is not None:
+        return DelayResult(step.samples, step.std, 'steps', step), None
+    reason = (
+        'the voltage never jumps out of a rest, and a slow record cannot tell a delay from the '
+        'lag of the hysteresis; add steps'
+    )
+    return DelayResult(0, float('inf'), 'none', step), reason
+
+
+def _high_passed(x: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
+    sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, x - x[0]))
+
+
+def _fast_rms(u: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
+    """Return the rms above `HIGH_PASS` around each sample."""
+    if 4 * HIGH_PASS > rate:
+        return np.zeros(u.size)
+    width = max(1, int(WINDOW * rate))
+    power = ndimage.uniform_filter1d(_high_passed(u, rate) ** 2, width)
+    return np.asarray(np.sqrt(np.maximum(power, 0.0)))
+
+
+def _busiest(fast: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which `MOST` samples in a row have the most fast power."""
+    width = min(MOST, fast.size)
+    total = np.cumsum(np.concatenate([[0.0], fast**2]))
+    start = int(np.argmax(total[width:] - total[:-width]))
+    chosen = np.zeros(fast.size, dtype=bool)
+    chosen[start : start + width] = True
+    return chosen
+
+
+def _search_order(
+    w: NDArray[np.float64],
+    x: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    settings: Settings,
+    progress: Progress,
+) -> tuple[tuple[int, int], OutputErrorFit] | None:
+    """Return the order with the smallest BIC of free-run loss that beats G = 1 clearly."""
+    stretch = Stretch(w, x, use)
+    n = int(use.sum())
+    still = (x - w)[use]
+    static_loss = float(np.mean((still - still.mean()) ** 2))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
+    longest = int(np.argmax(edges[1::2] - edges[::2]))
+    part = slice(int(edges[2 * longest]), int(edges[2 * longest + 1]))
+    u, y = w[part] - w[part.start], x[part] - x[part.start]
+    best: tuple[float, tuple[int, int], OutputErrorFit] | None = None
+    orders = [settings.order] if settings.order else list(ORDERS)
+    na_max, nb_max = max(o[0] for o in orders), max(o[1] for o in orders)
+    if u.size < 4 * (na_max + nb_max + 1):
+        return None
+    factor = arx_factor(u, y, na_max, nb_max)
+    for i, (na, nb) in enumerate(orders):
+        theta, _ = factor.fit(na, nb, 0)
+        ls = Dynamics(a=theta[:na], b=theta[na:])
+        starts = [stabilised(ls), stabilised(instrumental_variables(u, y, ls, 0))]
+        for start in starts:
+            fit = output_error([stretch], start, maxiter=20)
+            bic = n * np.log(max(fit.rms**2, np.finfo(float).tiny)) + np.log(n) * (na + nb)
+            if best is None or bic < best[0]:
+                best = (bic, (na, nb), fit)
+        progress('dynamics', 0.2 + 0.6 * (i + 1) / len(orders))
+    if best is None or best[2].rms ** 2 > (1.0 - GAIN) * static_loss:
+        return None
+    return best[1], best[2]
+
+
+def joint_fit(
+    run: Run, n_fit: int, scaling: Scaling, settings: Settings, progress: Progress
+) -> JointFit:
+    """
+    Fit delay, low-order dynamics and the memory of the start on the first part of a run.
+
+    Parameters
+    ----------
+    run : Run
+    n_fit : int
+        Samples that may be used.
+    scaling : Scaling
+    settings : Settings
+    progress : callable
+
+    Raises
+    ------
+    IdentificationError
+        When the fitted part is too short, or its voltage hardly moves.
+    """
+    if n_fit < 100:
+        raise IdentificationError(
+            f'{run.record}: {n_fit} samples to fit are too few; at least 100 are needed'
+        )
+    u, x = run.u[:n_fit], run.x[:n_fit]
+    swing = float(np.ptp(u))
+    if swing < 0.02:
+        raise IdentificationError(
+            f'{run.record}: the voltage moves by {swing:.1%} of its range in the fitted part; '
+            'let it move there, or hold out less (--hold-out)'
+        )
+    progress('delay', 0.0)
+    found, no_delay = _find_delay(run, n_fit, settings)
+    missing = [('delay', no_delay)] if no_delay else []
+    progress('delay', 1.0)
+    delay = Delay(found.samples)
+    rate = run.piece.sample_rate
+    r = even_thresholds(swing, 40)
+    known = run.known[:n_fit]
+    # a record that never comes back over its range has no part without the unknown start
+    if known.sum() < n_fit // 5:
+        known = np.ones(n_fit, dtype=bool)
+    G = Dynamics.unit()
+    rule: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    windows = _windows(run, n_fit)
+    band = excited_band(u[known] - u[known].mean(), rate, depth=1e-4)
+    fast = _fast_rms(u, rate)
+    quiet = known & ~windows
+    broad = bool(quiet.any() and np.sqrt(np.mean(fast[quiet] ** 2)) > FAST)
+    slow = known
+    if broad:
+        windows |= known & _busiest(fast)
+        # where the stage lags behind a fast drive, H alone would take the lag for hysteresis
+        calm = known & (fast < FAST)
+        if calm.sum() > n_fit // 20 and np.ptp(u[calm]) > 0.8 * swing:
+            slow = calm
+
+    def view(z: NDArray[np.float64]) -> NDArray[np.float64]:
+        return z if broad or 4 * HIGH_PASS > rate else _high_passed(z, rate)
+
+    order: tuple[int, int] = (0, 1)
+    fit: OutputErrorFit | None = None
+    H = Hysteresis(r, np.zeros(r.size), 0.0, 1.0)
+    for turn in range(TURNS):
+        progress('dynamics', turn / TURNS)
+        use = known if turn else slow
+        R = factorise([Excerpt(u, x, use, rule)], r, G, delay)
+        result = fit_hysteresis(R, r, int(use.sum()))
+        H, offset = result.hysteresis, float(result.offsets[0])
+        # even at its lowest voltage a stage may not have come down from the top: it relaxes
+        shifted = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
+        trial = StageModel(rate, shifted, H, G, delay)
+        memory = fit_memory(trial, run.piece.cut(0, n_fit))
+        rule = _memory_rule(H.thresholds, memory, float(u[0]))
+        if not windows.any():
+            break
+        w = delay.apply(H(u, memory))
+        if fit is None:
+            searched = _search_order(view(w), view(x - offset), windows, settings, progress)
+            if searched is None:
+                break
+            order, fit = searched
+        else:
+            fit = output_error([Stretch(view(w), view(x - offset), windows)], G, maxiter=20)
+        G = fit.dynamics.normalised()
+    if fit is None:
+        missing.append(('dynamics', _why_static(windows, band)))
+    du = np.abs(np.diff(u))
+    if du[du > 0.02 * swing].sum() > 0.9 * du.sum():
+        missing.append(
+            (
+                'hysteresis',
+                'the voltage only jumps between levels, and what lies between them was never '
+                'seen; add a slow triangle',
+            )
+        )
+    covariance = np.zeros((1, 1)) if fit is None else fit.normalised_covariance
+    progress('dynamics', 1.0)
+    return JointFit(
+        delay=found,
+        dynamics=DynamicsResult(order, None, {}, covariance, band=band),
+        G=G,
+        memory=rule,
+        hysteresis=H,
+        not_identified=tuple(missing),
+    )
+
+
+def _why_static(windows: NDArray[np.bool_], band: float) -> str:
+    if not windows.any():
+        return (
+            f'the voltage has no jump and no power above {band:.3g} Hz, where a stage follows '
+            'statically; add steps or noise'
+        )
+    return 'no order up to (6, 6) explains more than the hysteresis alone; add noise'

@@ -1,0 +1,264 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Measured beside predicted as they come: joined on time, binned for people, judged by rms."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record.blocks import Samples
+
+__all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
+
+#: time for which a block waits for its partner [s]
+WAIT = 2.0
+#: time that jumps back by more than this is that of another run [s]
+BACK = 0.05
+#: after this time without any match, two streams are taken to be in the same run [s]
+CATCH_UP = 1.0
+#: most blocks that wait
+MOST = 500
+#: bins that a quantity may lag behind before it is no longer waited for
+LAG = 25
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Measured and predicted displacement of the same samples [m]."""
+
+    t: NDArray[np.float64]
+    y: NDArray[np.float64]
+    y_hat: NDArray[np.float64]
+    segment: str
+
+    @property
+    def residual(self) -> Samples:
+        """The residual as a block."""
+        return Samples(self.t, self.y - self.y_hat, self.segment, 'displacement')
+
+
+class _Side:
+    """One of two streams: what waits, how far it is, and how often its clock began anew."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Samples] = []
+        self.run = 0
+        self.begin = self.last = float('nan')
+
+    def restarts_with(self, t: NDArray[np.float64]) -> bool:
+        """Take note of a block, and return whether its clock began anew."""
+        first, last = float(t[0]), float(t[-1])
+        from_start = first <= self.begin and last < self.last
+        again = from_start or first < self.last - BACK
+        if again or np.isnan(self.begin):
+            self.begin = first
+        self.last = last if again else max(last, float(np.nan_to_num(self.last, nan=last)))
+        return again
+
+    @property
+    def span(self) -> float:
+        """Time between the oldest and the newest block that waits [s]."""
+        return float(self.waiting[-1].t[-1] - self.waiting[0].t[0]) if self.waiting else 0.0
+
+    def forget(self) -> int:
+        """Drop what has waited for too long, and return how many samples that were."""
+        kept = [s for s in self.waiting if self.last - s.t[-1] <= WAIT][-MOST:]
+        n = sum(s.t.size for s in self.waiting) - sum(s.t.size for s in kept)
+        self.waiting = kept
+        return n
+
+
+class Matcher:
+    """
+    Joins two streams of blocks on time, whichever comes first and however they are cut.
+
+    Where a clock begins anew, the old run's times come again; a block waits until the other
+    stream is in its run.
+
+    Attributes
+    ----------
+    unmatched : int
+        Measured samples for which no prediction came in time.
+    """
+
+    def __init__(self) -> None:
+        self.unmatched = 0
+        self._predicted, self._measured = _Side(), _Side()
+
+    def predicted(self, samples: Samples) -> list[Matched]:
+        """Take a prediction; return what is complete now."""
+        pairs = self._match(samples, self._predicted, self._measured)
+        return [Matched(a.t, b.values, a.values, a.segment) for a, b in pairs]
+
+    def measured(self, samples: Samples) -> list[Matched]:
+        """Take a measured block; return what is complete now."""
+        pairs = self._match(samples, self._measured, self._predicted)
+        return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
+
+    def _match(self, new: Samples, own: _Side, other: _Side) -> list[tuple[Samples, Samples]]:
+        if np.isnan(own.begin):
+            own.run = other.run
+        if own.restarts_with(new.t):
+            own.waiting.clear()
+            # who begins anew second has only caught up
+            own.run = other.run if other.run > own.run else own.run + 1
+        pairs, rest = [], new
+        if own.run != other.run and own.span > CATCH_UP:
+            # one of them was silent when the clock began anew
+            own.run = other.run = max(own.run, other.run)
+        for one in list(other.waiting) if own.run == other.run else ():
+            if not rest.t.size:
+                break
+            if one.t[-1] < rest.t[0] or one.t[0] > rest.t[-1]:
+                continue
+            other.waiting.remove(one)
+            if np.array_equal(one.t, rest.t):
+                pairs.append((rest, one))
+                rest = _without(rest, np.arange(rest.t.size))
+                break
+            _, i, j = np.intersect1d(rest.t, one.t, return_indices=True)
+            if i.size:
+                pairs.append((_rows(rest, i), _rows(one, j)))
+            left, rest = _without(one, j), _without(rest, i)
+            if left.t.size:
+                other.waiting.append(left)
+        if rest.t.size:
+            own.waiting.append(rest)
+        self._predicted.forget()
+        self.unmatched += self._measured.forget()
+        return sorted(pairs, key=lambda pair: float(pair[0].t[0]))
+
+
+def _rows(samples: Samples, rows: NDArray[np.generic]) -> Samples:
+    return replace(samples, t=samples.t[rows], values=samples.values[rows])
+
+
+def _without(samples: Samples, rows: NDArray[np.intp]) -> Samples:
+    keep = np.ones(samples.t.size, dtype=bool)
+    keep[rows] = False
+    return _rows(samples, keep)
+
+
+@dataclass(frozen=True)
+class PreviewBin:
+    """
+    Mean, smallest and largest of each quantity over a stretch of sample time.
+
+    Attributes
+    ----------
+    t : float
+        Begin of the stretch [s].
+    values : dict of str to (mean, min, max)
+    """
+
+    t: float
+    values: dict[str, tuple[float, float, float]]
+
+
+class Preview:
+    """
+    Bins on the grid of sample time.
+
+    A bin is complete when every quantity that is coming has gone past it.
+
+    Parameters
+    ----------
+    rate : float
+        Bins a second [Hz].
+    """
+
+    def __init__(self, rate: float = 50.0) -> None:
+        self.rate = rate
+        self._newest: dict[str, int] = {}
+        self._bins: dict[int, dict[str, tuple[int, float, float, float]]] = {}
+
+    def add(self, name: str, t: NDArray[np.float64], x: NDArray[np.float64]) -> list[PreviewBin]:
+        """
+        Take samples of a quantity; return the bins that are complete now, in order.
+
+        Parameters
+        ----------
+        name : str
+        t, x : ndarray, shape (n,)
+            Time [s], rising, and values; what is not a finite number is left out.
+        """
+        finite = np.isfinite(x) & np.isfinite(t)
+        if not finite.all():
+            t, x = t[finite], x[finite]
+        if not t.size:
+            return []
+        # a tick that division put a hair before its bin belongs into it
+        k = np.floor(t * self.rate + 1e-6).astype(np.int64)
+        done: list[PreviewBin] = []
+        if k[0] < self._newest.get(name, k[0]):
+            done = self._take(sorted(self._bins))
+            self._newest.clear()
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(k)) + 1])
+        count = np.diff(np.append(starts, k.size))
+        total, low, high = (f.reduceat(x, starts) for f in (np.add, np.minimum, np.maximum))
+        for i, start in enumerate(starts):
+            here = self._bins.setdefault(int(k[start]), {})
+            n, s, a, b = here.get(name, (0, 0.0, np.inf, -np.inf))
+            here[name] = (
+                n + int(count[i]),
+                s + float(total[i]),
+                min(a, float(low[i])),
+                max(b, float(high[i])),
+            )
+        self._newest[name] = int(k[-1])
+        end = max(min(self._newest.values()), max(self._newest.values()) - LAG)
+        return done + self._take(sorted(b for b in self._bins if b < end))
+
+    def _take(self, bins: list[int]) -> list[PreviewBin]:
+        taken = []
+        for b in bins:
+            values = {name: (s / n, a, z) for name, (n, s, a, z) in self._bins.pop(b).items()}
+            taken.append(PreviewBin(b / self.rate, values))
+        return taken
+
+
+class LiveError:
+    """
+    Rms of the residual over the last stretch of sample time.
+
+    Parameters
+    ----------
+    window : float
+        [s]
+    """
+
+    def __init__(self, window: float) -> None:
+        self.window = window
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        # begin, end, samples and sum of squares of each stretch
+        self._parts: deque[tuple[float, float, int, float]] = deque()
+
+    def add(self, t: NDArray[np.float64], residual: NDArray[np.float64]) -> None:
+        """Take a stretch of the residual [m]."""
+        e = residual[np.isfinite(residual)]
+        if not e.size:
+            return
+        if self._parts and t[0] <= self._parts[-1][1]:
+            self.clear()
+        self._parts.append((float(t[0]), float(t[-1]), e.size, float(e @ e)))
+        while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
+            self._parts.popleft()
+
+    @property
+    def seconds(self) -> float:
+        """How much of the window is filled [s]."""
+        return self._parts[-1][1] - self._parts[0][0] if self._parts else 0.0
+
+    @property
+    def rms(self) -> float:
+        """Root mean square [m]; NaN before the first sample."""
+        n = sum(part[2] for part in self._parts)
+        return float(np.sqrt(sum(part[3] for part in self._parts) / n)) if n else float('nan')

@@ -1,0 +1,347 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""
+A model beside a running stage: block by block, through gaps, restarts and changes of the model.
+
+The plays remember extremes of the voltage as far back as the start of the run.  They need only
+few of them, though: a loop that lies inside a later stroke leaves no trace, so it is taken out
+(the wiping-out property).  What is left, the turning points, puts any model into the state that
+it would have if it had run all along; G and the delay catch up over the last seconds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import kernel
+from piezo_ident.model.stage_model import Scaling, StageModel, Stream
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.play import weighted_plays
+from piezo_ident.record.blocks import Samples
+
+__all__ = ['Predictor', 'TurningPoints', 'expected_error', 'memory_after', 'warm_up']
+
+#: voltage that is kept sample by sample, for G and delay of a new model to catch up with [s]
+RECENT = 5.0
+#: longest gap that is bridged by a straight line; behind a longer one a new run begins [s]
+BRIDGE = 0.5
+#: time that jumps back by more samples than this is a restart, not a late block
+JUMP_BACK = 1000
+#: fastest sample clock [s], and most blocks that are kept, whatever the times say
+SHORTEST, MOST_BLOCKS = 1e-7, 100_000
+#: share of the voltage range within which the stage is at its lowest, where memory is known
+REST = 0.01
+
+
+#: what may be wrong with a block
+FINE, NOT_FINITE, NOT_UNIFORM = range(3)
+
+
+@kernel
+def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
+    shortest, longest = np.inf, 0.0
+    for k in range(t.size):
+        if not (np.isfinite(t[k]) and np.isfinite(v[k])):
+            return NOT_FINITE
+        if k:
+            step = t[k] - t[k - 1]
+            shortest, longest = min(shortest, step), max(longest, step)
+    if t.size > 1 and not (shortest > 0.999 * SHORTEST and longest < 1.5 * shortest):
+        return NOT_UNIFORM
+    return FINE
+
+
+@kernel
+def _turns(v: NDArray[np.float64], out: NDArray[np.float64]) -> int:
+    # first and last sample, and every one at which the direction changes
+    n, before = 0, 0.0
+    for k in range(v.size):
+        after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
+        if k == 0 or after != before:
+            out[n] = v[k]
+            n += 1
+        before = after
+    return n
+
+
+class TurningPoints:
+    """
+    The least of a voltage's history that any play operator needs.
+
+    Of four points in a row the inner two go when they lie between the outer two, whatever the
+    memory was before.  The first point always stays.
+
+    Examples
+    --------
+    >>> points = TurningPoints()
+    >>> points.add(np.array([0.0, 4.0, 1.0, 3.0, 2.0, 5.0]))
+    >>> points.values.tolist()
+    [0.0, 5.0]
+    """
+
+    def __init__(self) -> None:
+        self._points: list[float] = []
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Start, turning points and last sample."""
+        return np.array(self._points)
+
+    def add(self, v: NDArray[np.float64]) -> None:
+        """Add a stretch of voltage."""
+        # most samples of a block are on their way somewhere
+        turns = np.empty(v.size)
+        count = _turns(np.array(v, dtype=np.float64), turns)
+        points = self._points
+        for x in turns[:count].tolist():
+            if points and x == points[-1]:
+                continue
+            if len(points) > 1 and (points[-1] - points[-2]) * (x - points[-1]) > 0.0:
+                points.pop()
+            points.append(x)
+            while len(points) > 3:
+                a, b, c, d = points[-4:]
+                if not min(a, d) <= min(b, c) <= max(b, c) <= max(a, d):
+                    break
+                del points[-3:-1]
+
+
+def memory_after(model: StageModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """
+    Return the play outputs of a model behind a history of voltage, shape (m,).
+
+    Parameters
+    ----------
+    model : StageModel
+    points : ndarray, shape (n,)
+        The voltage, or its turning points; the stage was at rest before the first.
+    """
+    h, u = model.hysteresis, model.scaling.u(points)
+    start = h.initial_memory(float(u[0]))
+    return weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, start)[1]
+
+
+def expected_error(model: StageModel) -> float | None:
+    """Return the error at identification [% of stroke], on the best data the model names."""
+    errors = model.identification.get('errors')
+    if isinstance(errors, dict):
+        for data in ('held_out', 'selection', 'fitted'):
+            value = errors.get(data)
+            if isinstance(value, (int, float)) and 0.0 < value < float('inf'):
+                return float(value)
+    return None
+
+
+class Predictor:
+    """
+    Predicts the displacement as blocks of voltage come.
+
+    Attributes
+    ----------
+    lost : int
+        Samples that never came, or could not be used.
+    late : int
+        Samples that came again or out of turn, and were left out.
+    restarts : int
+        How often the sample clock began anew.
+    problem : str
+        What was last wrong with the stream; empty when all is well.
+    """
+
+    def __init__(self) -> None:
+        self.model: StageModel | None = None
+        self.lost = self.late = self.restarts = 0
+        self.problem = ''
+        self._stream: Stream | None = None
+        self._lowest = float('inf')
+        self._period = self._begin = self._last = float('nan')
+        self._blocks = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._old = TurningPoints()
+        self._recent: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
+        self._stream = None
+
+    @property
+    def sample_rate(self) -> float:
+        """Rate of the stream [Hz]; NaN before it is known."""
+        return 1.0 / self._period
+
+    @property
+    def memory_known(self) -> bool:
+        """
+        Whether the plays are where they must be.
+
+        That is so when the voltage has been at its lowest since the run began, or since the last
+        gap.
+        """
+        return self.model is not None and bool(self.model.scaling.u(self._lowest) < REST)
+
+    @property
+    def memory_lost(self) -> bool:
+        """Whether blocks come and the plays are not where they must be."""
+        return bool(np.isfinite(self._last)) and not self.memory_known
+
+    def set_model(self, model: StageModel) -> None:
+        """
+        Take a model, in the state that it would have if it had run all along.
+
+        Raises
+        ------
+        ModelError
+            When it holds for another sampling rate than that of the stream.
+        """
+        if np.isfinite(self._period):
+            self._check_rate(model)
+        self.model = model
+        self._stream = self._caught_up(model) if self._recent else None
+        if self._recent and self.problem.startswith('the stream'):
+            self.problem = ''
+
+    def _check_rate(self, model: StageModel) -> None:
+        if model.is_static or abs(self._period * model.sample_rate - 1.0) < 1e-6:
+            return
+        raise ModelError(
+            f'the stream is sampled at {1.0 / self._period:.6g} Hz, the model holds for '
+            f'{model.sample_rate:g} Hz; identify a model at the rate of the stream'
+        )
+
+    def _caught_up(self, model: StageModel) -> Stream:
+        old = self._old.values
+        # without older samples the run is here in full, start and all
+        stream = model.stream(memory_after(model, old) if old.size else None)
+        t, v = (np.concatenate(x) for x in zip(*self._recent, strict=True))
+        stream.process(v, t)
+        return stream
+
+    def process(self, samples: Samples) -> Samples | None:
+        """
+        Return the prediction for a block, None where there is none.
+
+        A gap of up to half a second is bridged by a straight line; behind a longer one, as
+        behind a restart, the stage is taken to be at rest.  Blocks that came before, and blocks
+        with a number that is none, are left out.
+
+        Parameters
+        ----------
+        samples : Samples
+            Of voltage.
+        """
+        # copies: what is remembered does not change with the message, and is whole to the kernels
+        t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
+        if not self._usable(t, v):
+            return None
+        n, step = t.size, float(t[0]) - self._last
+        period = float(t[-1] - t[0]) / (n - 1) if n > 1 else self._period
+        if np.isnan(step):
+            self._start(t, period)
+        elif step <= 0.5 * period:
+            if (t[0] <= self._begin and self._blocks > 1) or -step > JUMP_BACK * period:
+                self.restarts += 1
+                if t[0] > 0.5 * period:
+                    # a programme that begins anew begins at zero
+                    self.problem = f'time jumps back from {self._last:.6g} to {t[0]:.6g} s'
+                self._start(t, period)
+            else:
+                new = t > self._last + 0.5 * period
+                self.late += n - int(new.sum())
+                self.problem = f'samples at t = {t[0]:.6g} s came again or out of turn'
+                if not new.any():
+                    return None
+                t, v = t[new], v[new]
+        elif abs(period / self._period - 1.0) > 1e-3:
+            self.problem = f'the sampling rate changed at t = {t[0]:.6g} s'
+            self._start(t, period)
+        elif step > 1.5 * period:
+            self._bridge(float(t[0]), float(v[0]), round(step / period) - 1)
+        self._last = float(t[-1])
+        self._blocks += 1
+        y = self._advance(t, v)
+        if y is None:
+            return None
+        return Samples(t, y, samples.segment, 'displacement')
+
+    def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
+        if not t.size:
+            return False
+        fault = _fault(t, v)
+        if fault == NOT_FINITE:
+            # counted when the gap that it leaves is met
+            self.problem = (
+                f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
+                'it is left out'
+            )
+        elif fault == NOT_UNIFORM:
+            self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
+        elif t.size == 1 and np.isnan(self._period):
+            self.problem = (
+                f'the block at t = {t[0]:.6g} s is one sample, which tells no sampling rate; it '
+                'is left out'
+            )
+            return False
+        return bool(fault == FINE)
+
+    def _start(self, t: NDArray[np.float64], period: float) -> None:
+        self._clear()
+        self._begin, self._period, self._blocks = float(t[0]), period, 0
+        self._lowest = float('inf')
+
+    def _bridge(self, t1: float, v1: float, missing: int) -> None:
+        self.lost += missing
+        self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'
+        self._lowest = float('inf')
+        if missing * self._period > BRIDGE:
+            self._start(np.array([t1]), self._period)
+            return
+        v0, t0 = float(self._recent[-1][1][-1]), self._last
+        share = np.arange(1, missing + 1) / (missing + 1)
+        self._advance(t0 + (t1 - t0) * share, v0 + (v1 - v0) * share)
+        self._lowest = float('inf')
+
+    def _advance(
+        self, t: NDArray[np.float64], v: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        self._remember(t, v)
+        model = self.model
+        if model is None:
+            return None
+        if self._stream is None:
+            try:
+                self._check_rate(model)
+            except ModelError as error:
+                self.problem = str(error)
+                return None
+            self._stream = model.stream()
+        return self._stream.process(v, t)
+
+    def _remember(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+        self._lowest = min(self._lowest, float(v.min()))
+        self._recent.append((t, v))
+        recent = self._recent
+        while t[-1] - recent[0][0][-1] > RECENT or len(recent) > MOST_BLOCKS:
+            self._old.add(self._recent.popleft()[1])
+
+
+def warm_up() -> None:
+    """Compile or load what a prediction needs, so that the first block is in time."""
+    model = StageModel(
+        sample_rate=1000.0,
+        scaling=Scaling(0.0, 1.0, 0.0, 1.0, (0.0, 1.0)),
+        hysteresis=Hysteresis(np.array([0.1]), np.array([0.1]), 0.0, 0.9),
+        dynamics=Dynamics(np.array([-0.5]), np.array([0.5])),
+        delay=Delay(1),
+    )
+    predictor = Predictor()
+    predictor.set_model(model)
+    t = np.arange(100) / 1000.0
+    predictor.process(Samples(t, t))
+    predictor.set_model(model)
+    TurningPoints().add(t)
+    memory_after(model, t)

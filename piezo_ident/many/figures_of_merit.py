@@ -1,0 +1,110 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What one stage is like in a few numbers that can be compared from stage to stage.
+
+The coefficients of G cannot: two identifications of one stage may choose different orders.  What
+the coefficients do to a signal can, so the numbers are read from the answer of H and of G.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['Character', 'character']
+
+#: samples of one branch of the loop, and frequencies at which G is looked at
+BRANCH, FREQUENCIES = 400, 4000
+#: lowest of them, as a share of the highest
+LOWEST = 1e-4
+#: |G| from which a maximum is called a resonance
+RISES = 1.05
+
+
+@dataclass(frozen=True)
+class Character:
+    """
+    Numbers of a stage.
+
+    Attributes
+    ----------
+    gain : float
+        Displacement over voltage between the ends of the identified range [m/V]; negative for a
+        stage that retracts.
+    loop_width : float
+        Largest distance between the branches of the settled loop over that range, in % of its
+        stroke.
+    bandwidth : float or None
+        Lowest frequency at which |G| has fallen to 1/sqrt(2) [Hz]; None when it never does.
+    resonance, peak : float or None
+        Frequency of the largest |G| [Hz], and its value there; None without a resonance.
+    """
+
+    gain: float
+    loop_width: float
+    bandwidth: float | None
+    resonance: float | None
+    peak: float | None
+
+
+def character(model: StageModel) -> Character:
+    """
+    Return the numbers of a stage, from H and G of its model alone.
+
+    Parameters
+    ----------
+    model : StageModel
+
+    Examples
+    --------
+    >>> from piezo_ident.operators.dynamics import Delay, Dynamics
+    >>> from piezo_ident.operators.hysteresis import Hysteresis
+    >>> from piezo_ident.model.stage_model import Scaling
+    >>> scaling = Scaling(0.0, 10.0, 0.0, 70e-6, (0.0, 10.0))
+    >>> line = Hysteresis([], [], 0.0, 1.0)
+    >>> stage = character(StageModel(1e4, scaling, line, Dynamics.unit(), Delay(3)))
+    >>> print(f'{stage.gain:.1e} {stage.loop_width:g} {stage.resonance}')
+    7.0e-06 0 None
+    """
+    gain, width = _loop(model)
+    return Character(gain, width, *_answer(model))
+
+
+def _loop(model: StageModel) -> tuple[float, float]:
+    low, high = model.scaling.range
+    first, last = model.scaling.u(np.array([low, high]))
+    up = np.linspace(first, last, BRANCH)
+    # the first way up is the virgin one; from there on the loop repeats
+    w = model.hysteresis(np.concatenate([up, up[-2::-1], up[1:]]))
+    down, again = w[BRANCH - 1 : 2 * BRANCH - 1][::-1], w[2 * BRANCH - 2 :]
+    span = float(again[-1] - again[0])
+    width = float(np.max(np.abs(down - again)))
+    stroke = float(np.ptp(again))
+    return (
+        span * model.dynamics.gain * model.scaling.Y / (high - low),
+        100.0 * width / stroke if stroke > 0.0 else 0.0,
+    )
+
+
+def _answer(model: StageModel) -> tuple[float | None, float | None, float | None]:
+    if model.is_static:
+        return None, None, None
+    top = 0.5 * model.sample_rate
+    f = np.geomspace(LOWEST * top, top, FREQUENCIES)
+    size = np.abs(model.dynamics.response(f, model.sample_rate)) / abs(model.dynamics.gain)
+    low = np.flatnonzero(size < np.sqrt(0.5))
+    bandwidth = None
+    if low.size and low[0] > 0:
+        k = int(low[0])
+        # between two neighbours |G| is as good as a straight line
+        bandwidth = float(np.interp(-np.sqrt(0.5), -size[[k - 1, k]], f[[k - 1, k]]))
+    k = int(np.argmax(size))
+    if size[k] < RISES or k in (0, f.size - 1):
+        return bandwidth, None, None
+    curve = np.polyfit(np.log(f[k - 1 : k + 2] / f[k]), size[k - 1 : k + 2], 2)
+    at = -curve[1] / (2.0 * curve[0])
+    return bandwidth, float(f[k] * np.exp(at)), float(np.polyval(curve, at))

@@ -1,0 +1,312 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Model files: one YAML document, read with the safe loader only, written in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+import difflib
+import os
+from pathlib import Path
+import reprlib
+import tempfile
+from typing import Any
+
+import numpy as np
+from piezo_ident import __version__
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.limits import EFFECTS, ORDER
+from piezo_ident.common.yaml_io import endless, load_yaml, parse_yaml
+from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+import yaml
+
+__all__ = [
+    'SCHEMA_VERSION',
+    'load_model',
+    'load_yaml',
+    'model_from_dict',
+    'model_to_dict',
+    'parse_yaml',
+    'plain',
+    'save_model',
+    'write_text',
+]
+
+SCHEMA_VERSION = 1
+
+_REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
+_OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
+_INSIDE: Mapping[str, tuple[str, ...]] = {
+    'input': ('v0', 'V', 'range'),
+    'output': ('y0', 'Y'),
+    'delay': ('samples', 'fraction'),
+    'hysteresis': ('thresholds', 'weights', 'p1', 'p2'),
+    'dynamics': ('a', 'b'),
+}
+_EFFECT = ('name', 'slot', 'parameters')
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers on one line, everything else in blocks."""
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list[Any]) -> yaml.Node:
+    flow = all(isinstance(x, (int, float, str)) for x in data)
+    return dumper.represent_sequence('tag:yaml.org,2002:seq', data, flow_style=flow)
+
+
+_Dumper.add_representer(list, _represent_list)
+
+
+def plain(value: Any) -> Any:
+    """Return nested mappings, sequences and numpy values as plain Python data."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return value
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, 'strerror', None) or type(error).__name__
+
+
+def _mapping(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
+    value = data.get(key)
+    if not isinstance(value, Mapping):
+        raise ModelError(f'{name}: {key} must be a mapping, see config/stage_paper.yaml')
+    return value
+
+
+def _number(data: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
+    value = data.get(key, default)
+    # YAML 1.1 reads 2e-5 as text; people write it all the same
+    if isinstance(value, bool) or value is None:
+        raise ModelError(f'{name}: {key} is missing or not a number')
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f'{name}: {key} is not a number: {reprlib.repr(value)}') from None
+
+
+def _numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
+    value = data.get(key)
+    if not isinstance(value, list) or any(isinstance(x, bool) for x in value):
+        raise ModelError(f'{name}: {key} must be a list of numbers')
+    try:
+        return np.array([float(x) for x in value], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f'{name}: {key} must be a list of numbers') from None
+
+
+def _unknown(data: Mapping[str, Any], known: Collection[str]) -> list[str]:
+    return sorted(set(map(str, data)) - set(known))
+
+
+def _meant(key: str, known: Iterable[str]) -> str | None:
+    """Return the known key that a misspelt one stands for."""
+    names = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(key.lower(), names, n=1)
+    return names[close[0]] if close else None
+
+
+def _refuse_unknown(unknown: list[str], known: Collection[str], where: str, name: str) -> None:
+    if not unknown:
+        return
+    meant = list(dict.fromkeys(filter(None, (_meant(key, known) for key in unknown))))
+    cure = f'did you mean {", ".join(meant)}?' if meant else f'it knows {", ".join(known)}'
+    listed = ', '.join(key[:40] for key in unknown[:8])
+    raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
+
+
+def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
+    """
+    Build a model from plain data.
+
+    Parameters
+    ----------
+    data : mapping
+        Contents of a model file.
+    name : str, optional
+        What to call it in messages.
+
+    Raises
+    ------
+    ModelError
+        When the schema is later than this package knows, or a part is missing or wrong.
+    """
+    found = endless(data)
+    if found is not None:
+        raise ModelError(f'{name}: {found} is nested too deeply, or too large')
+    version = data.get('schema_version', SCHEMA_VERSION)
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise ModelError(
+            f'{name}: schema_version must be a whole number, got {reprlib.repr(version)}'
+        )
+    if version > SCHEMA_VERSION:
+        raise ModelError(
+            f'{name}: written with model schema {reprlib.repr(version)}, this package reads up to '
+            f'{SCHEMA_VERSION}; update piezo_ident'
+        )
+    missing = [key for key in _REQUIRED if key not in data]
+    unknown = _unknown(data, (*_REQUIRED, *_OPTIONAL))
+    # a misspelt part is there; anything else that lacks one is another file
+    if missing and not any(_meant(key, missing) for key in unknown):
+        raise ModelError(f'{name}: missing {", ".join(missing)}; is this a model file?')
+    _refuse_unknown(unknown, (*_REQUIRED, *_OPTIONAL), '', name)
+    for part, known in _INSIDE.items():
+        inside = _mapping(data, part, name)
+        _refuse_unknown(_unknown(inside, known), known, f' in {part}', name)
+
+    source, target = _mapping(data, 'input', name), _mapping(data, 'output', name)
+    delay, h = _mapping(data, 'delay', name), _mapping(data, 'hysteresis', name)
+    g = _mapping(data, 'dynamics', name)
+    limits = _numbers(source, 'range', name)
+    if limits.size != 2:
+        raise ModelError(f'{name}: input.range must be [lowest, highest] voltage')
+    effects = data.get('effects') or []
+    if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
+        raise ModelError(f'{name}: effects must be a list of mappings')
+    if len(effects) > EFFECTS:
+        raise ModelError(f'{name}: {len(effects)} effects; give at most {EFFECTS}')
+    for effect in effects:
+        _refuse_unknown(_unknown(effect, _EFFECT), _EFFECT, ' in effects', name)
+    identification = data.get('identification') or {}
+    if not isinstance(identification, Mapping):
+        raise ModelError(f'{name}: identification must be a mapping')
+    samples = _number(delay, 'samples', name)
+    if not samples.is_integer():
+        raise ModelError(f'{name}: delay.samples must be a whole number, got {samples}')
+    a, b = _numbers(g, 'a', name), _numbers(g, 'b', name)
+    if max(a.size, b.size) > ORDER:
+        raise ModelError(f'{name}: dynamics of order {max(a.size, b.size)}; at most {ORDER}')
+    try:
+        return StageModel(
+            sample_rate=_number(data, 'sample_rate', name),
+            scaling=Scaling(
+                v0=_number(source, 'v0', name),
+                V=_number(source, 'V', name),
+                y0=_number(target, 'y0', name),
+                Y=_number(target, 'Y', name),
+                range=(float(limits[0]), float(limits[1])),
+            ),
+            hysteresis=Hysteresis(
+                thresholds=_numbers(h, 'thresholds', name),
+                weights=_numbers(h, 'weights', name),
+                p1=_number(h, 'p1', name),
+                p2=_number(h, 'p2', name),
+            ),
+            dynamics=Dynamics(a=a, b=b),
+            delay=Delay(int(samples), _number(delay, 'fraction', name, 0.0)),
+            effects=tuple(
+                EffectSetting(
+                    str(e.get('name')),
+                    {str(k): v for k, v in _mapping(e, 'parameters', name).items()},
+                )
+                for e in effects
+            ),
+            identification=dict(identification),
+        )
+    except ModelError as error:
+        raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
+
+
+def model_to_dict(model: StageModel) -> dict[str, Any]:
+    """Return a model as plain data, ready for YAML or JSON."""
+    s, h = model.scaling, model.hysteresis
+    data = {
+        'schema_version': SCHEMA_VERSION,
+        'package_version': __version__,
+        'sample_rate': model.sample_rate,
+        'input': {'v0': s.v0, 'V': s.V, 'range': list(s.range)},
+        'output': {'y0': s.y0, 'Y': s.Y},
+        'delay': {'samples': model.delay.samples, 'fraction': model.delay.fraction},
+        'hysteresis': {
+            'thresholds': h.thresholds,
+            'weights': h.weights,
+            'p1': h.p1,
+            'p2': h.p2,
+        },
+        'dynamics': {'a': model.dynamics.a, 'b': model.dynamics.b},
+        'effects': [
+            {'name': e.name, 'slot': e.slot, 'parameters': e.parameters} for e in model.effects
+        ],
+        'identification': model.identification,
+    }
+    result: dict[str, Any] = plain(data)
+    return result
+
+
+def model_to_yaml(model: StageModel) -> str:
+    """Return the text of a model file."""
+    text: str = yaml.dump(
+        model_to_dict(model),
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=99,
+    )
+    return text
+
+
+def load_model(path: str | os.PathLike[str]) -> StageModel:
+    """
+    Read a model file.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read or is not YAML.
+    ModelError
+        When it is not a model, or one of a later schema.
+    """
+    return model_from_dict(load_yaml(path), str(path))
+
+
+def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
+    """
+    Write a model file; the old one stays whole until the new one is.
+
+    Raises
+    ------
+    DataError
+        When the file cannot be written.
+    """
+    write_text(path, model_to_yaml(model))
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """
+    Write a text file under a temporary name and rename it.
+
+    Raises
+    ------
+    DataError
+        When the file cannot be written.
+    """
+    target = Path(path)
+    try:
+        handle, temporary = tempfile.mkstemp(
+            dir=target.parent, prefix=f'.{target.name}.', suffix='.tmp'
+        )
+        try:
+            with os.fdopen(handle, 'w', encoding='utf-8') as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, target)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise DataError(
+            f'{path}: cannot be written ({_reason(error)}); choose another place'
+        ) from None

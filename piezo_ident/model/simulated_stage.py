@@ -1,0 +1,330 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The simulated stage: a model between a digital-to-analogue converter and a noisy, sampled sensor.
+
+    command --> [DAC] --> applied voltage --> [StageModel] --> [+ noise] --> [ADC] --> reading
+
+Its configuration is a model file with two more keys, ``sensor`` and ``seed``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import math
+import os
+import reprlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.program import Sequence
+from piezo_ident.model.files import load_yaml, model_from_dict
+from piezo_ident.model.stage_model import CHUNK, StageModel
+from piezo_ident.record.record import Fault, Piece, Record
+
+__all__ = [
+    'Converter',
+    'Sensor',
+    'SimulatedStage',
+    'StageRun',
+    'load_stage',
+    'simulate',
+    'simulate_truth',
+    'stage_from_dict',
+]
+
+
+@dataclass(frozen=True)
+class Converter:
+    """
+    A converter between numbers and a physical quantity.
+
+    Its codes are ``low + k (high - low) / 2^bits``, k = 0 .. 2^bits - 1, so that zero is a code of
+    every symmetric range and `high` itself lies one step above the last.
+
+    Parameters
+    ----------
+    bits : int
+        Resolution.
+    low, high : float
+        Range, in the unit of the quantity.
+
+    Raises
+    ------
+    ConfigError
+        When the resolution is not within 1 .. 32 bits, or the range is empty.
+    """
+
+    bits: int
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= 32:
+            raise ConfigError(f'a converter has 1 .. 32 bits, got {self.bits}')
+        if not self.low < self.high:
+            raise ConfigError(
+                f'a converter range is [lowest, highest], got [{self.low:g}, {self.high:g}]'
+            )
+
+    @property
+    def step(self) -> float:
+        """Smallest difference between two codes."""
+        return (self.high - self.low) / 2.0**self.bits
+
+    def quantise(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nearest codes; values outside the range become its last ones."""
+        code = np.clip(np.rint((x - self.low) / self.step), 0.0, 2.0**self.bits - 1.0)
+        return np.asarray(self.low + self.step * code)
+
+    def outside(self, x: NDArray[np.float64]) -> int:
+        """Return how many values lie outside the range."""
+        return int(np.count_nonzero((x < self.low) | (x > self.high)))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """
+    What stands between the computer and the stage.
+
+    Attributes
+    ----------
+    noise_rms : float
+        White noise of the displacement sensor [m].
+    dac : Converter or None
+        In front of the amplifier [V]; ideal when None.
+    adc : Converter or None
+        Behind the sensor [m]; ideal when None.
+    """
+
+    noise_rms: float = 0.0
+    dac: Converter | None = None
+    adc: Converter | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.noise_rms) and self.noise_rms >= 0):
+            raise ConfigError(f'noise_rms must not be negative, got {self.noise_rms} m')
+
+
+@dataclass(frozen=True)
+class SimulatedStage:
+    """
+    A model that plays the stage, with its converters and sensor noise.
+
+    Attributes
+    ----------
+    model : StageModel
+    sensor : Sensor
+    seed : int
+        For the generator that draws the noise.
+    """
+
+    model: StageModel
+    sensor: Sensor = field(default_factory=Sensor)
+    seed: int = 0
+
+    def run(self, rng: np.random.Generator) -> StageRun:
+        """Return a run of this stage that takes the command block by block."""
+        return StageRun(self, rng)
+
+
+class StageRun:
+    """
+    One run of a simulated stage, block by block, in volts and metres.
+
+    The first command is taken as the one under which the stage was at rest.  The result does not
+    depend on how the stream is cut.
+
+    Attributes
+    ----------
+    clipped_input, clipped_output : int
+        Samples so far that left the range of the DAC and of the ADC.
+    """
+
+    def __init__(self, stage: SimulatedStage, rng: np.random.Generator) -> None:
+        self.stage = stage
+        self.clipped_input = 0
+        self.clipped_output = 0
+        self._rng = rng
+        self._stream = stage.model.stream()
+
+    def applied(self, v: ArrayLike) -> NDArray[np.float64]:
+        """Return what the DAC makes of a command [V], shape (n,)."""
+        command, dac = np.asarray(v, dtype=np.float64), self.stage.sensor.dac
+        return command if dac is None else dac.quantise(command)
+
+    def process(
+        self,
+        v: ArrayLike,
+        t: ArrayLike | None = None,
+        channels: Mapping[str, NDArray[np.float64]] | None = None,
+    ) -> NDArray[np.float64]:
+        """
+        Return the sensor's readings [m] for the next stretch of command [V].
+
+        Parameters
+        ----------
+        v : array_like, shape (n,)
+            Command [V].
+        t : array_like, shape (n,), optional
+            Time [s]; counted from the first sample when absent.
+        channels : mapping of str to ndarray, optional
+            Further signals that effects of the model look at.
+        """
+        sensor = self.stage.sensor
+        command = np.asarray(v, dtype=np.float64)
+        if sensor.dac is not None:
+            self.clipped_input += sensor.dac.outside(command)
+        y = self._stream.process(self.applied(command), t, channels)
+        if sensor.noise_rms > 0:
+            y = y + sensor.noise_rms * self._rng.standard_normal(y.size)
+        if sensor.adc is not None:
+            self.clipped_output += sensor.adc.outside(y)
+            y = sensor.adc.quantise(y)
+        return y
+
+
+def simulate(
+    stage: SimulatedStage,
+    sequence: Sequence,
+    rng: np.random.Generator,
+    name: str = 'simulated',
+) -> Record:
+    """
+    Return what would be measured while the stage plays a sequence.
+
+    Parameters
+    ----------
+    stage : SimulatedStage
+        The stage.
+    sequence : Sequence
+        The command; it is what the record holds as voltage.
+    rng : numpy.random.Generator
+        Draws the sensor noise.
+    name : str, optional
+        Of the record.
+
+    Returns
+    -------
+    Record
+        With a fault for each converter whose range was left.
+
+    Raises
+    ------
+    ModelError
+        When stage and sequence differ in sampling rate.
+    """
+    run = stage.run(rng)
+    # one piece without measurement yet, so that the model's own check and clock are used
+    piece = _piece(sequence, np.zeros(sequence.n))
+    stage.model.check_rate(piece)
+    t, y = piece.t, np.empty(sequence.n)
+    for start in range(0, sequence.n, CHUNK):
+        cut = slice(start, start + CHUNK)
+        y[cut] = run.process(sequence.v[cut], t[cut])
+    clipped = {'voltage': run.clipped_input, 'displacement': run.clipped_output}
+    faults = tuple(
+        Fault('clipping', where, count, 'held at the end of the converter range')
+        for where, count in clipped.items()
+        if count
+    )
+    return Record((_piece(sequence, y),), name, faults)
+
+
+def simulate_truth(stage: SimulatedStage, sequence: Sequence, name: str = 'truth') -> Record:
+    """
+    Return the displacement itself: no noise, no converters.
+
+    Raises
+    ------
+    ModelError
+        When stage and sequence differ in sampling rate.
+    """
+    ideal = SimulatedStage(stage.model)
+    return simulate(ideal, sequence, np.random.default_rng(0), name)
+
+
+def _piece(sequence: Sequence, y: NDArray[np.float64]) -> Piece:
+    return Piece(v=sequence.v, y=y, sample_rate=sequence.sample_rate, segments=sequence.segments)
+
+
+def load_stage(path: str | os.PathLike[str]) -> SimulatedStage:
+    """
+    Read the configuration of a simulated stage.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read, or its sensor is not understood.
+    ModelError
+        When its model is not understood.
+    """
+    return stage_from_dict(load_yaml(path), str(path))
+
+
+def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedStage:
+    """
+    Build a simulated stage from plain data; see `load_stage`.
+
+    Parameters
+    ----------
+    data : mapping
+        A model's keys, and ``sensor`` and ``seed``.  A plain model file is an ideal stage.
+    name : str, optional
+        What to call it in messages.
+    """
+    sensor = data.get('sensor') or {}
+    if not isinstance(sensor, Mapping):
+        raise ConfigError(f'{name}: sensor must be a mapping, see config/stage_paper.yaml')
+    known = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
+    strange = [str(key)[:40] for key in sensor if key not in known][:8]
+    if strange:
+        raise ConfigError(
+            f'{name}: unknown {", ".join(strange)} in sensor; it knows {", ".join(known)}'
+        )
+    seed = data.get('seed', 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ConfigError(
+            f'{name}: seed must be a whole number, not negative, got {reprlib.repr(seed)}'
+        )
+    model = model_from_dict({k: v for k, v in data.items() if k not in ('sensor', 'seed')}, name)
+    try:
+        return SimulatedStage(
+            model,
+            Sensor(
+                noise_rms=_number(sensor.get('noise_rms', 0.0), 'noise_rms'),
+                dac=_converter(sensor, 'dac'),
+                adc=_converter(sensor, 'adc'),
+            ),
+            seed,
+        )
+    except ConfigError as error:
+        raise ConfigError(f'{name}: sensor: {error}') from None
+
+
+def _converter(sensor: Mapping[str, Any], which: str) -> Converter | None:
+    bits, ends = sensor.get(f'{which}_bits'), sensor.get(f'{which}_range')
+    if bits is None and ends is None:
+        return None
+    if bits is None or not isinstance(ends, list) or len(ends) != 2:
+        raise ConfigError(f'give both {which}_bits and {which}_range: [lowest, highest]')
+    number = _number(bits, f'{which}_bits')
+    if number != int(number):
+        raise ConfigError(f'{which}_bits must be a whole number, got {number:g}')
+    low, high = (_number(x, f'{which}_range') for x in ends)
+    return Converter(int(number), low, high)
+
+
+def _number(value: Any, key: str) -> float:
+    # YAML 1.1 reads 2e-5 as text; people write it all the same
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigError(f'{key} must be a number, got {reprlib.repr(value)}')
+    return number

@@ -1,0 +1,314 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+G and z^-d: the linear dynamics and the pure delay, each as parameters and as a streaming operator.
+
+    y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j w(k-d-j+1)                    (eqs. 4-5)
+
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import kernel
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.kernels import coefficients, recursion
+
+__all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
+
+#: longest pure delay that a model may have [samples]
+MAX_DELAY = 1_000_000
+#: longest memory that is told of dynamics [samples]: more than any record has
+MAX_MEMORY = 2**40
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """
+    The rational part of G.
+
+    Parameters
+    ----------
+    a : array_like, shape (na,)
+        Coefficients a_1 .. a_na of ``A(z) = 1 + a_1 z^-1 + ...``.
+    b : array_like, shape (nb,)
+        Coefficients b_1 .. b_nb of ``B(z) = b_1 + b_2 z^-1 + ...``.
+
+    Raises
+    ------
+    ModelError
+        When a coefficient is not finite, or b is empty.
+    """
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        a, b = frozen_array(self.a), frozen_array(self.b)
+        if a.ndim != 1 or b.ndim != 1 or b.size == 0:
+            raise ModelError('dynamics: a and b are lists, and b has at least one number')
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+            raise ModelError('dynamics: a and b must be finite numbers')
+        object.__setattr__(self, 'a', a)
+        object.__setattr__(self, 'b', b)
+
+    @classmethod
+    def unit(cls) -> Dynamics:
+        """Return G = 1."""
+        return cls(a=np.empty(0), b=np.ones(1))
+
+    @property
+    def gain(self) -> float:
+        """Static gain G(1), infinite for an integrator."""
+        return _static_gain(self.b, self.a)
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Poles of G in the z plane."""
+        return np.asarray(np.roots(np.concatenate([[1.0], self.a])), dtype=np.complex128)
+
+    @property
+    def radius(self) -> float:
+        """Largest magnitude of a pole, 0 without poles."""
+        return float(np.abs(self.poles).max(initial=0.0))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether every pole lies inside the unit circle."""
+        return _is_stable(self.a)
+
+    def memory(self, share: float) -> int:
+        """Return after how many samples its slowest pole has fallen to a share of its start."""
+        radius = self.radius
+        if radius >= 1.0:
+            return MAX_MEMORY
+        if radius < share:
+            return self.b.size
+        return min(MAX_MEMORY, self.b.size + int(np.log(share) / np.log(radius)))
+
+    def normalised(self) -> Dynamics:
+        """
+        Return the same dynamics with G(1) = 1.
+
+        Raises
+        ------
+        ModelError
+            When the static gain is zero or not finite.
+        """
+        gain = self.gain
+        if not np.isfinite(gain) or gain == 0.0:
+            raise ModelError(f'dynamics: static gain {gain} cannot be scaled to one')
+        return Dynamics(a=self.a, b=self.b / gain)
+
+    def without_slow_poles(self, slowest: float, sample_rate: float) -> Dynamics:
+        """
+        Return the dynamics freed of real poles below a frequency, each with the zero next to it.
+
+        Parameters
+        ----------
+        slowest, sample_rate : float
+            [Hz]
+
+        Returns
+        -------
+        Dynamics
+            With the same gain at ten times that frequency; itself when no pole is that slow.
+        """
+        radius = np.exp(-2.0 * np.pi * slowest / sample_rate)
+        poles, zeros = self.poles, np.roots(self.b)
+        slow = (poles.imag == 0.0) & (poles.real > radius)
+        if not slow.any() or zeros.size < slow.sum():
+            return self
+        for pole in poles[slow]:
+            # complex zeros come in pairs; only a real one may go alone
+            real = np.flatnonzero(np.abs(zeros.imag) == 0.0)
+            if not real.size:
+                return self
+            zeros = np.delete(zeros, real[np.argmin(np.abs(zeros[real] - pole))])
+        a = np.atleast_1d(np.real(np.poly(poles[~slow])))[1:]
+        faster = Dynamics(a=a, b=np.atleast_1d(np.real(np.poly(zeros))))
+        at = [10.0 * slowest]
+        gain = np.abs(self.response(at, sample_rate)) / np.abs(faster.response(at, sample_rate))
+        sign = np.sign(np.real(self.response(at, sample_rate) / faster.response(at, sample_rate)))
+        return Dynamics(a=faster.a, b=faster.b * float(gain[0] * sign[0]))
+
+    def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
+        """
+        Return the frequency response.
+
+        Parameters
+        ----------
+        frequency : array_like, shape (n,)
+            Frequencies [Hz].
+        sample_rate : float
+            [Hz]
+
+        Returns
+        -------
+        ndarray of complex, shape (n,)
+        """
+        z = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) / sample_rate)
+        numerator = np.polyval(self.b[::-1], z)
+        denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
+        return np.asarray(numerator / denominator, dtype=np.complex128)
+
+    def modes(self, sample_rate: float) -> list[tuple[float, float]]:
+        """Return (natural frequency [Hz], damping ratio) of each oscillating pole pair."""
+        found = []
+        for pole in self.poles:
+            if pole.imag > 0.0 and abs(pole) > 0.0:
+                s = np.log(pole) * sample_rate
+                found.append((float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))))
+        return sorted(found)
+
+
+def filter_arx(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    x: NDArray[np.float64],
+    at_rest: bool = True,
+) -> NDArray[np.float64]:
+    """
+    Return B(z)/A(z) x.
+
+    Parameters
+    ----------
+    a, b : ndarray
+        As in `Dynamics`.
+    x : ndarray, shape (n,)
+    at_rest : bool, optional
+        Start in equilibrium with the first sample (default) instead of from zero.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    n_w, n_y = b.size - 1, a.size
+    w, y = np.empty(n_w + x.size), np.empty(n_y + x.size)
+    w[n_w:] = x
+    w[:n_w] = x[0] if at_rest else 0.0
+    y[:n_y] = x[0] * _static_gain(b, a) if at_rest else 0.0
+    recursion(*coefficients(b, a), w, y)
+    return y[n_y:]
+
+
+@kernel
+def _is_stable(a: NDArray[np.float64]) -> bool:
+    # Schur and Cohn: A has all roots within the circle if, and only if, its last coefficient is
+    # smaller than one and the same is true of the polynomial that is one shorter
+    a = a.copy()
+    for n in range(a.size, 0, -1):
+        last = a[n - 1]
+        if not abs(last) < 1.0:
+            return False
+        share = 1.0 / (1.0 - last * last)
+        for i in range(n // 2):
+            k = n - 2 - i
+            a[i], a[k] = share * (a[i] - last * a[k]), share * (a[k] - last * a[i])
+    return True
+
+
+def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:
+    numerator, denominator = float(b.sum()), 1.0 + float(a.sum())
+    return numerator / denominator if denominator != 0.0 else float('inf')
+
+
+class DynamicsOperator:
+    """G as a link of the chain, with its state."""
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        self.dynamics = dynamics
+        self._coefficients = coefficients(dynamics.b, dynamics.a)
+        self._past_w, self._past_y = np.zeros(dynamics.b.size - 1), np.zeros(dynamics.a.size)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to equilibrium with a constant signal."""
+        rest = x0 * self.dynamics.gain
+        self._past_w[:], self._past_y[:] = x0, rest
+        return rest
+
+    def process(self, block: Block) -> Block:
+        """Return the block filtered."""
+        w = np.concatenate([self._past_w, block.x])
+        y = np.empty(self._past_y.size + block.x.size)
+        y[: self._past_y.size] = self._past_y
+        recursion(*self._coefficients, w, y)
+        self._past_w, self._past_y = w[block.x.size :].copy(), y[block.x.size :].copy()
+        return block.with_signal(y[self._past_y.size :])
+
+
+@dataclass(frozen=True)
+class Delay:
+    """
+    The pure delay.
+
+    Parameters
+    ----------
+    samples : int
+        Whole samples d >= 0.
+    fraction : float, optional
+        Further part of a sample, 0 <= fraction < 1, by linear interpolation.
+
+    Raises
+    ------
+    ModelError
+        When out of range.
+    """
+
+    samples: int
+    fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.samples <= MAX_DELAY or int(self.samples) != self.samples:
+            raise ModelError(
+                f'delay: samples must be a whole number, 0 to {MAX_DELAY}, got {self.samples}'
+            )
+        if not 0.0 <= self.fraction < 1.0:
+            raise ModelError(f'delay: fraction must be in [0, 1), got {self.fraction}')
+
+    @property
+    def total(self) -> float:
+        """Delay in samples, with its fraction."""
+        return self.samples + self.fraction
+
+    def apply(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a signal delayed, preceded by its own first value; shape (n,)."""
+        operator = DelayOperator(self)
+        operator.reset(0.0, float(x[0]))
+        return operator.shift(x)
+
+
+class DelayOperator:
+    """z^-d as a link of the chain, with its buffer."""
+
+    def __init__(self, delay: Delay) -> None:
+        self.delay = delay
+        self._past = np.zeros(delay.samples + 1)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Fill the buffer with a constant signal."""
+        self._past = np.full(self.delay.samples + 1, x0)
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Return the block delayed."""
+        return block.with_signal(self.shift(block.x))
+
+    def shift(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signal delayed; shape (n,)."""
+        if self.delay.total == 0.0:
+            return x
+        line = np.concatenate([self._past, x])
+        # copied: a view would keep every past block alive
+        self._past = line[x.size :].copy()
+        f = self.delay.fraction
+        if f == 0.0:
+            return line[1 : 1 + x.size]
+        return np.asarray((1.0 - f) * line[1 : 1 + x.size] + f * line[: x.size])

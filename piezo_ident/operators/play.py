@@ -1,0 +1,133 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Play operators in compiled kernels.
+
+    F_r[v](t) = max(v(t) - r, min(v(t), F_r[v](t-)))        r >= 0                       (eqs. 1-2)
+
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.  This is the one-sided play: F_r
+stays within [v - r, v], and F_0[v] = v.  The kernels release the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.kernel import kernel
+from piezo_ident.operators.kernels import sum_of_plays
+
+__all__ = ['initial_memory', 'play', 'play_columns', 'weighted_plays']
+
+# Comparisons are written out: the NaN rules of max() and min() would keep the compiler from
+# vectorising over the thresholds.
+
+
+@kernel
+def _columns(
+    v: NDArray[np.float64],
+    r: NDArray[np.float64],
+    memory: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    for i in range(r.size):
+        f = memory[i]
+        width = r[i]
+        for k in range(v.size):
+            x = v[k]
+            if f > x:
+                f = x
+            if f < x - width:
+                f = x - width
+            out[i, k] = f
+        memory[i] = f
+
+
+def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
+    """
+    Return the play outputs of a stage that last came down to zero and then went to `v0`.
+
+    That is the state ``F_r = 0`` at ``v = 0`` of the paper, moved to `v0` in one stroke.
+
+    Parameters
+    ----------
+    v0 : float
+        Normalised input.
+    thresholds : array_like, shape (m,)
+        Play thresholds r, normalised.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+    """
+    r = np.asarray(thresholds, dtype=np.float64)
+    return np.maximum(v0 - r, np.minimum(v0, np.zeros_like(r)))
+
+
+def play_columns(
+    v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """
+    Return the output of every play operator.
+
+    Parameters
+    ----------
+    v : array_like, shape (n,)
+        Normalised input.
+    thresholds : array_like, shape (m,)
+        Thresholds r >= 0.
+    memory : array_like, shape (m,), optional
+        Outputs before the first sample; `initial_memory` of the first input when absent.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+    """
+    x = np.ascontiguousarray(v, dtype=np.float64)
+    r = np.ascontiguousarray(thresholds, dtype=np.float64)
+    start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
+    out = np.empty((r.size, x.size))
+    _columns(x, r, start, out)
+    return out
+
+
+def play(v: ArrayLike, threshold: float) -> NDArray[np.float64]:
+    """
+    Return the output of one play operator that starts from `initial_memory`.
+
+    Examples
+    --------
+    >>> play([0.0, 1.0, 0.0], 0.25).tolist()
+    [0.0, 0.75, 0.0]
+    """
+    result: NDArray[np.float64] = play_columns(v, [threshold])[0]
+    return result
+
+
+def weighted_plays(
+    v: NDArray[np.float64],
+    thresholds: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    p1: float,
+    p2: float,
+    memory: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """
+    Return ``p1 v^3 + p2 v + sum_i q_i F_ri[v]`` (eqs. 3 and 6) and the memory after it.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+    thresholds, weights, memory : ndarray, shape (m,)
+    p1, p2 : float
+
+    Returns
+    -------
+    w : ndarray, shape (n,)
+    memory : ndarray, shape (m,)
+    """
+    x = np.ascontiguousarray(v)
+    end = memory.copy()
+    out = np.empty(x.size)
+    sum_of_plays(x, thresholds, weights, p1, p2, end, out)
+    return out, end

@@ -1,0 +1,299 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Raw columns to a record: every fault of measured data is met here, the same way for all formats.
+
+What can be met without guessing is met and reported as a `Fault`: gaps, restarts and changes of
+the sampling rate split the record, repeated rows are dropped, samples without a number are cut
+out.  What would need a guess is refused, and the message says what to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+import itertools
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.common.limits import PIECES
+from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
+from piezo_ident.record.ordering import at_times, in_order, Rows
+from piezo_ident.record.overall import Overall
+from piezo_ident.record.record import Fault, Piece, Record, Segment
+
+__all__ = ['UNITS', 'SegmentStarts', 'assemble', 'label_runs']
+
+#: label of each stretch and the row at which it begins; it lasts until the next begins
+SegmentStarts = tuple[Sequence[str], ArrayLike]
+
+#: how many of a displacement unit make a metre
+UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm': 1e6, 'nm': 1e9}
+
+#: higher rates [Hz] are counted in another unit than seconds
+MAX_RATE = 1e9
+#: more pieces than this, with fewer samples than this in each, are no uniform sampling
+MANY = 10
+#: a stretch of fewer samples has no sampling rate
+MIN_PIECE = 2
+
+
+def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
+    """
+    Return the label of each stretch and the row at which it begins, from one label a row.
+
+    >>> label_runs(['noise', 'noise', '', 'sine:50Hz'])
+    (['noise', '', 'sine:50Hz'], [0, 2, 3])
+    """
+    names, starts, row = [], [], 0
+    for label, group in itertools.groupby(labels):
+        names.append(label)
+        starts.append(row)
+        row += sum(1 for _ in group)
+    return names, starts
+
+
+def assemble(
+    t: ArrayLike,
+    v: ArrayLike,
+    y: ArrayLike,
+    segments: SegmentStarts | None = None,
+    channels: Mapping[str, ArrayLike] | None = None,
+    *,
+    name: str,
+    displacement_unit: str = 'm',
+    voltage_limits: tuple[float, float] | None = None,
+    sample_rate: float | None = None,
+    faults: Iterable[Fault] = (),
+    overall: Overall | None = None,
+) -> Record:
+    """
+    Make a record of raw columns.
+
+    What makes a restart, a repeat or disorder is said in `piezo_ident.record.ordering`; how the
+    sampling rate is found, in `piezo_ident.record.clock`.
+
+    Parameters
+    ----------
+    t, v, y : array_like, shape (n,)
+        Time [s], command voltage [V] and displacement [`displacement_unit`].
+    segments : tuple of (names, starts), optional
+        Label of each stretch and the row at which it begins; an empty label means none.
+    channels : mapping of str to array_like, shape (n,), optional
+        Further signals.
+    name : str
+        What errors call the data, and the record's name.
+    displacement_unit : {'m', 'mm', 'um', 'nm'}
+        Unit of `y`.
+    voltage_limits : tuple of float, optional
+        Smallest and largest voltage [V] that may occur.
+    sample_rate : float, optional
+        Rate that the file names [Hz]; the stamps must agree with it.
+    faults : iterable of Fault
+        Already met by the caller.
+    overall : Overall, optional
+        Where the columns are a part of a record: takes note of what the whole will be judged by,
+        voltage limits included, and nothing of that is judged here.
+
+    Returns
+    -------
+    Record
+        Its pieces carry SI units; its faults say what was met and done.
+
+    Raises
+    ------
+    DataError
+        For data that cannot be used without a guess.
+    """
+    met = list(faults)
+    table = _table(t, v, y, segments, channels or {}, name)
+    if displacement_unit not in UNITS:
+        raise DataError(
+            f'{name}: unknown displacement unit {displacement_unit!r}; use m, mm, um or nm'
+        )
+    judged = Overall(voltage_limits) if overall is None else overall
+    table = _drop_not_finite(table, judged, met)
+    if overall is None:
+        judged.check_finite(name)
+    if not table.t.size:
+        raise DataError(f'{name}: no sample has all its numbers; record again')
+    table, epochs = in_order(table, name, met)
+    if UNITS[displacement_unit] != 1.0:
+        scaled = table.columns['y'] / UNITS[displacement_unit]
+        table = replace(table, columns={**table.columns, 'y': scaled})
+    judged.see(table.t, table.columns['v'], table.columns['y'])
+    if overall is None:
+        judged.check_ranges(name, displacement_unit)
+    pieces = _pieces(table, epochs, name, sample_rate, met)
+    return Record(pieces, name, tuple(met))
+
+
+def _table(
+    t: ArrayLike,
+    v: ArrayLike,
+    y: ArrayLike,
+    segments: SegmentStarts | None,
+    channels: Mapping[str, ArrayLike],
+    name: str,
+) -> Rows:
+    columns = {}
+    for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
+        try:
+            columns[key] = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise DataError(f'{name}: column {key!r} holds something else than numbers') from None
+    shapes = {k: x.shape for k, x in columns.items()}
+    if len(set(shapes.values())) > 1 or columns['t'].ndim != 1:
+        lengths = ', '.join(f'{k} {"x".join(map(str, s))}' for k, s in shapes.items())
+        raise DataError(f'{name}: columns differ in length ({lengths}); give one value a sample')
+    n = columns['t'].size
+    if n == 0:
+        raise DataError(f'{name}: no samples; record some')
+    if n == 1:
+        raise DataError(f'{name}: one sample only; a record needs at least two')
+    names, starts = segments if segments is not None else ((), ())
+    try:
+        rows = np.asarray(starts if len(names) else (), dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise DataError(f'{name}: segment starts must be sample indices') from None
+    if (
+        rows.size != len(names)
+        or not np.all((rows >= 0) & (rows <= n) & (rows == np.floor(rows)))
+        or np.any(np.diff(rows) < 0)
+    ):
+        raise DataError(
+            f'{name}: segments need one start for each name, rising sample indices from 0 to {n}'
+        )
+    empty = np.zeros(0, dtype=np.int64)
+    return Rows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
+
+
+def _drop_not_finite(table: Rows, judged: Overall, met: list[Fault]) -> Rows:
+    finite = np.isfinite(table.t)
+    for x in table.columns.values():
+        finite &= np.isfinite(x)
+    bad = finite.size - int(np.count_nonzero(finite))
+    judged.rows += finite.size
+    judged.bad += bad
+    if not bad:
+        return table
+    rows = np.flatnonzero(finite)
+    where = at_times(table.t[~finite][np.isfinite(table.t[~finite])])
+    met.append(Fault('not_finite', where, bad, 'cut out, record split there'))
+    torn = np.flatnonzero(np.diff(rows) > 1) + 1
+    return replace(table.take(rows), torn=torn)
+
+
+def _pieces(
+    table: Rows, epochs: list[int], name: str, sample_rate: float | None, met: list[Fault]
+) -> tuple[Piece, ...]:
+    t = table.t
+    resolution = Resolution.of(t)
+    parts: list[tuple[int, int]] = []
+    for begin, end in zip(epochs, [*epochs[1:], t.size], strict=True):
+        # uniform across a lost sample or not, the record is cut there
+        torn = table.torn[(table.torn > begin) & (table.torn < end)]
+        starts = [begin + start for start, _ in split_uniform(t[begin:end], resolution)]
+        marks = np.union1d(starts, torn).astype(np.int64)
+        parts.extend(itertools.pairwise([*marks.tolist(), end]))
+    if len(parts) > MANY and t.size < MANY * len(parts):
+        raise DataError(
+            f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); '
+            'write t with more decimals, or resample on a uniform grid'
+        )
+    if len(parts) > PIECES:
+        raise DataError(
+            f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
+        )
+    short = [p for p in parts if p[1] - p[0] < MIN_PIECE]
+    parts = [p for p in parts if p[1] - p[0] >= MIN_PIECE]
+    if not parts:
+        raise DataError(f'{name}: no two samples belong together; check the time column')
+    if short:
+        met.append(Fault('lone_sample', at_times(t[[p[0] for p in short]]), len(short), 'dropped'))
+    clocks = _clocks(t, parts, resolution, name, sample_rate, met)
+    _report_breaks(table, epochs, parts, clocks, met)
+    return tuple(_piece(table, p, c) for p, c in zip(parts, clocks, strict=True))
+
+
+def _clocks(
+    t: NDArray[np.float64],
+    parts: list[tuple[int, int]],
+    resolution: Resolution,
+    name: str,
+    sample_rate: float | None,
+    met: list[Fault],
+) -> list[Clock]:
+    known: dict[float, None] = {} if sample_rate is None else {sample_rate: None}
+    clocks: dict[tuple[int, int], Clock] = {}
+    for part in sorted(parts, key=lambda p: p[0] - p[1]):
+        clocks[part] = clock = fit_clock(t[slice(*part)], resolution, known)
+        known[clock.sample_rate] = None
+        if clock.sample_rate > MAX_RATE:
+            raise DataError(f'{name}: t says {clock.sample_rate:.3g} Hz; write t in seconds')
+        if clock.jitter > 0.5:
+            raise DataError(
+                f'{name}: time stamps from {t[part[0]]:.6g} s stray {clock.jitter:.2g} samples '
+                'from a uniform grid; resample on a uniform grid'
+            )
+    jitter = [c.jitter for c in clocks.values() if c.jitter > 0.01]
+    if jitter:
+        where = f'up to {max(jitter):.2g} samples'
+        met.append(Fault('timing_jitter', where, len(jitter), 'read as uniformly sampled'))
+    rates = {c.sample_rate for c in clocks.values()}
+    if sample_rate is not None and sample_rate not in rates:
+        where = f'named {sample_rate:g} Hz, stamps say {max(rates):g} Hz'
+        met.append(Fault('sample_rate', where, 1, 'the stamps are believed'))
+    return [clocks[p] for p in parts]
+
+
+def _report_breaks(
+    table: Rows,
+    epochs: list[int],
+    parts: list[tuple[int, int]],
+    clocks: list[Clock],
+    met: list[Fault],
+) -> None:
+    gaps, lost, changes = [], 0.0, []
+    known = {*epochs, *table.torn.tolist()}
+    for i in range(1, len(parts)):
+        end, start = parts[i - 1][1] - 1, parts[i][0]
+        old, new = clocks[i - 1], clocks[i]
+        if not known.isdisjoint(range(end + 1, start + 1)):
+            continue  # reported as what it is
+        step = table.t[start] - table.t[end]
+        if old.sample_rate != new.sample_rate:
+            changes.append(float(table.t[start]))
+        if old.sample_rate == new.sample_rate or step > 1.5 * max(
+            1 / old.sample_rate, 1 / new.sample_rate
+        ):
+            gaps.append(float(table.t[end]))
+            lost += float(step) - 1 / old.sample_rate
+    if gaps:
+        where = f'{at_times(np.array(gaps))}, {lost:.3g} s in all'
+        met.append(Fault('gap', where, len(gaps), 'record split there'))
+    if changes:
+        rates = ', '.join(f'{r:g}' for r in dict.fromkeys(c.sample_rate for c in clocks))
+        where = f'{at_times(np.array(changes))}, between {rates} Hz'
+        met.append(Fault('rate_change', where, len(changes), 'record split there'))
+
+
+def _piece(table: Rows, part: tuple[int, int], clock: Clock) -> Piece:
+    start, stop = part
+    columns = {k: x[start:stop] for k, x in table.columns.items()}
+    starts = table.starts
+    segments: list[Segment] = []
+    low = max(int(np.searchsorted(starts, start, 'right')) - 1, 0)
+    for i in range(low, int(np.searchsorted(starts, stop))):
+        end = int(starts[i + 1]) if i + 1 < starts.size else stop
+        a, b = max(int(starts[i]), start) - start, min(end, stop) - start
+        label = table.names[i]
+        if a >= b or not label:
+            continue
+        if segments and segments[-1].label == label and segments[-1].stop == a:
+            a = segments.pop().start
+        segments.append(Segment(label, a, b))
+    v, y = columns.pop('v'), columns.pop('y')
+    return Piece(v, y, clock.sample_rate, clock.start_time, tuple(segments), columns)

@@ -1,0 +1,169 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Samples as they travel: blocks of (t, value) rows in a Float64MultiArray, and nothing of ROS.
+
+A block is an N x 2 matrix, row by row::
+
+    dim[0] = {label 'sample:<segment>', size N, stride 2N}
+    dim[1] = {label 't,<quantity>',     size 2, stride 2}
+
+so that a block explains itself: when its samples were taken, what they are, to which segment
+they belong.  The quantity is ``voltage``, ``displacement``, or ``x_<name>`` for a further channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.record import Segment
+
+__all__ = [
+    'BLOCK_SIZE',
+    'Dimension',
+    'DimensionLike',
+    'Samples',
+    'cut_blocks',
+    'decode',
+    'encode',
+    'quantity_of',
+]
+
+#: samples in a block unless told otherwise
+BLOCK_SIZE = 100
+
+
+class Dimension(NamedTuple):
+    """One dimension of a multi-array's layout."""
+
+    label: str
+    size: int
+    stride: int
+
+
+class DimensionLike(Protocol):
+    """What a `Dimension` and a std_msgs/MultiArrayDimension have in common."""
+
+    @property
+    def label(self) -> str:
+        """Name of the dimension."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        ...
+
+    @property
+    def stride(self) -> int:
+        """Numbers in one entry and all that is nested in it, times `size`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """
+    A block of samples of one quantity.
+
+    Attributes
+    ----------
+    t, values : ndarray, shape (n,)
+        Time [s] and value [SI].
+    segment : str
+        Label of the segment; empty for none.
+    quantity : str
+        What the values are.
+    """
+
+    t: NDArray[np.float64]
+    values: NDArray[np.float64]
+    segment: str = ''
+    quantity: str = 'voltage'
+
+
+def encode(samples: Samples) -> tuple[NDArray[np.float64], tuple[Dimension, Dimension]]:
+    """
+    Return the data vector and the layout of a block.
+
+    >>> data, dims = encode(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0]), 'noise'))
+    >>> data.tolist(), dims[0]
+    ([0.0, 5.0, 0.1, 6.0], Dimension(label='sample:noise', size=2, stride=4))
+    """
+    n = samples.t.size
+    data = np.empty(2 * n)
+    data[0::2] = samples.t
+    data[1::2] = samples.values
+    return data, (
+        Dimension(f'sample:{samples.segment}', n, 2 * n),
+        Dimension(f't,{samples.quantity}', 2, 2),
+    )
+
+
+def quantity_of(dims: Sequence[DimensionLike]) -> str | None:
+    """Return what a layout says it carries, or None for a layout that is none of ours."""
+    if len(dims) != 2 or not dims[1].label.startswith('t,'):
+        return None
+    return dims[1].label[2:].strip()
+
+
+def decode(data: ArrayLike, dims: Sequence[DimensionLike], data_offset: int = 0) -> Samples:
+    """
+    Return the samples of a block.
+
+    Parameters
+    ----------
+    data : array_like, shape (2 n,)
+        The message's numbers; not copied.
+    dims : sequence of DimensionLike
+        The message's layout.
+    data_offset : int
+        Numbers in front of the matrix.
+
+    Raises
+    ------
+    DataError
+        When the layout is not that of a block, or does not fit the data.
+    """
+    flat = np.asarray(data, dtype=np.float64)
+    quantity = quantity_of(dims)
+    if quantity is None:
+        labels = [d.label for d in dims]
+        raise DataError(f"layout {labels} is not ['sample:<segment>', 't,<quantity>']")
+    n, width = dims[0].size, dims[1].size
+    if n < 0 or width != 2 or dims[1].stride != 2 or dims[0].stride != 2 * n:
+        raise DataError(
+            f'layout {n} x {width} with strides {dims[0].stride}, {dims[1].stride} is not N x 2 '
+            'with strides 2N, 2'
+        )
+    if flat.size - data_offset != 2 * n or data_offset < 0:
+        raise DataError(
+            f'layout announces {n} x 2 numbers after {data_offset}, the message holds {flat.size}'
+        )
+    kind, _, segment = dims[0].label.partition(':')
+    if kind != 'sample':
+        raise DataError(f"first dimension is {dims[0].label!r}, not 'sample:<segment>'")
+    matrix = flat[data_offset:].reshape(n, 2)
+    return Samples(matrix[:, 0], matrix[:, 1], segment, quantity)
+
+
+def cut_blocks(
+    n: int, segments: Sequence[Segment], size: int = BLOCK_SIZE
+) -> Iterator[tuple[int, int, str]]:
+    """
+    Yield (start, stop, label) of blocks that cover `n` samples, none across two segments.
+
+    >>> list(cut_blocks(7, [Segment('step', 2, 7)], size=4))
+    [(0, 2, ''), (2, 6, 'step'), (6, 7, 'step')]
+    """
+    end = 0
+    for s in (*segments, Segment('', n, n)):
+        for label, start, stop in (('', end, s.start), (s.label, s.start, s.stop)):
+            for i in range(start, stop, size):
+                yield i, min(i + size, stop), label
+        end = s.stop

@@ -1,0 +1,473 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""
+Blocks as they come to a record: bounded, checked, and by the same path as a bag of these blocks.
+
+What is wrong is met where it is met for a bag, in `piezo_ident.record.join` and
+`piezo_ident.record.assemble`.
+Beside them a capture knows what no bag tells: which blocks could not be read, and what was
+forgotten to make room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.assemble import assemble
+from piezo_ident.record.blocks import Samples
+from piezo_ident.record.join import join
+from piezo_ident.record.ordering import at_times
+from piezo_ident.record.overall import Overall
+from piezo_ident.record.record import Fault, Record
+from piezo_ident.record.stream import Stream
+
+__all__ = [
+    'APPLIED',
+    'SPARSE',
+    'Capture',
+    'Snapshot',
+    'record_of_streams',
+    'refuse_incomplete',
+    'tolerance_of',
+]
+
+#: key of what the amplifier got, which carries the quantity voltage
+APPLIED = 'applied_voltage'
+#: commanded and applied voltage may differ by this share of the range
+TOLERANCE = 1e-3
+#: fault of a further channel of a lower rate, or that ended early
+SPARSE = 'sparse_channel'
+#: most of a segment by time, or of a further channel, that may be missing before it is not used
+MAX_MISSING = 0.05
+#: segments that the three steps stand on
+NEEDED = ('step', 'noise', 'triangle')
+#: time that jumps back by more samples than this is a restart, not a late block
+JUMP_BACK = 1000
+#: samples and blocks of a topic that are kept, and labels that are counted, whatever the times say
+MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
+
+
+def record_of_streams(
+    streams: Mapping[str, Stream],
+    *,
+    name: str,
+    tolerance: float | None = None,
+    displacement_unit: str = 'm',
+    voltage_limits: tuple[float, float] | None = None,
+    sample_rate: float | None = None,
+    faults: Iterable[Fault] = (),
+    overall: Overall | None = None,
+) -> Record:
+    """
+    Make a record of streams of blocks.
+
+    Parameters
+    ----------
+    streams : mapping of str to Stream
+        Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
+        command and applied voltage differ, the amplifier's guard was at work: the stage did not
+        get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
+        `MAX_MISSING` of the samples is left out.
+    name : str
+        What errors call the data, and the record's name.
+    tolerance : float, optional
+        Difference of command and applied voltage that counts as none [V]; a thousandth of the
+        range when absent.
+    displacement_unit, voltage_limits, sample_rate, faults, overall
+        As for `piezo_ident.record.assemble.assemble`.
+
+    Raises
+    ------
+    DataError
+        For data that cannot be used without a guess.
+    """
+    sparse = _sparse(streams)
+    needed = {key: s for key, s in streams.items() if key != APPLIED and key not in sparse}
+    try:
+        joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
+    except DataError as error:
+        raise DataError(f'{name}: {error}') from None
+    met, t, columns, segments = (
+        [*faults, *sparse.values(), *joined.faults],
+        joined.t,
+        joined.columns,
+        joined.segments,
+    )
+    if APPLIED in columns and np.array_equal(columns['voltage'], columns[APPLIED]):
+        del columns[APPLIED]
+    if overall is not None:
+        overall.see_command(columns['voltage'], APPLIED in columns)
+    if APPLIED in columns:
+        v, applied = columns['voltage'], columns.pop(APPLIED)
+        wrong = _guarded(v, applied, tolerance)
+        unknown = int(np.count_nonzero(np.isnan(applied)))
+        if unknown:
+            where = at_times(t[np.isnan(applied)][:1])
+            met.append(Fault('applied_unknown', where, unknown, 'taken as commanded'))
+        if wrong.any():
+            if wrong.all():
+                raise DataError(
+                    f'{name}: the applied voltage is nowhere the commanded one; look at the '
+                    "guards of the amplifier's driver"
+                )
+            worst = float(np.abs(v - applied)[wrong].max())
+            where = f'{at_times(t[_begins(wrong)])}, by up to {worst:.3g} V'
+            count = int(np.count_nonzero(wrong))
+            met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
+            keep = np.flatnonzero(~wrong)
+            names, starts = segments
+            t, columns = t[keep], {key: x[keep] for key, x in columns.items()}
+            segments = (names, np.searchsorted(keep, starts).tolist())
+    return assemble(
+        t,
+        columns.pop('voltage'),
+        columns.pop('displacement'),
+        segments,
+        {key[2:]: x for key, x in columns.items()},
+        name=name,
+        displacement_unit=displacement_unit,
+        voltage_limits=voltage_limits,
+        sample_rate=sample_rate,
+        faults=met,
+        overall=overall,
+    )
+
+
+def _sparse(streams: Mapping[str, Stream]) -> dict[str, Fault]:
+    """Return the further channels for whose sake too many other samples would be cut out."""
+    n = min(streams['voltage'].n, streams['displacement'].n)
+    return {
+        key: Fault(SPARSE, f'{key}, {stream.n} samples beside {n}', n - stream.n, 'left out')
+        for key, stream in streams.items()
+        if key.startswith('x_') and stream.n < (1.0 - MAX_MISSING) * n
+    }
+
+
+def tolerance_of(v: NDArray[np.float64]) -> float:
+    """Return the difference of command and applied voltage that counts as none [V]."""
+    finite = v[np.isfinite(v)]
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    return TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
+
+
+def _guarded(
+    v: NDArray[np.float64], applied: NDArray[np.float64], tolerance: float | None
+) -> NDArray[np.bool_]:
+    """Tell where another voltage was applied than commanded."""
+    if tolerance is None:
+        tolerance = tolerance_of(v)
+    return np.asarray(np.abs(v - applied) > tolerance)  # False where either is NaN
+
+
+def _begins(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))
+
+
+def refuse_incomplete(
+    record: Record, sent: Mapping[str, float] | None = None, most: float = MAX_MISSING
+) -> None:
+    """
+    Refuse a record that lost too much of what the three steps stand on.
+
+    Time that is missing between two pieces is charged to the segments on both of its sides.
+
+    Parameters
+    ----------
+    record : Record
+    sent : mapping of str to float, optional
+        Time [s] of each kind of segment in the voltage: also what is missing at either end of
+        the record is then seen.
+    most : float, optional
+        Share of the segments of a kind that may be missing.
+
+    Raises
+    ------
+    DataError
+    """
+    present = {kind: sum(p.duration for p in record.find(kind)) for kind in NEEDED}
+    missing = dict.fromkeys(NEEDED, 0.0)
+    for one, other in itertools.pairwise(record.pieces):
+        gap = other.start_time - (one.start_time + one.duration)
+        if gap <= 0.0:
+            continue  # another run
+        sides = [s[i].kind for s, i in ((one.segments, -1), (other.segments, 0)) if s]
+        for kind in set(sides) & set(NEEDED):
+            missing[kind] += gap
+    for kind in NEEDED:
+        missing[kind] = max(missing[kind], (sent or {}).get(kind, 0.0) - present[kind])
+        whole = present[kind] + missing[kind]
+        if missing[kind] > most * whole:
+            raise DataError(
+                f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
+                'are missing or not usable; find what loses samples, and run the programme again'
+            )
+
+
+@dataclass
+class _Watch:
+    """Where the sample clock of one topic stands, and what happened to it."""
+
+    last: float = float('nan')
+    begin: float = float('nan')
+    period: float = float('nan')
+    lost: int = 0
+    late: int = 0
+    restarts: int = 0
+    seconds: list[float] = field(default_factory=list)  # of each block that is kept
+    runs: list[int] = field(default_factory=list)  # blocks at which the clock restarted
+    total: float = 0.0
+    samples: int = 0  # since the last time that room was made
+    dropped: int = 0  # blocks that are no longer kept
+
+    def add(self, t: NDArray[np.float64]) -> None:
+        """Take note of a block."""
+        n = t.size
+        first, last = (float(t[0]), float(t[-1])) if n else (self.last, self.last)
+        if n > 1 and 0.0 < last - first < np.inf:
+            self.period = (last - first) / (n - 1)
+        seconds = n * self.period if np.isfinite(self.period) else 0.0
+        step = first - self.last
+        if not np.isfinite(first):
+            # where it lies nobody knows; the record will say so
+            pass
+        elif np.isnan(self.begin):
+            self.begin = first
+        elif step > 1.5 * self.period:
+            self.lost += round(step / self.period) - 1
+        elif step <= 0.0:
+            if first <= self.begin or -step > JUMP_BACK * self.period:
+                self.restarts += 1
+                self.runs.append(len(self.seconds))
+                self.begin = first
+            else:
+                self.late += n
+        if np.isfinite(last):
+            self.last = last
+        self.seconds.append(seconds)
+        self.total += seconds
+        self.samples += n
+
+    def drop(self, blocks: int) -> None:
+        """Forget the oldest blocks."""
+        self.total -= sum(self.seconds[:blocks])
+        self.dropped += blocks
+        del self.seconds[:blocks]
+        self.runs = [i - blocks for i in self.runs if i > blocks]
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A capture as it was at one moment; making a record of it can wait for a quiet hour."""
+
+    streams: Mapping[str, Stream]
+    faults: tuple[Fault, ...] = ()
+    tolerance: float | None = None
+
+    def record(self, name: str = 'capture') -> Record:
+        """
+        Return the record.
+
+        Raises
+        ------
+        DataError
+            For data that cannot be used without a guess; also when there are none.
+        """
+        for key, cure in (
+            ('voltage', 'start the excitation, or replay a bag'),
+            ('displacement', 'is the stage running, and does it publish on this topic?'),
+        ):
+            if key not in self.streams or not self.streams[key].n:
+                raise DataError(f'{name}: no {key} has been captured; {cure}')
+        order = ('voltage', 'displacement', *sorted(self.streams))
+        streams = {key: self.streams[key] for key in dict.fromkeys(order)}
+        if not streams.get(APPLIED, streams['voltage']).n:
+            del streams[APPLIED]
+        return record_of_streams(streams, name=name, tolerance=self.tolerance, faults=self.faults)
+
+    def sent(self) -> dict[str, float]:
+        """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
+        stream = self.streams['voltage']
+        t = stream.times
+        names, starts = stream.labels()
+        times: dict[str, list[NDArray[np.float64]]] = {}
+        for name, start, stop in zip(names, starts, [*starts[1:], t.size], strict=True):
+            times.setdefault(name.partition(':')[0], []).append(t[start:stop])
+        step = np.diff(t)
+        period = float(np.median(step[step > 0.0])) if np.any(step > 0.0) else 0.0
+        return {kind: period * np.unique(np.concatenate(x)).size for kind, x in times.items()}
+
+
+class Capture:
+    """
+    All blocks of all topics so far.
+
+    Parameters
+    ----------
+    limit : float, optional
+        Longest measured time that is kept [s].  Beyond it the oldest whole run of the sample
+        clock is forgotten, or the oldest tenth where there is only one.
+    tolerance : float, optional
+        As for `record_of_streams`.
+    """
+
+    def __init__(self, limit: float = 600.0, tolerance: float | None = None) -> None:
+        self.limit = limit
+        self.tolerance = tolerance
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._streams: dict[str, Stream] = {}
+        self._watches: dict[str, _Watch] = {}
+        self._segments: dict[str, int] = {}
+        self._unreadable: dict[str, tuple[int, str]] = {}
+        self._forgotten = 0.0
+        self.segment = ''
+
+    def add(self, key: str, samples: Samples, arrival: int) -> None:
+        """
+        Take a block.
+
+        Parameters
+        ----------
+        key : str
+            ``voltage``, ``displacement``, ``applied_voltage`` or ``x_<name>``.
+        samples : Samples
+        arrival : int
+            When it came [ns], by a clock that all topics share.
+        """
+        self._streams.setdefault(key, Stream()).append(samples, arrival)
+        watch = self._watches.setdefault(key, _Watch())
+        watch.add(samples.t)
+        if key == 'voltage':
+            self.segment = samples.segment
+            label = samples.segment or 'unlabelled'
+            if len(self._segments) >= MOST_LABELS and label not in self._segments:
+                label = 'others'
+            self._segments[label] = self._segments.get(label, 0) + samples.t.size
+        if (
+            watch.total > self.limit
+            or watch.samples > MOST_SAMPLES
+            or len(watch.seconds) > MOST_BLOCKS
+        ):
+            self._make_room(key)
+
+    def unreadable(self, key: str, reason: str) -> None:
+        """Take note of a message that is no block."""
+        self._unreadable[key] = (self._unreadable.get(key, (0, ''))[0] + 1, reason)
+
+    def _make_room(self, key: str) -> None:
+        watch = self._watches[key]
+        blocks = next(iter(watch.runs), 0)
+        if not blocks and watch.total <= self.limit:
+            blocks = max(1, len(watch.seconds) // 10)
+        elif not blocks:
+            room = 0.0
+            while room < 0.1 * self.limit and blocks < len(watch.seconds) - 1:
+                room += watch.seconds[blocks]
+                blocks += 1
+        before = watch.total
+        watch.drop(blocks)
+        self._streams[key].drop(blocks)
+        watch.samples = self._streams[key].n
+        if key == 'voltage':
+            self._forgotten += before - watch.total
+
+    def mark(self) -> dict[str, int]:
+        """Return what tells later what was captured after now; not across `clear`."""
+        return {key: watch.dropped + len(watch.seconds) for key, watch in self._watches.items()}
+
+    def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
+        """Return the measured time of a topic after a mark that is kept [s]."""
+        if key not in self._watches:
+            return 0.0
+        watch = self._watches[key]
+        return sum(watch.seconds[max(0, mark.get(key, 0) - watch.dropped) :])
+
+    def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
+        """
+        Return all that was captured up to now, at little cost.
+
+        Parameters
+        ----------
+        since : mapping of str to int, optional
+            Only what came after this mark; see `mark`.
+        """
+        faults = [
+            Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
+            for key, (count, reason) in self._unreadable.items()
+        ]
+        if self._forgotten:
+            where = f'the oldest {self._forgotten:.3g} s'
+            action = f'forgotten, {self.limit:g} s are kept'
+            faults.append(Fault('capture_limit', where, 1, action))
+        streams = {key: stream.copy() for key, stream in self._streams.items()}
+        for key, stream in streams.items():
+            stream.drop(max(0, (since or {}).get(key, 0) - self._watches[key].dropped))
+        return Snapshot(streams, tuple(faults), self.tolerance)
+
+    def record(self, name: str = 'capture') -> Record:
+        """Return what was captured as a record; see `Snapshot.record`."""
+        return self.snapshot().record(name)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """What was captured, in order of appearance."""
+        return tuple(self._streams)
+
+    @property
+    def n(self) -> int:
+        """Samples of the voltage."""
+        return self.count('voltage')
+
+    def count(self, key: str) -> int:
+        """Return the samples of a topic that are kept."""
+        return self._streams[key].n if key in self._streams else 0
+
+    def last_time(self, key: str) -> float:
+        """Return the time of the newest sample of a topic [s]; NaN before the first."""
+        return self._watches[key].last if key in self._watches else float('nan')
+
+    def seconds_of(self, key: str) -> float:
+        """Return the measured time of a topic that is kept [s]."""
+        return self._watches[key].total if key in self._watches else 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Measured time of the voltage that is kept [s]."""
+        return self.seconds_of('voltage')
+
+    @property
+    def segments(self) -> Mapping[str, int]:
+        """Samples of each label so far, in order of appearance."""
+        return dict(self._segments)
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Samples that never came, by topic, as its sample clock tells."""
+        return {key: watch.lost for key, watch in self._watches.items()}
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """Samples that came again or out of turn, by topic."""
+        return {key: watch.late for key, watch in self._watches.items()}
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong with the capture so far, one sentence a topic."""
+        said = []
+        for key, watch in self._watches.items():
+            if watch.lost:
+                said.append(f'{watch.lost} samples of {key} are missing')
+            if watch.late:
+                said.append(f'{watch.late} samples of {key} came twice or out of turn')
+        for key, (count, reason) in self._unreadable.items():
+            said.append(f'{count} messages on {key} are no blocks ({reason})')
+        return tuple(said)

@@ -1,0 +1,139 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Short gaps in a record, bridged for fitting.
+
+Reading splits a record wherever samples are missing.  A stage does not forget there: over a short
+gap its voltage moved on from where it was to where it is next, and its plays with it.  So pieces
+of one clock are joined by straight lines, and what was not measured, with the moment after it, is
+kept from every fit and every error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record.long_record import Outline
+from piezo_ident.record.record import Piece, Record, Segment
+
+__all__ = ['LONGEST', 'Bridged', 'bridged', 'follows']
+
+#: longest gap that is bridged [s]
+LONGEST = 1.0
+#: time after a gap in which the dynamics may still answer to what was not measured [s]
+SETTLING = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Bridged:
+    """
+    A piece with its gaps filled.
+
+    Attributes
+    ----------
+    piece : Piece
+    sound : ndarray of bool, shape (n,)
+        Samples that were measured, and at which a gap before them has died away.
+    gaps, filled : int
+        Number of gaps, and of samples in them.
+    """
+
+    piece: Piece
+    sound: NDArray[np.bool_]
+    gaps: int = 0
+    filled: int = 0
+
+
+def follows(one: Piece | Outline, other: Piece | Outline) -> int | None:
+    """Return how many samples are missing between two pieces, None where they do not connect."""
+    if abs(other.sample_rate / one.sample_rate - 1.0) > 1e-6:
+        return None
+    elapsed = (other.start_time - one.start_time) * one.sample_rate
+    missing = round(elapsed) - one.n
+    # ticks of one clock, however it was rounded in the file
+    if abs(elapsed - round(elapsed)) > 0.1 or not 0 <= missing <= LONGEST * one.sample_rate:
+        return None
+    return missing
+
+
+def bridged(record: Record) -> list[Bridged]:
+    """
+    Join the pieces of a record over short gaps.
+
+    Parameters
+    ----------
+    record : Record
+
+    Returns
+    -------
+    list of Bridged
+    """
+    groups: list[list[Piece]] = []
+    for piece in record:
+        connects = groups and follows(groups[-1][-1], piece) is not None
+        if connects and set(groups[-1][-1].channels) == set(piece.channels):
+            groups[-1].append(piece)
+        else:
+            groups.append([piece])
+    return [_joined(group) for group in groups]
+
+
+def _joined(pieces: list[Piece]) -> Bridged:
+    first = pieces[0]
+    if len(pieces) == 1:
+        return Bridged(first, np.ones(first.n, dtype=bool))
+    starts = [0]
+    for one, other in itertools.pairwise(pieces):
+        starts.append(starts[-1] + one.n + (follows(one, other) or 0))
+    n = starts[-1] + pieces[-1].n
+    measured = np.zeros(n, dtype=bool)
+    for start, piece in zip(starts, pieces, strict=True):
+        measured[start : start + piece.n] = True
+
+    def fill(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        whole = np.empty(n)
+        for start, part in zip(starts, parts, strict=True):
+            whole[start : start + part.size] = part
+        for (start, part), (stop, after) in itertools.pairwise(zip(starts, parts, strict=True)):
+            end = start + part.size
+            slope = (after[0] - part[-1]) / (stop - end + 1)
+            whole[end:stop] = slope * np.arange(1, stop - end + 1) + part[-1]
+        return whole
+
+    sound = measured.copy()
+    settle = max(1, round(SETTLING * first.sample_rate))
+    for start in starts[1:]:
+        sound[start : start + settle] = False
+    return Bridged(
+        piece=Piece(
+            v=fill([p.v for p in pieces]),
+            y=fill([p.y for p in pieces]),
+            sample_rate=first.sample_rate,
+            start_time=first.start_time,
+            segments=_segments(pieces, starts),
+            channels={k: fill([p.channels[k] for p in pieces]) for k in first.channels},
+        ),
+        sound=sound,
+        gaps=len(pieces) - 1,
+        filled=int(n - measured.sum()),
+    )
+
+
+def _segments(pieces: list[Piece], starts: list[int]) -> tuple[Segment, ...]:
+    """Return the segments on the joined clock; one that goes on behind a gap stays one."""
+    found: list[Segment] = []
+    end = 0
+    for piece, start in zip(pieces, starts, strict=True):
+        for s in piece.segments:
+            moved = Segment(s.label, s.start + start, s.stop + start)
+            goes_on = s.start == 0 and found and found[-1].stop == end and start > 0
+            if goes_on and found[-1].label == s.label:
+                found[-1] = Segment(s.label, found[-1].start, moved.stop)
+            else:
+                found.append(moved)
+        end = start + piece.n
+    return tuple(found)

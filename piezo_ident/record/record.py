@@ -1,0 +1,242 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What was measured: voltage, displacement, time and named segments.
+
+A record is a list of uniformly sampled pieces.  Wherever time jumps, the rate changes or a
+sample is unusable, a new piece begins, because the stage's memory at its start is unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.errors import DataError
+
+__all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment']
+
+#: the segment kinds that the programmes use; other labels are kept and treated as unlabelled
+KINDS = (
+    'step',
+    'settle',
+    'noise',
+    'triangle',
+    'sine',
+    'hold',
+    'staircase',
+    'multisine',
+    'ramp',
+    'idle',
+)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A named stretch of a piece: samples ``start`` to ``stop - 1``."""
+
+    label: str
+    start: int
+    stop: int
+
+    @property
+    def kind(self) -> str:
+        """The part of the label before the colon: ``sine`` of ``sine:50Hz``."""
+        return self.label.partition(':')[0]
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.stop - self.start
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong with the data, and what was done about it."""
+
+    name: str
+    where: str
+    count: int
+    action: str
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        return f'{self.name} ({self.count}) {self.where}: {self.action}'
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """
+    Uniformly sampled voltage and displacement.
+
+    Parameters
+    ----------
+    v, y : array_like, shape (n,)
+        Command voltage [V] and displacement [m].
+    sample_rate : float
+        Samples a second [Hz].
+    start_time : float
+        Time of the first sample [s].
+    segments : tuple of Segment
+        In order and without overlap; empty for unlabelled data.
+    channels : mapping of str to array_like, shape (n,)
+        Further measured signals, for example temperature or another axis's voltage.
+
+    Raises
+    ------
+    DataError
+        When lengths differ, the piece is empty, or the rate is not positive.
+    """
+
+    v: NDArray[np.float64]
+    y: NDArray[np.float64]
+    sample_rate: float
+    start_time: float = 0.0
+    segments: tuple[Segment, ...] = ()
+    channels: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        v, y = frozen_array(self.v), frozen_array(self.y)
+        channels = {name: frozen_array(x) for name, x in self.channels.items()}
+        if v.ndim != 1 or v.size == 0:
+            raise DataError('a piece needs at least one sample of voltage and displacement')
+        lengths = {'v': v.size, 'y': y.size, **{k: x.size for k, x in channels.items()}}
+        if len(set(lengths.values())) > 1:
+            raise DataError(f'channels differ in length: {lengths}; give one value a sample')
+        if not (np.isfinite(self.sample_rate) and self.sample_rate > 0):
+            raise DataError(f'sample rate must be positive, got {self.sample_rate} Hz')
+        end = 0
+        for s in self.segments:
+            if s.start < end or s.stop <= s.start or s.stop > v.size:
+                raise DataError(
+                    f'segment {s.label!r} ({s.start}..{s.stop}) is empty, overlaps its '
+                    f'neighbour or leaves the piece of {v.size} samples'
+                )
+            end = s.stop
+        object.__setattr__(self, 'v', v)
+        object.__setattr__(self, 'y', y)
+        object.__setattr__(self, 'channels', MappingProxyType(channels))
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return int(self.v.size)
+
+    @property
+    def dt(self) -> float:
+        """Sample period [s]."""
+        return 1.0 / self.sample_rate
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return self.n / self.sample_rate
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """
+        Time of each sample [s].
+
+        ``k / sample_rate`` in one division where the piece starts on a tick of the sample clock,
+        so that two streams of the same clock join on equal numbers.
+        """
+        return self.time(0, self.n)
+
+    def time(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
+        first = round(self.start_time * self.sample_rate)
+        ticks = np.arange(start, min(stop, self.n), dtype=np.float64)
+        if first / self.sample_rate == self.start_time:
+            return (first + ticks) / self.sample_rate
+        return self.start_time + ticks / self.sample_rate
+
+    def find(self, kind: str) -> list[Segment]:
+        """Return the segments of a kind (``sine``) or with a full label (``sine:50Hz``)."""
+        return [s for s in self.segments if kind in (s.kind, s.label)]
+
+    def cut(self, start: int, stop: int) -> Piece:
+        """
+        Return samples ``start`` to ``stop - 1`` as a piece of its own, segments included.
+
+        Raises
+        ------
+        DataError
+            When the range is empty or leaves the piece.
+        """
+        if not 0 <= start < stop <= self.n:
+            raise DataError(f'cannot cut samples {start}..{stop} out of a piece of {self.n}')
+        segments = tuple(
+            Segment(s.label, max(s.start, start) - start, min(s.stop, stop) - start)
+            for s in self.segments
+            if s.start < stop and s.stop > start
+        )
+        return Piece(
+            v=self.v[start:stop],
+            y=self.y[start:stop],
+            sample_rate=self.sample_rate,
+            start_time=float(self.time(start, start + 1)[0]) if start else self.start_time,
+            segments=segments,
+            channels={k: x[start:stop] for k, x in self.channels.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """
+    One measurement: pieces in order of time, and what was wrong with the data.
+
+    Raises
+    ------
+    DataError
+        When there is no piece.
+    """
+
+    pieces: tuple[Piece, ...]
+    name: str = 'record'
+    faults: tuple[Fault, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.pieces:
+            raise DataError(f'{self.name}: no usable samples')
+
+    def __iter__(self) -> Iterator[Piece]:
+        """Iterate over the pieces."""
+        return iter(self.pieces)
+
+    @property
+    def n(self) -> int:
+        """Number of samples in all pieces."""
+        return sum(p.n for p in self.pieces)
+
+    @property
+    def duration(self) -> float:
+        """Measured time in all pieces [s]."""
+        return sum(p.duration for p in self.pieces)
+
+    @property
+    def stroke(self) -> float:
+        """Largest minus smallest displacement [m]."""
+        return float(max(p.y.max() for p in self) - min(p.y.min() for p in self))
+
+    @property
+    def voltage_range(self) -> tuple[float, float]:
+        """Smallest and largest command voltage [V]."""
+        return float(min(p.v.min() for p in self)), float(max(p.v.max() for p in self))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Segment labels in order of first appearance."""
+        return tuple(dict.fromkeys(s.label for p in self for s in p.segments))
+
+    def find(self, kind: str) -> list[Piece]:
+        """Return every segment of a kind, or of a full label, as a piece of its own."""
+        return [p.cut(s.start, s.stop) for p in self for s in p.find(kind)]
+
+    def renamed(self, name: str) -> Record:
+        """Return the same record under another name."""
+        return replace(self, name=name)

@@ -1,0 +1,101 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The blocks of one topic as they come, in buffers that a copy shares."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record.blocks import Samples
+
+__all__ = ['Stream']
+
+#: numbers in a chunk of a stream
+CHUNK = 1 << 17
+
+
+class Stream:
+    """All blocks of one topic so far, in flat buffers that grow chunk by chunk."""
+
+    def __init__(self) -> None:
+        self._chunks = [array('d')]  # only the last one grows, so that copies share the others
+        self._sizes = array('q')
+        self._arrivals = array('q')
+        self._segments: list[str] = []
+
+    def append(self, samples: Samples, arrival: int) -> None:
+        """Add a block that arrived at a time [ns] of a clock that all streams share."""
+        rows = np.column_stack([samples.t, samples.values])
+        if len(self._chunks[-1]) >= CHUNK:
+            self._chunks.append(array('d'))
+        self._chunks[-1].frombytes(rows.tobytes())
+        self._sizes.append(samples.t.size)
+        self._arrivals.append(arrival)
+        # one string for all blocks of a segment, not one a block
+        last = self._segments[-1] if self._segments else ''
+        self._segments.append(last if last == samples.segment else samples.segment)
+
+    def copy(self) -> Stream:
+        """Return the stream as it is now, without copying what no longer changes."""
+        other = Stream()
+        other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
+        other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
+        other._segments = self._segments[:]
+        return other
+
+    def drop(self, blocks: int) -> None:
+        """Forget the oldest blocks."""
+        left = 2 * sum(self._sizes[:blocks])
+        while left and len(self._chunks) > 1 and left >= len(self._chunks[0]):
+            left -= len(self._chunks.pop(0))
+        self._chunks[0] = self._chunks[0][left:]
+        del self._sizes[:blocks], self._arrivals[:blocks], self._segments[:blocks]
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return sum(len(chunk) for chunk in self._chunks) // 2
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Time of each sample [s], a copy of shape (n,)."""
+        return self._column(0)
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Value of each sample, a copy of shape (n,)."""
+        return self._column(1)
+
+    def _column(self, k: int) -> NDArray[np.float64]:
+        column, at = np.empty(self.n), 0
+        for chunk in self._chunks:
+            part = np.frombuffer(chunk, dtype=np.float64)[k::2]
+            column[at : at + part.size] = part
+            at += part.size
+        return column
+
+    @property
+    def arrivals(self) -> NDArray[np.int64]:
+        """When each sample arrived [ns]."""
+        return np.repeat(np.array(self._arrivals, dtype=np.int64), self._sizes)
+
+    def arrived(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return when some samples arrived [ns]."""
+        ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
+        block = np.searchsorted(ends, rows, 'right')
+        return np.array(self._arrivals, dtype=np.int64)[block]
+
+    def labels(self) -> tuple[list[str], NDArray[np.int64]]:
+        """Return the label of each stretch, and the row where it begins."""
+        names: list[str] = []
+        starts: list[int] = []
+        row = 0
+        for label, size in zip(self._segments, self._sizes, strict=True):
+            if size and not (names and names[-1] == label):
+                names.append(label)
+                starts.append(row)
+            row += size
+        return names, np.array(starts, dtype=np.int64)

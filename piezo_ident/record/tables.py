@@ -1,0 +1,355 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Records in tables: CSV, NumPy's npz and MATLAB's mat, columns by name.
+
+``t``, ``v`` and ``y`` must be there; ``x_<name>`` are further channels.  In CSV the column
+``segment`` labels each row, and comments, lines with ``#``, may stand above the header; npz and
+mat carry ``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment
+begins.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+import csv
+from dataclasses import dataclass, field
+import itertools
+from pathlib import Path
+import re
+from typing import Any, BinaryIO
+import zipfile
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.common.limits import COLUMNS, unpacked
+from piezo_ident.record.assemble import label_runs
+from piezo_ident.record.mat_read import read_variables
+from piezo_ident.record.table_parts import csv_parts
+import scipy.io
+
+__all__ = ['READERS', 'WRITERS', 'Table']
+
+#: rows of a CSV file taken together
+_ROWS = 65536
+_REQUIRED = ('t', 'v', 'y')
+_POINTS = (
+    'these look like decimal commas: save it with decimal points (in a spreadsheet, with the '
+    'number format of English)'
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Raw columns of a file, the segments' names and starts, and the names of unused columns."""
+
+    columns: dict[str, NDArray[np.float64]]
+    names: list[str] = field(default_factory=list)
+    starts: ArrayLike = ()
+    ignored: tuple[str, ...] = ()
+
+
+def _wanted(name: str) -> bool:
+    return name in _REQUIRED or (name.startswith('x_') and len(name) > 2)
+
+
+def _check_names(names: Iterable[str], path: Path) -> None:
+    found = list(names)
+    if sum(map(_wanted, found)) > COLUMNS:
+        raise DataError(f'{path}: more than {COLUMNS} columns; leave out some')
+    twice = sorted(c for c, n in Counter(found).items() if c and n > 1)
+    if twice:
+        raise DataError(
+            f'{path}: column {", ".join(twice)[:200]} stands there twice; keep one of them'
+        )
+    missing = [c for c in _REQUIRED if c not in found]
+    if missing:
+        raise DataError(
+            f'{path}: {", ".join(missing)} missing (found: {", ".join(found)[:200] or "nothing"})'
+            '; name the columns t [s], v [V] and y'
+        )
+
+
+# --- CSV ------------------------------------------------------------------------------------
+
+
+def read_csv(path: Path) -> Table:
+    """Read a CSV file with a header line; comments may stand above it."""
+    try:
+        # newline='' leaves line ends to the csv module; utf-8-sig drops a byte order mark
+        with path.open(encoding='utf-8-sig', newline='') as file:
+            return _parse_csv(csv.reader(_uncommented(file), strict=True), path)
+    except UnicodeDecodeError:
+        raise DataError(f'{path}: no text in UTF-8; save it as CSV in UTF-8') from None
+    except csv.Error as error:
+        raise DataError(f'{path}: no CSV file ({error}); save it as comma-separated CSV') from None
+
+
+def _uncommented(lines: Iterable[str]) -> Iterator[str]:
+    """
+    Yield as many lines as there are, with empty ones for the comments above the header.
+
+    Where numbers follow a comment that names the columns, as numpy.savetxt writes it, that is the
+    header.
+    """
+    rest = iter(lines)
+    comment: str | None = None
+    for line in rest:
+        bare = line.strip()
+        if bare.startswith('#'):
+            if comment is not None:
+                yield '\n'
+            comment = bare.lstrip('#').strip()
+        elif bare:
+            if comment is not None:
+                names = {c.strip() for c in comment.split(',')}
+                is_header = names.issuperset(_REQUIRED) and _is_number(bare.partition(',')[0])
+                yield f'{comment}\n' if is_header else '\n'
+            yield line
+            break
+        else:
+            yield '\n'
+    yield from rest
+
+
+def _parse_csv(reader: Any, path: Path) -> Table:
+    header = _header(reader, path)
+    numeric = {name: i for i, name in enumerate(header) if _wanted(name)}
+    label = header.index('segment') if 'segment' in header else None
+    chunks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in numeric}
+    names: list[str] = []
+    starts: list[int] = []
+    n = 0
+    while True:
+        line = reader.line_num + 1
+        chunk = list(itertools.islice(reader, _ROWS))
+        if not chunk:
+            break
+        try:
+            columns = list(zip(*(r for r in chunk if r), strict=True))
+            if not columns:
+                continue
+            if len(columns) != len(header):
+                raise ValueError
+            for name, i in numeric.items():
+                column = map(float, columns[i])
+                chunks[name].append(np.fromiter(column, np.float64, len(columns[i])))
+        except ValueError:
+            raise _culprit(chunk, line, header, numeric, path) from None
+        if label is not None:
+            new, at = label_runs(map(str.strip, columns[label]))
+            names += new
+            starts += [n + i for i in at]
+        n += len(columns[0])
+    if not n:
+        raise DataError(f'{path}: no rows below the header; record some samples')
+    return Table(
+        {name: np.concatenate(parts) for name, parts in chunks.items()},
+        names,
+        starts,
+        tuple(c for c in header if c and c not in numeric and c != 'segment'),
+    )
+
+
+def _header(reader: Any, path: Path) -> list[str]:
+    header = [c.strip() for c in next((r for r in reader if r), [])]
+    if not header:
+        raise DataError(f'{path}: empty file; write a header line t,v,y and the samples below it')
+    for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if len(header) == 1 and separator in header[0]:
+            raise DataError(f'{path}: separated by {name}; save it with commas and decimal points')
+    if not set(_REQUIRED).intersection(header) and _is_number(header[0]):
+        further = header[len(_REQUIRED) :]
+        # the only text that a row of ours has
+        names = ['segment'] if further and not _is_number(further[0]) else []
+        more = ', with a name for each further column,' if len(further) > len(names) else ''
+        raise DataError(
+            f"{path}: no header line; put '{','.join([*_REQUIRED, *names])}'{more} on top of the "
+            'numbers'
+        )
+    _check_names(header, path)
+    return header
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _culprit(
+    chunk: list[list[str]], line: int, header: list[str], numeric: Mapping[str, int], path: Path
+) -> DataError:
+    """Return the error for the first row of a chunk that cannot be read."""
+    for number, row in enumerate(chunk, start=line):
+        if row and len(row) != len(header):
+            return DataError(
+                f'{path}: line {number} has {len(row)} columns, the header has {len(header)}; '
+                + (_POINTS if _torn_at_commas(row, header) else 'mend or delete the line')
+            )
+        for name, i in numeric.items():
+            if row and not _is_number(row[i]):
+                comma = re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', row[i])
+                return DataError(
+                    f'{path}: line {number}, column {name}: {row[i][:40]!r} is no number; '
+                    + (_POINTS if comma else 'mend or delete the line')
+                )
+    return DataError(f'{path}: unreadable rows from line {line}; save it again')
+
+
+def _torn_at_commas(row: list[str], header: list[str]) -> bool:
+    """Return whether a row looks as if its decimal commas were taken for separators."""
+    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
+    texts = sum(not _wanted(name) for name in header)
+    return len(header) < len(row) <= 2 * len(header) and len(row) - whole <= texts
+
+
+def write_csv(file: BinaryIO, table: Table) -> None:
+    """Write a CSV file whose numbers read back exactly."""
+    with csv_parts(file, tuple(table.columns), table.names, table.starts) as add:
+        add(table.columns)
+
+
+# --- npz ------------------------------------------------------------------------------------
+
+
+def read_npz(path: Path) -> Table:
+    """Read a NumPy archive; pickled objects are refused."""
+    with _damage(path, 'npz archive', 'save it again with numpy.savez'):
+        _check_npz(path)
+        with np.load(path, allow_pickle=False) as archive:
+            return _from_arrays({k: archive[k] for k in archive.files if _used(k)}, archive, path)
+
+
+def _check_npz(path: Path) -> None:
+    """Refuse what only pretends to be arrays, before memory is spent on what it announces."""
+    with zipfile.ZipFile(path) as archive:
+        used = [i for i in archive.infolist() if _used(i.filename.removesuffix('.npy'))]
+        if sum(info.file_size for info in used) > unpacked(path.stat().st_size):
+            raise ValueError('it unpacks to more than a file of its size holds')
+        for info in used:
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                header = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }.get(version)
+                if header is None:
+                    raise ValueError('unknown version of the npy format')
+                shape, _, dtype = header(member)
+                size = dtype.itemsize * int(np.prod([float(s) for s in shape]))
+                if not dtype.hasobject and size != info.file_size - member.tell():
+                    raise ValueError(f'{info.filename} does not hold the size that it announces')
+                if dtype.hasobject:
+                    raise DataError(
+                        f'{path}: {info.filename} holds Python objects; save plain numbers'
+                    )
+
+
+def _used(name: str) -> bool:
+    return _wanted(name) or name in ('segment_name', 'segment_start')
+
+
+def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Path) -> Table:
+    _check_names(everything, path)
+    columns = {}
+    for name in filter(_wanted, arrays):
+        x = np.asarray(arrays[name])
+        if x.dtype.kind not in 'fiu':
+            raise DataError(f'{path}: {name} holds {x.dtype}, no real numbers; save plain numbers')
+        if x.ndim != 1 and sum(s != 1 for s in x.shape) > 1:
+            shape = ' x '.join(map(str, x.shape))
+            raise DataError(f'{path}: {name} is {shape}; give one column of samples')
+        columns[name] = x.astype(np.float64).reshape(-1)
+    lengths = {name: x.size for name, x in columns.items()}
+    if len(set(lengths.values())) > 1:
+        text = ', '.join(f'{k} {n}' for k, n in lengths.items())
+        raise DataError(f'{path}: columns differ in length ({text}); give one value a sample')
+    ignored = tuple(k for k in everything if not _used(k))
+    if ('segment_name' in arrays) != ('segment_start' in arrays):
+        raise DataError(f'{path}: segment_name and segment_start need each other; save both')
+    if 'segment_name' not in arrays:
+        return Table(columns, ignored=ignored)
+    starts = np.asarray(arrays['segment_start'])
+    if starts.dtype.kind not in 'fiu':
+        raise DataError(f'{path}: segment_start holds no numbers; save sample indices from 0')
+    names = [_text(x, path) for x in np.atleast_1d(arrays['segment_name']).reshape(-1)]
+    return Table(columns, names, starts.reshape(-1), ignored)
+
+
+def _text(value: object, path: Path) -> str:
+    # a cell of a MATLAB cell array is an array of one string, or of none
+    while isinstance(value, np.ndarray):
+        if value.size > 1:
+            break
+        value = value.reshape(-1)[0] if value.size else ''
+    if not isinstance(value, str):
+        raise DataError(f'{path}: segment_name holds no text; save it as text (MATLAB: a cellstr)')
+    return value.strip()
+
+
+def write_npz(file: BinaryIO, table: Table) -> None:
+    """Write a NumPy archive."""
+    arrays: dict[str, Any] = dict(table.columns)
+    if table.names:
+        arrays |= {'segment_name': np.array(table.names), 'segment_start': table.starts}
+    np.savez(file, **arrays)
+
+
+# --- MATLAB ---------------------------------------------------------------------------------
+
+
+def read_mat(path: Path) -> Table:
+    """Read a MATLAB file of version 5 to 7."""
+    with _damage(path, 'MATLAB file', 'save it again with save -v7'):
+        with path.open('rb') as file:
+            head = file.read(1024)
+        if b'\x89HDF\r\n\x1a\n' in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
+            raise DataError(f'{path}: MATLAB 7.3 file (HDF5); save it with save -v7')
+        names, arrays = read_variables(path.read_bytes(), _used)
+        return _from_arrays(arrays, names, path)
+
+
+def write_mat(file: BinaryIO, table: Table) -> None:
+    """Write a MATLAB 5 file of column vectors."""
+    arrays: dict[str, Any] = dict(table.columns)
+    if table.names:
+        names = np.empty(len(table.names), dtype=object)
+        names[:] = table.names
+        starts = np.asarray(table.starts, dtype=np.float64)
+        arrays |= {'segment_name': names, 'segment_start': starts}
+    to: Any = file  # the stubs know paths only
+    scipy.io.savemat(to, arrays, oned_as='column', long_field_names=True)
+
+
+@contextmanager
+def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
+    """Turn whatever a parser throws at damaged bytes into one line."""
+    try:
+        yield
+    except DataError:
+        raise
+    # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the file's
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
+
+
+READERS: Mapping[str, Callable[[Path], Table]] = {
+    '.csv': read_csv,
+    '.npz': read_npz,
+    '.mat': read_mat,
+}
+WRITERS: Mapping[str, Callable[[BinaryIO, Table], None]] = {
+    '.csv': write_csv,
+    '.npz': write_npz,
+    '.mat': write_mat,
+}

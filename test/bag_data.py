@@ -1,0 +1,60 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Blocks of samples, and bags of them, for tests."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.blocks import encode, Samples
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+
+def blocks(n: int = 1000, size: int = 100, seed: int = 0) -> list[tuple[Samples, Samples]]:
+    rng = np.random.default_rng(seed)
+    t, v, y = np.arange(n) / 1000.0, rng.normal(size=n), 1e-6 * rng.normal(size=n)
+    return [
+        (
+            Samples(t[i : i + size], v[i : i + size], 'noise', 'voltage'),
+            Samples(t[i : i + size], y[i : i + size], 'noise', 'displacement'),
+        )
+        for i in range(0, n, size)
+    ]
+
+
+def write(path: Path, messages: Iterable[tuple[str, Samples]], edit=None) -> Path:
+    """Write messages in the order given, one a millisecond, as a recorder would."""
+    store = typestore()
+    types = store.types
+    connections = {}
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for i, (topic, samples) in enumerate(messages):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
+            data, dims = encode(samples)
+            if edit is not None:
+                data, dims = edit(i, data, dims)
+            dimension = types['std_msgs/msg/MultiArrayDimension']
+            layout = types['std_msgs/msg/MultiArrayLayout']([dimension(*d) for d in dims], 0)
+            raw = store.serialize_cdr(types[MESSAGE_TYPE](layout, data), MESSAGE_TYPE)
+            writer.write(connections[topic], 10**9 + i * 10**6, raw)
+    return path
+
+
+def raw(samples: Samples) -> bytes:
+    data, dims = encode(samples)
+    dimension = typestore().types['std_msgs/msg/MultiArrayDimension']
+    layout = typestore().types['std_msgs/msg/MultiArrayLayout']([dimension(*d) for d in dims], 0)
+    message = typestore().types[MESSAGE_TYPE](layout, data)
+    return bytes(typestore().serialize_cdr(message, MESSAGE_TYPE))
+
+
+def raw_blocks(n: int = 10**9) -> Iterator[tuple[bytes, bytes]]:
+    for k in range(n):
+        t = np.arange(100 * k, 100 * k + 100) / 20000.0
+        yield (
+            raw(Samples(t, 5 + np.sin(t), 'noise', 'voltage')),
+            raw(Samples(t, 1e-5 + 1e-6 * np.sin(t), 'noise', 'displacement')),
+        )

@@ -1,0 +1,342 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``piezo_ident diagnose`` and ``piezo_ident effects``: what they print, write and refuse."""
+
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import signal
+import sys
+import time
+
+from diagnosis_examples import base_model, example, measured, RATE, refined_model
+import jsonschema
+import numpy as np
+from piezo_ident.cli import diagnose_command as module
+from piezo_ident.cli import effects_command, main
+from piezo_ident.diagnosis.diagnosis_json import diagnosis_schema
+from piezo_ident.effects import catalogue
+from piezo_ident.model.files import load_model, save_model
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.record.io import write_record
+from piezo_ident.record.record import Record
+import pytest
+
+ONLY = ('--only', 'creep')
+
+
+def run(capsys, *argv: object) -> tuple[int, str, str]:
+    code = main([str(a) for a in argv])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def succeed(capsys, *argv: object) -> str:
+    code, out, err = run(capsys, *argv)
+    assert (code, err) == (0, '')
+    return out
+
+
+def refuse(capsys, folder: Path, argv: list[object], *words: object) -> None:
+    """Run a command that cannot work: one line, exit code 2, and nothing new on disk."""
+    before = {p: p.read_bytes() for p in folder.rglob('*') if p.is_file()}
+    code, out, err = run(capsys, *argv)
+    assert (code, out) == (2, ''), out
+    assert err.count('\n') == 1, err
+    assert err.startswith('piezo_ident')
+    assert 'Traceback' not in err
+    for word in words:
+        assert str(word) in err
+    assert {p: p.read_bytes() for p in folder.rglob('*') if p.is_file()} == before
+
+
+@pytest.fixture
+def made(tmp_path) -> Path:
+    """Return a folder with a model that knows no creep, and records of a stage that creeps."""
+    save_model(base_model(), tmp_path / 'model.yaml')
+    record = measured('val.npz')
+    write_record(record, tmp_path / 'val.npz')
+    (piece,) = record.pieces
+    # another part of the same stage's life
+    late = piece.cut(round(2.6 * RATE), piece.n)
+    write_record(Record((late,), 'unseen.npz'), tmp_path / 'unseen.npz')
+    return tmp_path
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Have every diagnosis give an example at once; its arguments are kept."""
+    asked = {}
+
+    def diagnose(model, records, settings, *, progress):
+        progress('candidates', 0.5)
+        asked.update(model=model, records=records, settings=settings)
+        return asked.get('gives') or example('named')
+
+    monkeypatch.setattr(module, 'diagnose', diagnose)
+    return asked
+
+
+# --- the way it is meant --------------------------------------------------------------------
+
+
+def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
+    refined, report = made / 'refined.yaml', made / 'deep' / 'report'
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', *ONLY]
+    argv += ['--model', refined, '--report', report, '--validation', made / 'unseen.npz']
+    text = succeed(capsys, *argv)
+    data = json.loads((report / 'diagnosis.json').read_text(encoding='utf-8'))
+    jsonschema.Draft202012Validator(diagnosis_schema()).validate(data)
+    # drifts were not tried
+    assert data['verdict'] == 'class'
+    assert data['class']['names'] == ['creep', 'thermal_drift', 'gain_drift']
+    assert [e['name'] for e in data['effects']] == ['creep']
+    assert text.replace('\n', ' ').startswith(data['sentence'])
+    # the noise of the example is 0.0053 % of its stroke
+    assert data['error']['before']['overall'] > 0.5
+    assert data['error']['after']['overall'] < 0.01
+    model = load_model(refined)
+    assert [e.name for e in model.effects] == ['creep']
+    assert (report / 'model.yaml').read_bytes() == refined.read_bytes()
+    record = measured()
+    assert predict_record(model, record).whole.percent < 0.01
+    assert predict_record(base_model(), record).whole.percent > 0.5
+    (row,) = [line for line in text.splitlines() if line.startswith('unseen.npz  ')]
+    before, after = map(float, row.split()[1:3])
+    assert after < 0.2 * before
+    assert f'model: {refined} (' in text
+    assert 'with creep' in text
+    assert (report / 'report.html').is_file()
+    assert load_model(made / 'model.yaml').effects == ()
+
+
+def test_help(capsys):
+    assert 'diagnose' in succeed(capsys, '--help')
+    text = succeed(capsys, 'diagnose', '--help')
+    for option in ('--model', '--report', '--validation', '--only', '--without', '--seed'):
+        assert option in text
+
+
+def test_what_it_prints(capsys, made, quick):
+    quick['gives'] = example('class')
+    text = succeed(capsys, 'diagnose', made / 'model.yaml', made / 'val.npz')
+    lines = text.splitlines()
+    assert lines[0] == 'Creep or thermal drift explains 93 % of what the model missed.'
+    for start in ('overall ', 'staircase ', 'sine:5Hz ', '50 Hz ', 'noise floor ', 'detectable '):
+        assert any(line.startswith(start) for line in lines), start
+    for words in (
+        'as given  H refitted  refined',
+        'added: creep (slot: hidden), 93 % of the explainable part',
+        'gain            0.01200 ± 0.00040, 0.01000 ± 0.00060 [1]',
+        'cannot tell apart: creep, thermal_drift, gain_drift',
+        'a hold of 10 s',
+        'rate_dependent_hysteresis (29 %): creep explains more',
+        'and 1 more',
+        'cross_coupling: needs a recorded voltage of another axis',
+        'outliers (3) in val.npz at 1.2 s: left out',
+        'warning: no repeated periods',
+        '--model refined.yaml',
+    ):
+        assert words in text, words
+    # six candidates are told of
+    assert 'slew_limit' not in text
+    assert sorted(p.name for p in made.iterdir()) == ['model.yaml', 'unseen.npz', 'val.npz']
+
+
+def test_json(capsys, made, quick):
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', '--json', '--seed', 5]
+    data = json.loads(
+        succeed(capsys, *argv, '--model', made / 'r.yaml', '--validation', made / 'unseen.npz')
+    )
+    jsonschema.Draft202012Validator(diagnosis_schema()).validate(data)
+    assert data['model_changes'] == ['with creep']
+    assert data['files'] == {'model': str(made / 'r.yaml'), 'report': None}
+    (check,) = data['validation']
+    assert check['record'] == 'unseen.npz'
+    assert check['after'] < check['before']
+    assert quick['settings'].seed == 5
+
+
+def test_a_model_that_lacks_nothing_stays_as_it_is(capsys, made, quick):
+    quick['gives'] = example('none')
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', '--model', made / 'same.yaml']
+    text = succeed(capsys, *argv)
+    assert f'model: {made / "same.yaml"} (the same as {made / "model.yaml"}' in text
+    data = json.loads(succeed(capsys, *argv, '--json'))
+    assert data['model_changes'] == []
+
+
+def test_options_reach_the_diagnosis(capsys, made, quick):
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', made / 'unseen.npz']
+    succeed(capsys, *argv)
+    assert quick['settings'].effects is None
+    assert [record.name for record in quick['records']] == ['val.npz', 'unseen.npz']
+    more = ['--without', 'creep,backlash', '--without', 'slew_limit', '--most-effects', 2]
+    succeed(capsys, *argv, *more)
+    assert quick['settings'].without == ('creep', 'backlash', 'slew_limit')
+    assert quick['settings'].most_effects == 2
+    succeed(capsys, *argv, '--only', 'creep', '--only', 'thermal_drift')
+    assert quick['settings'].effects == ('creep', 'thermal_drift')
+
+
+def test_a_unit_converts(capsys, made, quick):
+    (piece,) = measured().pieces
+    rows = np.column_stack([piece.t, piece.v, 1e6 * piece.y])
+    np.savetxt(made / 'um.csv', rows, delimiter=',', header='t,v,y', comments='', fmt='%.9g')
+    argv = ['diagnose', made / 'model.yaml', made / 'um.csv']
+    succeed(capsys, *argv, '--displacement-unit', 'um')
+    assert quick['records'][0].stroke == pytest.approx(measured().stroke, rel=1e-6)
+    refuse(capsys, made, argv, 'um.csv', '--displacement-unit')
+
+
+# --- what a user gets wrong -----------------------------------------------------------------
+
+
+def test_misspelt_effects(capsys, made, quick):
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz']
+    refuse(capsys, made, [*argv, '--without', 'crep'], "'crep'; did you mean creep?")
+    refuse(capsys, made, [*argv, '--only', 'Thermal-Drift'], 'did you mean thermal_drift?')
+    refuse(capsys, made, [*argv, '--only', 'xyzzy'], 'see piezo_ident effects')
+    refuse(capsys, made, [*argv, *ONLY, '--without', 'creep'], 'leave no candidate')
+    everything = ','.join(catalogue())
+    refuse(capsys, made, [*argv, '--without', everything], 'leave no candidate')
+    assert quick == {}
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--most-effects', 0], 'most_effects'),
+        (['--most-effects', 'all'], '--most-effects'),
+        (['--seed', -1], '--seed'),
+        (['--mdoel', 'r.yaml'], '--mdoel'),
+        (['--only', ''], 'is empty; give a name'),
+        (['--model', 'r.csv'], 'r.csv'),
+        (['--displacement-unit', 'ym'], 'nm'),
+    ],
+)
+def test_bad_options(capsys, made, quick, options, word):
+    refuse(capsys, made, ['diagnose', made / 'model.yaml', made / 'val.npz', *options], word)
+    assert quick == {}
+
+
+def test_inputs_and_other_reports_are_never_overwritten(capsys, made, quick):
+    model, record = made / 'model.yaml', made / 'val.npz'
+    argv = ['diagnose', model, record]
+    refuse(capsys, made, [*argv, '--model', model], 'is one of the inputs')
+    refuse(capsys, made, [*argv, '--validation', record], 'is no validation')
+    # the report would put its model.yaml there
+    refuse(capsys, made, [*argv, '--report', made], 'is one of the inputs')
+    (made / 'old').mkdir()
+    (made / 'old' / 'identification.json').write_text('{}')
+    refuse(capsys, made, [*argv, '--report', made / 'old'], 'report of an identification')
+    (made / 'mine').mkdir()
+    (made / 'mine' / 'model.yaml').write_text('')
+    refuse(capsys, made, [*argv, '--report', made / 'mine'], 'of no earlier report')
+    (made / 'file').write_text('')
+    refuse(capsys, made, [*argv, '--report', made / 'file'], 'is a file')
+    refuse(capsys, made, [*argv, '--model', made / 'no' / 'r.yaml'], 'make it first')
+    assert quick == {}
+
+
+def test_models_and_records_that_do_not_fit(capsys, made):
+    model, record = made / 'model.yaml', made / 'val.npz'
+    for argv in ([record, model], [record, record], [model, model]):
+        refuse(capsys, made, ['diagnose', *argv], 'MODEL comes first: piezo_ident diagnose')
+    refuse(capsys, made, ['diagnose', model, made / 'no.csv'], 'no.csv', 'check the name')
+    refuse(capsys, made, ['diagnose', made / 'no.yaml', record], 'no.yaml', 'check the name')
+    (piece,) = measured().pieces
+    fast = Record((replace(piece, sample_rate=4000.0),))
+    write_record(fast, made / 'fast.npz')
+    refuse(capsys, made, ['diagnose', model, made / 'fast.npz', *ONLY], 'fast.npz', '4000')
+    # what is looked at in the end is tried at the start
+    argv = ['diagnose', model, record, '--validation', made / 'fast.npz']
+    refuse(capsys, made, argv, 'fast.npz', '4000')
+    write_record(Record((piece.cut(600, 900),)), made / 'short.npz')
+    refuse(capsys, made, ['diagnose', model, made / 'short.npz'], 'short.npz', 'longer')
+
+
+def test_interrupt_leaves_nothing(capsys, made, monkeypatch):
+    def diagnose(model, records, settings, *, progress):
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(1.0)
+        raise AssertionError('it went on')
+
+    monkeypatch.setattr(module, 'diagnose', diagnose)
+    before = sorted(made.rglob('*'))
+    outputs = ['--model', made / 'r.yaml', '--report', made / 'report']
+    code, out, err = run(capsys, 'diagnose', made / 'model.yaml', made / 'val.npz', *outputs)
+    assert (code, out) == (130, '')
+    assert err == 'piezo_ident: interrupted; nothing was left half written\n'
+    assert sorted(made.rglob('*')) == before
+
+
+def test_an_unwritable_folder_is_refused_before_the_work(capsys, made, quick):
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', '--report', '/proc/report']
+    refuse(capsys, made, argv, '/proc/report')
+    assert quick == {}
+
+
+# --- the catalogue --------------------------------------------------------------------------
+
+
+def test_catalogue(capsys):
+    text = succeed(capsys, 'effects')
+    data = json.loads(succeed(capsys, 'effects', '--json'))
+    assert [e['name'] for e in data] == sorted(catalogue())
+    for effect in data:
+        assert f'{effect["name"]}  (slot: {effect["slot"]})\n' in text
+        assert effect['about'] in text
+    # one effect at length comes with another call
+    assert len(text.splitlines()) < 4 * len(data)
+
+
+@pytest.mark.parametrize('name', sorted(catalogue()))
+def test_one_effect(capsys, name):
+    text = succeed(capsys, 'effects', name)
+    effect = json.loads(succeed(capsys, 'effects', name, '--json'))
+    assert effect['name'] == name
+    assert text.startswith(f'{name}  (slot: {effect["slot"]})\n')
+    for p in catalogue()[name].parameters:
+        (row,) = [line for line in text.splitlines() if line.startswith(f'{p.name}  ')]
+        assert p.description in row
+        if p.kind == 'number':
+            assert f'{p.lower:g}' in row
+            assert f'{p.upper:g}' in row
+            assert p.unit in row
+    assert effect['documentation'].splitlines()[0] in text
+
+
+def test_a_misspelt_name(capsys, tmp_path):
+    refuse(capsys, tmp_path, ['effects', 'back_lash'], 'did you mean backlash?')
+
+
+def test_a_plug_in_is_listed_with_its_package(capsys, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'example_effect'))
+    from example_effect import SoftStop
+
+    effects = {**catalogue(), 'soft_stop': SoftStop}
+    monkeypatch.setattr(effects_command, 'catalogue', lambda: effects)
+    assert 'soft_stop  (slot: output)  from example_effect\n' in succeed(capsys, 'effects')
+    text = succeed(capsys, 'effects', 'soft_stop')
+    assert 'share k' in text
+    assert effects_command.effect_name('soft_stop') == 'soft_stop'
+    sys.modules.pop('example_effect', None)
+
+
+def test_the_model_of_the_example_is_what_it_says():
+    # what the fast tests lean on
+    assert os.fspath(measured().name) == 'val.npz'
+    assert predict_record(refined_model(), measured()).whole.percent < 0.01
+
+
+def test_the_example_in_the_documentation_is_the_one_that_is_tested():
+    root = Path(__file__).resolve().parents[2]
+    code = (root / 'test' / 'example_effect' / 'example_effect.py').read_text(encoding='utf-8')
+    text = (root / 'docs' / 'diagnosis.md').read_text(encoding='utf-8')
+    # behind the licence header
+    assert f'```python\n{code[code.index(chr(34) * 3) :]}```\n' in text
+    setup = (root / 'test' / 'example_effect' / 'setup.cfg').read_text(encoding='utf-8')
+    assert setup[setup.index('[options.entry_points]') :].rstrip() in text

@@ -1,0 +1,441 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Data with an undeclared effect: inside the catalogue, outside it, and none.
+
+The stages come from benchmarks/truths: their laws are not those of the candidates.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+import sys
+
+import numpy as np
+from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
+from piezo_ident.diagnosis import diagnose, DiagnosisSettings
+from piezo_ident.diagnosis import rows as rows_module
+from piezo_ident.diagnosis import simulator as simulator_module
+from piezo_ident.diagnosis.fit import base_at, base_thresholds, fit_base, fit_jointly
+from piezo_ident.diagnosis.gain import gram_of, held_out_errors
+from piezo_ident.diagnosis.rows import make_rows
+from piezo_ident.diagnosis.simulator import Added, retuned, Simulator, State
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.files import model_from_dict, model_to_dict
+from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RATE = 20_000.0
+IDENTIFICATION = """
+limits: [0, 10]
+sample_rate: 20000
+seed: 1
+slew: 40
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 16}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 2}
+  - {signal: triangle, slope: 12}
+  - {signal: idle, duration: 0.1}
+"""
+
+
+@pytest.fixture(scope='module')
+def truths():
+    sys.path.insert(0, str(ROOT / 'benchmarks'))
+    try:
+        import truths as found
+    finally:
+        sys.path.remove(str(ROOT / 'benchmarks'))
+    return found
+
+
+def record_of(v, y, labels, name) -> Record:
+    segments = tuple(Segment(*label) for label in labels)
+    return Record((Piece(v, y, RATE, segments=segments),), name)
+
+
+@cache
+def measured(effect, size, seed):
+    """Return model, a record to diagnose and one that nothing saw."""
+    import truths as found
+
+    stage = found.make_stage(effect, size, seed)
+    sequence = parse_program(IDENTIFICATION).build()
+    t = np.arange(sequence.n) / RATE
+    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
+    y = stage.respond(t, sequence.v, changed=False)
+    model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
+    records = []
+    for kind in ('diagnosis', 'unseen'):
+        t, v, labels = found.programme(kind, seed)
+        records.append(record_of(v, stage.respond(t, v), labels, kind))
+    return model.model, *records
+
+
+def unseen_errors(result, record) -> tuple[float, float]:
+    before, after = (predict_record(m, record).whole.percent for m in (result.given, result.model))
+    return before, after
+
+
+# -- the user's three cases --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('effect', ['creep', 'saturation'])
+def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
+    model, record, unseen = measured(effect, 0.3, 1)
+    result = diagnose(model, record)
+    assert result.verdict in ('named', 'class'), result.sentence
+    assert effect in {e.name for e in result.effects} | set(
+        result.group.names if result.group else ()
+    )
+    assert result.refit.overall > 0.2
+    assert result.after.overall < result.refit.overall / 3
+    before, after = unseen_errors(result, unseen)
+    assert after < before / 3
+
+
+@pytest.mark.parametrize('dropouts', [0, 60])
+def test_of_a_long_record_the_beginning_is_searched_and_all_is_fitted(truths, dropouts):
+    model, record, unseen = measured('creep', 0.3, 1)
+    (piece,) = record
+    most = record.n * 2 // 3
+    y = piece.y.copy()
+    lost = np.random.default_rng(4).integers(most, piece.n, dropouts)
+    y[lost] = y.min()
+    record = Record((Piece(piece.v, y, RATE, segments=piece.segments),), 'long')
+    few = ('creep', 'thermal_drift', 'saturation')
+    result = diagnose(model, record, DiagnosisSettings(effects=few, most_samples=most))
+    assert [e.name for e in result.effects] == ['creep'], result.sentence
+    before, after = unseen_errors(result, unseen)
+    assert after < before / 10
+    (said,) = [w for w in result.warnings if 'samples were searched' in w]
+    assert sum(part.piece.n for part in result.residuals) == most
+    if dropouts:
+        # they bend nothing, and are not passed over in silence
+        assert said.endswith('something changes later: give that part as a record of its own')
+    else:
+        assert 'fitted to all of them' in said and 'changes later' not in said
+        # errors are those of the model that comes back, over all
+        for percent, one in ((result.before.overall, model), (result.after.overall, result.model)):
+            whole = predict_record(one, record).whole.percent
+            assert percent == pytest.approx(whole, rel=0.25)
+
+
+def test_what_is_asked_for_is_there_behind_the_beginning(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
+        diagnose(model, record, DiagnosisSettings(most_samples=1000))
+
+
+def test_effect_outside_the_catalogue_stays_unexplained(truths):
+    model, record, unseen = measured('floor_vibration', 0.3, 1)
+    result = diagnose(model, record)
+    assert result.verdict == 'unexplained', result.sentence
+    assert not result.effects
+    assert result.unexplained.rms_percent > 0.1
+    # a refit of H may help; nothing else was added
+    assert result.after.overall <= result.before.overall
+    before, after = unseen_errors(result, unseen)
+    assert after < 1.05 * before
+
+
+def test_no_effect_is_none(truths):
+    model, record, unseen = measured(None, 0.0, 2)
+    result = diagnose(model, record)
+    assert result.verdict == 'none', result.sentence
+    assert not result.effects
+    assert result.smallest_detectable >= 0.05
+    assert result.after.overall <= result.before.overall < 0.3
+    before, after = unseen_errors(result, unseen)
+    assert after < 1.05 * before
+
+
+NARROW = """
+limits: [0, 10]
+rest: 4
+slew: 100
+segments:
+  - {signal: triangle, peaks: [6, 6, 6], base: 4, slope: 8}
+  - {signal: hold, level: 6, duration: 3}
+  - {signal: hold, level: 4, duration: 3}
+  - {signal: sine, bias: 5, amplitude: 1, frequency: 1, periods: 3}
+  - {signal: hold, level: 6, duration: 3}
+"""
+
+
+def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    sequence = parse_program(NARROW).build(RATE)
+    stage = truths.make_stage('creep', 0.3, 1)
+    t = np.arange(sequence.n) / RATE
+    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
+    narrow = record_of(sequence.v, stage.respond(t, sequence.v), labels, 'narrow')
+    few = DiagnosisSettings(effects=('creep', 'saturation'))
+    result = diagnose(model, narrow, few)
+    assert [e.name for e in result.effects] == ['creep'], result.sentence
+    assert result.model.scaling.range == (sequence.v.min(), sequence.v.max())
+    assert 'the hysteresis was refitted to 4 .. 6 V alone' in result.warnings[-1]
+    # and who leaves that range hears of it
+    assert result.model.extrapolation(record)
+    whole = diagnose(model, record, few)
+    assert whole.model.scaling.range == model.scaling.range
+    assert not [w for w in whole.warnings if 'was refitted' in w]
+
+
+def test_a_share_is_of_what_a_refit_leaves(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    # the sensor was set to zero anew
+    (piece,) = record.pieces
+    moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
+    result = diagnose(model, moved, DiagnosisSettings(effects=('creep',)))
+    assert 'of what a refit of the hysteresis leaves' in result.sentence
+    assert f'with the refit alone to {result.refit.overall:.3g} %' in result.sentence
+    assert result.after.overall < result.refit.overall < 0.1 * result.before.overall
+
+
+def test_hum_stays_in_its_record(truths):
+    model, record, unseen = measured('periodic_disturbance', 0.3, 1)
+    result = diagnose(model, record)
+    assert 'switched off beside the hysteresis as it was given' in ' '.join(result.warnings)
+    assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
+    assert result.after.overall < result.refit.overall / 3
+    frequency = result.effects[0].parameters['frequency'].value
+    assert frequency == pytest.approx(50.0, abs=15.0)
+    # another record has another phase: the refined model must not make it worse
+    before, after = unseen_errors(result, unseen)
+    assert after == pytest.approx(before)
+
+
+def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    refined = diagnose(model, record).model
+    again = model_from_dict(model_to_dict(refined))
+    assert [e.name for e in again.effects] == ['creep']
+    second = diagnose(again, record)
+    assert second.verdict == 'none', second.sentence
+    assert second.before.overall < 0.1
+
+
+def test_seed_repeats_and_inputs_stay(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    y = record.pieces[0].y.copy()
+    one, other = (diagnose(model, record, DiagnosisSettings(seed=3)) for _ in range(2))
+    assert one.sentence == other.sentence
+    assert one.candidates == other.candidates
+    np.testing.assert_array_equal(record.pieces[0].y, y)
+
+
+def test_a_candidate_that_is_left_out_is_not_named(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    result = diagnose(model, record, DiagnosisSettings(without=('creep',)))
+    assert 'creep' not in {e.name for e in result.effects}
+    assert 'creep' not in {c.name for c in result.candidates}
+
+
+def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    result = diagnose(model, record, DiagnosisSettings(effects=('creep',)))
+    assert [e.name for e in result.effects] == ['creep']
+    assert result.verdict == 'class' and result.group.names[0] == 'creep'
+    assert 'thermal_drift' in result.group.names
+    assert 'diagnose again with' in result.group.separating_experiment
+
+
+def test_every_step_can_be_cancelled(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    for step in ('residual', 'candidates', 'verdict'):
+
+        def progress(name, share, step=step):
+            if name == step and share >= 0.0:
+                raise Cancelled(name)
+
+        with pytest.raises(Cancelled, match=step):
+            diagnose(model, record, progress=progress)
+
+
+# -- refusals ----------------------------------------------------------------------------------
+
+
+def test_unknown_candidates_are_refused():
+    with pytest.raises(ConfigError, match='unknown effect'):
+        DiagnosisSettings(without=('crep',))
+
+
+def test_another_rate_and_too_little_are_refused(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    piece = record.pieces[0]
+    slow = Record((Piece(piece.v[::2], piece.y[::2], RATE / 2),), 'slow')
+    with pytest.raises(IdentificationError, match='sampled'):
+        diagnose(model, slow)
+    with pytest.raises(IdentificationError, match='longer'):
+        diagnose(model, Record((piece.cut(0, 500),), 'short'))
+
+
+def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
+    unplugged = Record((replace(piece, y=noise),), 'unplugged')
+    with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
+        diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
+
+
+@pytest.mark.parametrize(
+    ('scale', 'said'), [(1.0, []), (1e-3, ['in volts?']), (1e3, ['extrapolation'])]
+)
+def test_voltages_that_the_model_does_not_know_are_said(truths, scale, said):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
+    found = diagnose(model, scaled, DiagnosisSettings(effects=('creep',)))
+    heard = [w for w in found.warnings if w.startswith('scaled: ')]
+    assert len(heard) == len(said)
+    assert all(part in line for part, line in zip(said, heard, strict=True))
+
+
+def test_one_pass_over_the_range_names_nothing(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    piece = record.pieces[0]
+    sine = next(s for s in piece.segments if s.label.startswith('sine:1Hz'))
+    once = Record((piece.cut(0, sine.start + int(RATE)),), 'once')
+    result = diagnose(model, once)
+    assert not result.effects
+    assert result.verdict in ('none', 'unexplained')
+    assert 'nothing that is fitted could be tested' in result.sentence
+    assert 'no candidate' not in result.sentence
+
+
+# -- the parts that carry it -------------------------------------------------------------------
+
+
+def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    stroke = make_rows(model, [record]).stroke
+    # the sensor was set to zero anew in between
+    moved = Record((replace(piece, y=piece.y + 500e-6),), 'moved')
+    assert make_rows(model, [record, moved]).stroke == pytest.approx(stroke, rel=1e-9)
+    glitch = piece.y.copy()
+    glitch[1000] += 1e-3
+    faulty = Record((replace(piece, y=glitch),), 'faulty')
+    bad = np.arange(piece.n) == 1000
+    assert make_rows(model, [faulty]).stroke > 5 * stroke
+    assert make_rows(model, [faulty], [bad]).stroke == stroke
+
+
+def test_time_begins_with_the_record_whatever_its_clock_says(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    epoch = Record((replace(piece, start_time=600.0),), 'epoch')
+    here, there = make_rows(model, [record]), make_rows(model, [epoch])
+    np.testing.assert_allclose(there.time(0), piece.t, atol=1e-9)
+    np.testing.assert_allclose(there.time(0, 5, 9), piece.t[5:9], atol=1e-9)
+    assert there.duration == here.duration == piece.duration
+    # so does what a diagnosis left switched off, while what follows the clock goes on with it
+    hum = {'frequency': 50.0, 'harmonic': [1.0], 'phase': [0.0]}
+    for amplitude, begin in ((0.0, 600.0), (0.01, 0.0)):
+        setting = EffectSetting('periodic_disturbance', {**hum, 'amplitude': [amplitude]})
+        rows = make_rows(replace(model, effects=(setting,)), [epoch])
+        assert rows.begin.tolist() == [begin]
+        assert rows.duration == piece.duration
+    # a gap is part of it
+    two = Record((piece.cut(0, 50_000), piece.cut(100_000, piece.n)), 'two')
+    assert make_rows(model, [two]).duration == pytest.approx(piece.duration)
+
+
+def test_of_one_kind_of_excitation_fifths_are_held_out(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    rows = make_rows(model, [Record((replace(piece, segments=()),), 'unlabelled')])
+    named = replace(piece, segments=(Segment('triangle', 0, piece.n),))
+    one = make_rows(model, [Record((named,), 'one kind')])
+    assert len(rows.labels) == len(one.labels) == 5
+    assert len(set(one.group)) == 5
+
+
+def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    rows = make_rows(model, [record])
+    rng = np.random.default_rng(0)
+    M, e = rng.standard_normal((rows.n, 4)), rng.standard_normal(rows.n)
+    errors = held_out_errors(gram_of(rows, M, e), rows.fold, np.zeros(4))
+    out = (rows.fold == 2)[rows.block]
+    theta = np.linalg.lstsq(M[~out], e[~out], rcond=None)[0]
+    left = e[out] - M[out] @ theta
+    assert errors[rows.fold == 2].sum() == pytest.approx(left @ left, rel=1e-6)
+
+
+def test_columns_near_the_optimum_are_derivatives(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    rows = make_rows(model, [record])
+    simulator = Simulator(model, rows)
+    state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), base_thresholds(1.0))
+    # without effects the quick columns are the exact ones
+    np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-9)
+    fitted = fit_jointly(simulator, state, base)
+    assert fitted.mean_square < 1e-6
+
+
+@pytest.mark.parametrize('m', [12, 30, 49])
+def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
+    model, record, _ = measured('creep', 0.3, 1)
+    monkeypatch.setattr(rows_module, 'MOST_ROWS', record.n // m + 1)
+    rows = make_rows(model, [record])
+    assert rows.m == m
+    assert rows.n == record.n // m
+
+
+@pytest.mark.parametrize('window', [1, 100, 5003])
+def test_windows_change_nothing(truths, monkeypatch, window):
+    model, record, _ = measured('creep', 0.3, 1)
+    simulator = Simulator(model, make_rows(model, [Record((record.pieces[0].cut(0, 20_000),))]))
+    added = Added('creep', ({'gain': [0.01, 0.02], 'time_constant': [0.1, 1.0]},))
+    state = State(model.hysteresis, np.zeros(1), (added,))
+    whole = simulator.remember(state)
+    monkeypatch.setattr(simulator_module, 'WINDOW', window)
+    assert simulator.run(state).tobytes() == whole.tobytes()
+    (full,) = simulator.full(state)
+    assert full.size == 20_000
+
+
+def test_what_is_kept_from_the_run_before_changes_nothing(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    simulator = Simulator(model, make_rows(model, [record]))
+    state = State(model.hysteresis, np.zeros(1), retuning=(0.1, 0.2, 0.01, 0.02))
+    simulator.remember(state)
+    for name, values in (
+        ('creep', {'gain': [0.01], 'time_constant': [0.3]}),
+        ('even_nonlinearity', {'square': 0.01}),
+        ('delay_change', {'samples': 0.7}),
+        ('saturation', {'high': 0.9}),
+        ('input_feedthrough', {'gain': 0.01}),
+        ('sensor_nonlinearity', {'square': 0.01}),
+    ):
+        added = Added(name, (values,))
+        added = Added(name, (added.effect.check(values),))
+        np.testing.assert_allclose(
+            simulator.added(added), simulator.run(state.with_effect(added)), atol=1e-12
+        )
+
+
+def test_retuning_is_the_product_with_its_factor():
+    G = Dynamics(a=np.array([-0.9]), b=np.array([0.06, 0.04]))
+    c = (0.3, -0.5, 0.02, -0.04)
+    f = np.array([0.0, 3.0, 40.0, 900.0])
+    z = np.exp(-2j * np.pi * f / RATE)
+    factor = 1 + c[0] * (1 - z) + c[1] * (1 - z) ** 2
+    for size, corner in zip(c[2:], (15.0, 100.0), strict=True):
+        factor = factor + size * (1 - z) / (1 - np.exp(-2 * np.pi * corner / RATE) * z)
+    np.testing.assert_allclose(
+        retuned(G, c, RATE).response(f, RATE), G.response(f, RATE) * factor, rtol=1e-9
+    )
+    assert retuned(G, (0.0,) * 4, RATE) is G

@@ -1,0 +1,136 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A lab's own effect comes in as an entry point: the package in example_effect/ does it."""
+
+import configparser
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from effect_table import PAPER, rich
+import numpy as np
+from piezo_ident import effects
+from piezo_ident.common.errors import ModelError
+from piezo_ident.effects import catalogue
+from piezo_ident.model.files import model_to_dict
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = Path(__file__).parents[1] / 'example_effect'
+
+#: in a fresh interpreter: what the catalogue has, and what a model file with the effect predicts
+SCRIPT = """
+import json
+import sys
+import numpy as np
+from piezo_ident.effects import catalogue, View
+from piezo_ident.model.files import load_model
+
+model = load_model(sys.argv[1])
+view = View(20_000.0, 0.0, 1.0, np.array([1.0, 10.0]), 1.0)
+effect = catalogue()['soft_stop']
+print(json.dumps({
+    'names': sorted(catalogue()),
+    'y': model.stream().process(np.load(sys.argv[2])).tolist(),
+    'trials': [[dict(t.values), list(t.moves), list(t.steps)] for t in effect.trials(view)],
+}))
+"""
+
+
+def install(folder: Path) -> None:
+    """Put the example and its metadata where an installer would, without the network."""
+    config = configparser.ConfigParser()
+    config.read(EXAMPLE / 'setup.cfg')
+    name, version = config['metadata']['name'], config['metadata']['version']
+    (module,) = config['options']['py_modules'].split()
+    text = (EXAMPLE / f'{module}.py').read_text(encoding='utf-8')
+    (folder / f'{module}.py').write_text(text, encoding='utf-8')
+    info = folder / f'{name.replace("-", "_")}-{version}.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n')
+    groups = config['options.entry_points'].items()
+    (info / 'entry_points.txt').write_text(
+        '\n'.join(f'[{group}]{points}' for group, points in groups), encoding='utf-8'
+    )
+
+
+def run(folder: Path, *args: object) -> str:
+    paths = [str(folder), str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]
+    done = subprocess.run(
+        [sys.executable, *map(str, args)],
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('site')
+    install(folder)
+    return folder
+
+
+def test_an_installed_effect_is_in_the_catalogue_and_in_models(site, tmp_path):
+    data, v = model_to_dict(PAPER), rich()
+    data['effects'] = [{'name': 'soft_stop', 'parameters': {'gain': 0.5, 'stop': 0.6}}]
+    (tmp_path / 'model.yaml').write_text(yaml.safe_dump(data), encoding='utf-8')
+    np.save(tmp_path / 'v.npy', v)
+    found = json.loads(run(site, '-c', SCRIPT, tmp_path / 'model.yaml', tmp_path / 'v.npy'))
+    assert set(found['names']) == {*catalogue(), 'soft_stop'}
+    x = PAPER.stream().process(v) / 75e-6
+    law = x - 0.5 * np.maximum(0.0, x - 0.6)
+    np.testing.assert_allclose(np.array(found['y']) / 75e-6, law, atol=1e-12)
+    # nothing was written for it: it is a candidate all the same
+    assert found['trials'] == [
+        [{'gain': 0.0, 'stop': stop}, [['gain', None]], [0.01]] for stop in (0.5, 0.7, 0.9)
+    ]
+
+
+def test_an_installed_effect_is_listed_at_the_prompt(site):
+    text = run(site, '-m', 'piezo_ident', 'effects')
+    assert 'soft_stop  (slot: output)' in text
+    assert 'the stage runs into something soft' in text
+
+
+def test_the_example_is_short():
+    code = (EXAMPLE / 'example_effect.py').read_text(encoding='utf-8').partition('import')[2]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+
+
+class Entry:
+    """What importlib.metadata gives for one entry point."""
+
+    def __init__(self, value, loaded):
+        self.value, self._loaded = value, loaded
+
+    def load(self):
+        if isinstance(self._loaded, Exception):
+            raise self._loaded
+        return self._loaded
+
+
+@pytest.mark.parametrize(
+    ('loaded', 'says'),
+    [
+        (ImportError('no module named lab'), 'lab:Mine.* does not load: no module named lab'),
+        (dict, 'is not a subclass of Effect'),
+        (len, 'is not a subclass of Effect'),
+        (effects.find_effect('creep'), "the name 'creep' is taken"),
+    ],
+)
+def test_an_effect_that_does_not_fit_is_refused_by_name(monkeypatch, loaded, says):
+    monkeypatch.setattr(effects, 'entry_points', lambda group: [Entry('lab:Mine', loaded)])
+    catalogue.cache_clear()
+    try:
+        with pytest.raises(ModelError, match=says):
+            catalogue()
+    finally:
+        monkeypatch.undo()
+        catalogue.cache_clear()

@@ -1,0 +1,416 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Signals and programmes: what they promise, and what would prove it wrong."""
+
+from itertools import pairwise
+from pathlib import Path
+
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation import signals as ex
+from piezo_ident.excitation.catalogue import SIGNALS
+from piezo_ident.excitation.program import load_program, parse_program, Program
+from piezo_ident.operators.play import play_columns
+from piezo_ident.record.record import KINDS
+import pytest
+import yaml
+
+FS = 20_000.0
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ('identification', 'validation', 'minor_loops', 'survey', 'diagnosis', 'holds')
+
+
+def config(name: str) -> Program:
+    return load_program(ROOT / f'config/program_{name}.yaml')
+
+
+def program(*segments: dict, **head) -> Program:
+    return parse_program(yaml.safe_dump({'limits': [0, 10], **head, 'segments': list(segments)}))
+
+
+def band_power(x, fs, low, high):
+    spectrum = np.abs(np.fft.rfft(x - x.mean())) ** 2
+    f = np.fft.rfftfreq(x.size, 1 / fs)
+    return spectrum[(f >= low) & (f < high)].sum()
+
+
+# -- signals -----------------------------------------------------------------------------------
+
+
+def test_paper_triangle_is_equation_7():
+    v = ex.triangle(ex.PAPER_PEAKS, 0.0, ex.PAPER_SLOPE, FS)
+    assert v.size == 6 * FS
+    peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
+    assert peaks.tolist() == [3.0, 6.0, 9.0]
+    assert_allclose(np.abs(np.diff(v)) * FS, 6.0, rtol=1e-9)
+    assert_allclose(v[[0, 10_000, 20_000]], [0.0, 3.0, 0.0], atol=1e-12)
+
+
+def test_default_triangle_covers_the_range_it_is_given():
+    for limits in ([0, 10], [-10, 10], [-2, 7.7]):
+        s = program({'signal': 'triangle'}, limits=limits, rest=limits[0]).build(FS)
+        assert (s.v.min(), s.v.max()) == tuple(limits)
+        v = s.v[: s.segments[0].stop]
+        peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
+        assert_allclose(np.diff(peaks), (limits[1] - limits[0]) / 3)
+
+
+@given(levels=st.lists(st.floats(-10, 10), min_size=2, max_size=6), slope=st.floats(1.0, 1000.0))
+def test_corners_are_met_exactly(levels, slope):
+    assume(np.abs(np.diff(levels)).sum() / slope > 1e-3)
+    v = ex.corners(levels, slope, 1000.0)
+    assert set(levels[:-1]) <= set(v.tolist())
+    assert v.min() >= min(levels)
+    assert v.max() <= max(levels)
+
+
+@pytest.mark.parametrize('cutoff', [500.0, 3000.0])
+def test_noise_spectrum_is_flat_and_ends(cutoff):
+    v = ex.noise(5.0, 0.4, cutoff, 5.0, FS, np.random.default_rng(3))
+    total = band_power(v, FS, 0, FS)
+    # 1.2 times the cut-off is where the roll-off ends; what is left comes from the fades
+    assert band_power(v, FS, 1.25 * cutoff, FS) < 1e-4 * total
+    tenths = [band_power(v, FS, k * cutoff / 10, (k + 1) * cutoff / 10) for k in range(10)]
+    assert max(tenths) < 1.35 * min(tenths)
+
+
+@pytest.mark.parametrize(('crest', 'reached'), [(2.0, 2.1), (2.5, 2.6), (3.0, 3.1)])
+def test_noise_peaks_are_limited_and_its_size_is_exact(crest, reached):
+    v = ex.noise(5.0, 0.4, 3000.0, 5.0, FS, np.random.default_rng(1), crest=crest)
+    assert ex.crest_factor(v - 5.0) < reached
+    assert_allclose(np.abs(v - 5.0).max(), 0.4, rtol=1e-12)
+    assert abs(v.mean() - 5.0) < 1e-3
+    assert v[0] == 5.0
+    assert abs(v[-1] - 5.0) < 1e-3
+
+
+def test_seed_reproduces_and_matters():
+    def noise(seed):
+        return ex.noise(0.0, 1.0, 1000.0, 0.5, FS, np.random.default_rng(seed))
+
+    assert_array_equal(noise(1), noise(1))
+    assert not np.array_equal(noise(1), noise(2))
+    one, two = config('identification'), config('identification')
+    assert_array_equal(one.build().v, two.build().v)
+    other = one.build(rng=np.random.default_rng(99))
+    assert not np.array_equal(one.build().v, other.v)
+
+
+def test_multisine_has_odd_lines_only_and_leaves_some_out():
+    rng = np.random.default_rng(5)
+    lines = ex.odd_lines(1, 199, rng)
+    v = ex.multisine(5.0, 4.5, lines, 1.0, 3, FS, rng)
+    assert v.size == 3 * FS
+    assert_allclose(v[:20_000], v[20_000:40_000], atol=1e-12)
+    assert_allclose(np.abs(v - 5.0).max(), 4.5, rtol=1e-12)
+    spectrum = np.abs(np.fft.rfft(v[:20_000] - 5.0))
+    excited = np.flatnonzero(spectrum > 1e-6 * spectrum.max())
+    assert_array_equal(excited, lines)
+    assert np.all(excited % 2 == 1)
+    assert_allclose(spectrum[excited], spectrum[excited].mean(), rtol=1e-9)
+    assert np.all(ex.odd_lines(2, 99, rng) % 2 == 1)
+    # one of every four odd lines detects odd nonlinearity
+    for start in range(1, 193, 8):
+        group = {start, start + 2, start + 4, start + 6}
+        assert len(group & set(lines.tolist())) == 3
+
+
+@given(f=st.floats(0.5, 400.0), periods=st.integers(1, 12))
+def test_sine_has_whole_periods(f, periods):
+    v = ex.sine(5.0, 5.0, f, periods, FS)
+    assert abs(v.size * f / FS - periods) <= 0.5 * f / FS + 1e-9
+    # the next sample would be the first again, within the rounding to a sample
+    after = 5.0 + 5.0 * np.sin(2 * np.pi * f * v.size / FS)
+    assert abs(after - v[0]) <= 5.0 * 2 * np.pi * f * 0.5 / FS + 1e-9
+
+
+@given(
+    a=st.floats(-10, 10),
+    b=st.floats(-10, 10),
+    slew=st.floats(0.5, 500.0),
+    fs=st.floats(100.0, 50_000.0),
+)
+def test_ramp_is_soft_and_keeps_its_slew(a, b, slew, fs):
+    v = np.append(ex.ramp(a, b, slew, fs), b)
+    speed = np.diff(v) * fs
+    assert np.abs(speed).max() <= slew * (1 + 1e-9) + 1e-9
+    assert v[0] == a
+    assert np.all(speed * np.sign(b - a) >= -1e-9 * fs)
+    if v.size > 100:
+        assert abs(speed[0]) < 0.01 * slew
+        assert abs(speed[-1]) < 0.01 * slew
+
+
+def test_settling_sweep_starts_full_and_dies_out_evenly():
+    v = ex.settling_sweep(5.0, 0.5, 20, 20.0, FS) - 5.0
+    assert v.size == FS
+    cycles = np.abs(v.reshape(20, -1)).max(axis=1)
+    assert cycles[0] == pytest.approx(0.5, rel=1e-3)
+    assert cycles[-1] < 0.5 / 15
+    assert np.all(np.diff(cycles) < 0)
+    assert np.abs(np.diff(cycles)).max() < 0.5 / 15
+
+
+def test_noise_after_the_sweep_does_not_ratchet_the_plays():
+    s = config('identification').build()
+    noise = next(x for x in s.segments if x.kind == 'noise')
+    # thresholds wider than twice the noise stand still; without the sweep they wander
+    memory = play_columns(s.v / 10, [0.1, 0.2, 0.5])[:, noise.start : noise.stop]
+    assert np.ptp(memory, axis=1).max() == 0.0
+
+
+def test_steps_go_up_and_down_and_stairs_hold():
+    v = ex.steps(5.0, 1.0, 0.1, 10, FS)
+    jumps = np.diff(v)
+    assert_array_equal(np.unique(v), [4.5, 5.5])
+    assert (np.sum(jumps > 0), np.sum(jumps < 0)) == (5, 5)
+    assert np.diff(np.flatnonzero(jumps)).tolist() == [2000] * 9
+    assert ex.staircase([0, 2, 1], [0.1, 0.2, 0.3], 10.0).tolist() == [0, 2, 2, 1, 1, 1]
+
+
+def test_decaying_triangle_shrinks_to_its_bias():
+    v = ex.decaying_triangle(5.0, 5.0, 5, 20.0, FS)
+    turns = v[1:-1][(np.sign(np.diff(v))[1:] != np.sign(np.diff(v))[:-1])]
+    assert_allclose(turns, [10, 0, 9, 1, 8, 2, 7, 3, 6, 4], atol=1e-9)
+
+
+# -- programmes --------------------------------------------------------------------------------
+
+volt = st.floats(-0.5, 10.5)
+ONE_SIGNAL = st.one_of(
+    st.fixed_dictionaries({'signal': st.just('idle'), 'duration': st.floats(0.01, 0.1)}),
+    st.fixed_dictionaries(
+        {'signal': st.just('hold'), 'level': volt, 'duration': st.floats(0.01, 0.1)}
+    ),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('step'),
+            'bias': volt,
+            'size': st.floats(0.1, 2),
+            'hold': st.just(0.01),
+            'count': st.integers(1, 5),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('noise'),
+            'bias': volt,
+            'amplitude': st.floats(0.1, 5),
+            'cutoff': st.floats(100, 500),
+            'duration': st.floats(0.05, 0.2),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('sine'),
+            'bias': volt,
+            'amplitude': st.floats(0.1, 5),
+            'frequency': st.sampled_from([10, 50]),
+            'periods': st.integers(1, 5),
+            'phase': st.floats(-3, 3),
+        }
+    ),
+    st.fixed_dictionaries(
+        {'signal': st.just('staircase'), 'levels': st.lists(volt, min_size=1, max_size=4)}
+    ).map(lambda d: {**d, 'hold': 0.02}),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('minor_loops'),
+            'biases': st.lists(volt, min_size=1, max_size=3),
+            'amplitude': st.floats(0.1, 1),
+            'cycles': st.just(2),
+            'slope': st.just(100),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('settle'),
+            'bias': volt,
+            'amplitude': st.floats(0.1, 1),
+            'cycles': st.integers(1, 4),
+        }
+    ),
+    st.just({'signal': 'triangle', 'slope': 100}),
+    st.fixed_dictionaries(
+        {
+            'signal': st.just('multisine'),
+            'bias': volt,
+            'amplitude': st.floats(0.1, 5),
+            'lowest': st.just(10),
+            'highest': st.just(90),
+            'period': st.just(0.1),
+            'periods': st.just(2),
+            'realisations': st.integers(1, 2),
+        }
+    ),
+)
+
+
+@settings(deadline=None, max_examples=150)
+@given(items=st.lists(ONE_SIGNAL, min_size=1, max_size=5), rest=st.floats(0, 10))
+def test_every_programme_keeps_its_promises_or_is_refused(items, rest):
+    try:
+        s = program(*items, rest=rest, slew=50, seed=4).build(2000)
+    except ConfigError as error:
+        assert 'outside the limits 0 .. 10 V' in str(error)
+        assert 'segment' in str(error)
+        return
+    assert np.all((s.v >= 0.0) & (s.v <= 10.0))
+    # the segments cover every sample, in order
+    assert [x.start for x in s.segments] == [0, *[x.stop for x in s.segments[:-1]]]
+    assert s.segments[-1].stop == s.n
+    labels = [x.label for x in s.segments]
+    assert all(a != b for a, b in pairwise(labels))
+    assert {x.kind for x in s.segments} <= set(KINDS)
+    for x in s.segments:
+        if x.kind == 'ramp':
+            speed = np.diff(s.v[max(0, x.start - 1) : x.stop + 1])[1:] * 2000
+            assert np.abs(speed).max(initial=0.0) <= 50 * (1 + 1e-6)
+    if s.segments[-1].kind == 'ramp':
+        assert s.v[-1] == rest
+    assert not s.v.flags.writeable
+
+
+@pytest.mark.parametrize('name', CONFIG)
+def test_programmes_that_come_along(name):
+    s = config(name).build()
+    assert s.sample_rate == FS
+    assert np.all((s.v >= 0.0) & (s.v <= 10.0))
+    assert s.v[0] == s.v[-1] == 0.0
+    assert s.n == sum(x.n for x in s.segments)
+    assert len(s.describe().splitlines()) == len(s.segments)
+    # any rate will do
+    assert config(name).build(5000 if name != 'identification' else 10_000).duration == (
+        pytest.approx(s.duration, rel=1e-2)
+    )
+
+
+def test_identification_programme_has_what_the_three_steps_need():
+    s = config('identification').build()
+    assert 14 < s.duration < 18
+    kinds = [x.kind for x in s.segments if x.kind not in ('ramp', 'idle')]
+    assert kinds == ['step', 'settle', 'noise', 'triangle']
+    part = {x.kind: s.v[x.start : x.stop] for x in s.segments}
+    assert np.count_nonzero(np.diff(part['step'])) >= 10
+    assert np.ptp(part['settle']) > np.ptp(part['noise'])
+    assert (part['triangle'].min(), part['triangle'].max()) == (0.0, 10.0)
+
+
+def test_validation_programme_is_the_papers_six_sines():
+    s = config('validation').build()
+    sines = [x for x in s.segments if x.kind == 'sine']
+    assert [x.label for x in sines] == [f'sine:{f}Hz' for f in (1, 10, 50, 80, 100, 120)]
+    for x, f in zip(sines, (1, 10, 50, 80, 100, 120), strict=True):
+        k = np.arange(x.n)
+        assert_allclose(s.v[x.start : x.stop], 5 + 5 * np.sin(2 * np.pi * f * k / FS), atol=1e-9)
+        assert (x.n * f) % FS == 0
+
+
+def test_neighbours_never_share_a_label():
+    s = program({'signal': 'triangle'}, {'signal': 'triangle'}).build(1000)
+    assert [x.label for x in s.segments] == ['triangle', 'triangle:2']
+    hold = {'signal': 'hold', 'level': 4, 'duration': 0.1}
+    s = program(hold, hold, hold).build(1000)
+    assert [x.label for x in s.segments] == ['ramp', 'hold:4V', 'hold:4V-2', 'hold:4V', 'ramp']
+    s = program({**hold, 'name': 'warm'}, hold).build(1000)
+    assert [x.label for x in s.segments][1:3] == ['hold:warm', 'hold:4V']
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers():
+    text = 'limits: [0, 1e1]\nsegments:\n - {signal: hold, level: 5e0, duration: 2e-1}\n'
+    assert parse_program(text).build(1e3).v.max() == 5.0
+
+
+def test_limits_of_the_caller_only_narrow():
+    p = program({'signal': 'hold', 'level': 8, 'duration': 0.1})
+    assert p.build(1000, limits=(-5, 9)).v.max() == 8.0
+    with pytest.raises(ConfigError, match=r'segment 1 \(hold\).*outside the limits 0 .. 7 V'):
+        p.build(1000, limits=(-5, 7))
+    with pytest.raises(ConfigError, match='rest voltage'):
+        p.build(1000, limits=(1, 9))
+    # a signal that follows the range follows the narrower one
+    assert program({'signal': 'triangle'}).build(1000, limits=(0, 6)).v.max() == 6.0
+
+
+SINE = 'signal: sine, bias: 5, amplitude: 5, frequency: 10'
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ('', 'mapping'),
+        ('[1, 2', 'not valid YAML'),
+        ('segments: [{signal: idle, duration: 1}]', 'limits is missing'),
+        ('limits: [0, 10]', 'segments must be a list'),
+        ('limits: [0, 10]\nsegments: []', 'segments must be a list'),
+        ('limits: [10, 0]\nsegments: [{signal: idle, duration: 1}]', 'limits must be'),
+        ('limits: 5\nsegments: [{signal: idle, duration: 1}]', 'limits must be'),
+        ('limits: [0, .inf]\nsegments: [{signal: idle, duration: 1}]', 'not a number'),
+        ('limits: [0, 10]\nrest: 11\nsegments: [{signal: idle, duration: 1}]', 'rest = 11'),
+        ('limits: [0, 10]\nseed: -1\nsegments: [{signal: idle, duration: 1}]', 'seed'),
+        ('limits: [0, 10]\nslew: 0\nsegments: [{signal: idle, duration: 1}]', 'slew'),
+        ('limits: [0, 10]\nspeed: 3\nsegments: [{signal: idle, duration: 1}]', 'unknown speed'),
+        ('limits: [0, 10]\nsegments: [3]', r'segment 1 \(None\): signal must be one of'),
+        ('limits: [0, 10]\nsegments: [{signal: chirp}]', 'must be one of'),
+        ('limits: [0, 10]\nsegments: [{signal: [1]}]', 'must be one of'),
+        ('limits: [0, 10]\nsegments: [{signal: idle}]', r'1 \(idle\): duration is missing'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: -1}]', 'greater than zero'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: true}]', 'not a number'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: abc}]', "'abc' is not a number"),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: .nan}]', 'not a number'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: [1]}]', 'not a number'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, length: 1}]', 'unknown length'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1, name: a b}]', 'must be a word'),
+        (f'limits: [0, 10]\nsegments: [{{{SINE}}}]', 'either periods or duration'),
+        (f'limits: [0, 10]\nsegments: [{{{SINE}, periods: 1.5}}]', 'whole number'),
+        (f'limits: [0, 10]\nsegments: [{{{SINE}, periods: 2, duration: 1}}]', 'either periods'),
+        ('limits: [0, 10]\nsegments: [{signal: triangle, preset: own}]', 'none of range, paper'),
+        ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: []}]', 'list is empty'),
+        ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: [3, 11]}]', 'reaches 0 .. 11 V'),
+        ('limits: [0, 5]\nsegments: [{signal: triangle, preset: paper}]', 'reaches 0 .. 9 V'),
+        ('limits: [0, 10]\nsegments: [{signal: triangle, preset: paper, slope: 60}]', 'own slope'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e9}]', 'make it shorter'),
+        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e-9}]', 'shorter than one sample'),
+        (
+            'limits: [0, 9]\nsegments: [{signal: staircase, levels: [1, 2], hold: [1, 1, 1]}]',
+            '2 levels and 3 holds',
+        ),
+        (
+            'limits: [0, 10]\nsegments: '
+            '[{signal: noise, bias: 5, amplitude: 1, cutoff: 600, duration: 1}]',
+            'half the sampling rate',
+        ),
+        (
+            'limits: [0, 10]\nsegments: [{signal: multisine, bias: 5, amplitude: 1, lowest: 1, '
+            'highest: 600, period: 1, periods: 1}]',
+            'half the sampling rate',
+        ),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_in_one_line(text, says):
+    with pytest.raises(ConfigError, match=says) as caught:
+        parse_program(text, 'lab.yaml').build(1000)
+    assert str(caught.value).startswith('lab.yaml: ')
+    assert '\n' not in str(caught.value)
+
+
+def test_rate_is_needed_from_somewhere():
+    p = program({'signal': 'idle', 'duration': 1})
+    with pytest.raises(ConfigError, match='sample_rate'):
+        p.build()
+    with pytest.raises(ConfigError, match='sample_rate'):
+        p.build(float('nan'))
+    assert program({'signal': 'idle', 'duration': 1}, sample_rate=100).build().n == 100
+
+
+def test_missing_file_is_named():
+    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such file'):
+        load_program('nowhere.yaml')
+
+
+def test_every_signal_says_its_kind():
+    assert {s.kind for s in SIGNALS.values()} <= set(KINDS)

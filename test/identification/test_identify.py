@@ -1,0 +1,508 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The whole of it: known truth back, measured records, awkward records, cancelling, repeating."""
+
+from collections.abc import Callable
+from dataclasses import replace
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.testing import assert_array_equal
+from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
+from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.identification import three_steps
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.files import load_model, model_from_dict, model_to_dict, save_model
+from piezo_ident.model.simulated_stage import (
+    load_stage,
+    Sensor,
+    simulate,
+    simulate_truth,
+    SimulatedStage,
+)
+from piezo_ident.model.stage_model import EffectSetting, Scaling
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+
+pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get('PIEZO_IDENT_DATA', ROOT.parent / 'shared/data'))
+PAPER = load_stage(ROOT / 'config/stage_paper.yaml')
+DENSE = load_stage(ROOT / 'config/stage_dense.yaml')
+FULL = load_program(ROOT / 'config/program_identification.yaml')
+SHORT = """
+limits: [0, 10]
+sample_rate: 20000
+seed: 1
+slew: 40
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 16}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1.5}
+  - {signal: triangle, slope: 20}
+  - {signal: idle, duration: 0.1}
+"""
+#: the search over orders has tests of its own
+QUICK = Settings(order=(10, 10))
+FREQUENCIES = (1, 10, 50, 80, 100, 120)
+
+
+def short(stage=PAPER, noise=None, seed=1, text=SHORT) -> Record:
+    if noise is not None:
+        stage = replace(stage, sensor=replace(stage.sensor, noise_rms=noise * 75e-6))
+    return simulate(stage, parse_program(text).build(), np.random.default_rng(seed), 'short')
+
+
+def sine_errors(truth, model) -> list[float]:
+    """Return steady-state errors under v = 5 + 5 sin(2 pi f t), % of stroke (Table I)."""
+    errors, fs = [], 20_000
+    for f in FREQUENCIES:
+        soft = 5 * (1 - np.cos(np.pi * np.arange(fs // 2) / (fs // 2))) / 2
+        drop = fs * max(1, np.ceil(1 / f))
+        t = np.arange(int(drop + fs * max(1 / f, 0.2))) / fs
+        # the amplitude grows over the part that is dropped
+        v = np.concatenate([soft, 5 + 5 * np.sin(2 * np.pi * f * t) * np.minimum(1, 4 * t)])
+        last = slice(soft.size + int(drop), None)
+        y, y_hat = (m.stream().process(v)[last] for m in (truth, model))
+        errors.append(100 * float(np.sqrt(np.mean((y - y_hat) ** 2)) / np.ptp(y)))
+    return errors
+
+
+def loop_error(truth, model) -> float:
+    """Return the error over minor loops, % of their stroke."""
+    v = load_program(ROOT / 'config/program_minor_loops.yaml').build().v
+    y, y_hat = (m.stream().process(v) for m in (truth, model))
+    return 100 * float(np.sqrt(np.mean((y - y_hat) ** 2)) / np.ptp(y))
+
+
+@pytest.fixture(scope='module')
+def paper():
+    record = simulate(PAPER, FULL.build(), np.random.default_rng(1), 'paper')
+    return record, identify(record)
+
+
+# -- known truth -------------------------------------------------------------------------------
+
+
+def test_paper_stage_is_found(paper):
+    _, result = paper
+    assert result.delay.samples == 3
+    assert result.delay.source == 'steps'
+    assert result.delay.agree
+    assert result.model.dynamics.is_stable
+    assert result.model.dynamics.gain == pytest.approx(1.0, abs=1e-9)
+    assert result.warnings == ()
+    assert result.not_identified == ()
+    errors = sine_errors(PAPER.model, result.model)
+    assert max(errors) <= 0.02
+    assert loop_error(PAPER.model, result.model) <= 0.02
+    # the noise of the sensor and of its converter, 1.5 nm and 2.3 nm / sqrt(12)
+    assert result.noise_floor == pytest.approx(100 * 1.64e-9 / result.stroke, rel=0.1)
+    assert result.error('selection') == pytest.approx(result.noise_floor, rel=0.1)
+
+
+def test_hysteresis_alone_misses_as_in_the_paper(paper):
+    # worked out from the printed coefficients for a stage that hides nothing
+    errors = sine_errors(PAPER.model, paper[1].model.without_dynamics())
+    expected = [0.09, 0.85, 4.3, 6.8, 8.5, 10.2]
+    assert errors == pytest.approx(expected, rel=0.06)
+
+
+def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
+    def first_step(*arguments):
+        found = three_steps.first_step(*arguments)
+        return replace(found, samples=7, step=replace(found.step, samples=7))
+
+    monkeypatch.setattr('piezo_ident.identification.identify.first_step', first_step)
+    result = identify(short(noise=2e-5), QUICK)
+    assert (result.delay.step.samples, result.delay.scan) == (7, 3)
+    assert (result.delay.samples, result.delay.source) == (3, 'scan')
+    said = 'steps say a delay of 7 samples, the ARX loss says 3; the loss was followed'
+    assert said in result.warnings
+    assert max(sine_errors(PAPER.model, result.model)) < 0.1
+
+
+def test_swarm_and_optimum_are_both_told(paper):
+    _, result = paper
+    fit = result.hysteresis
+    assert fit.solver == 'swarm'
+    assert fit.optimum_loss <= fit.swarm_loss <= 1.01 * fit.optimum_loss
+    assert result.swarm.nfev > 0
+    assert fit.hysteresis.thresholds.size == 9
+
+
+def test_small_signal_gain_is_the_slope_of_h(paper):
+    dynamics = paper[1].dynamics
+    assert dynamics.slope_measured == pytest.approx(dynamics.slope_model, rel=0.01)
+    assert dynamics.bias == pytest.approx(0.5, abs=0.01)
+
+
+def test_inputs_stay_and_the_seed_repeats_bit_for_bit():
+    record = short()
+    piece = record.pieces[0]
+    v, y = piece.v.copy(), piece.y.copy()
+    one, two = identify(record, QUICK), identify([short()], QUICK)
+    assert_array_equal(piece.v, v)
+    assert_array_equal(piece.y, y)
+    assert model_to_dict(one.model) == model_to_dict(two.model)
+    assert one.hysteresis.swarm_loss == two.hysteresis.swarm_loss
+    assert one.errors == two.errors
+    other = identify(record, replace(QUICK, seed=1))
+    assert other.hysteresis.swarm_loss != one.hysteresis.swarm_loss
+
+
+def test_model_keeps_its_story_in_the_file(paper, tmp_path):
+    _, result = paper
+    save_model(result.model, tmp_path / 'model.yaml')
+    again = load_model(tmp_path / 'model.yaml')
+    assert model_to_dict(again) == model_to_dict(result.model)
+    story = again.identification
+    assert story['records'] == ['paper']
+    assert story['seed'] == 0
+    assert len(story['uncertainties']['weights']) == 9
+    assert len(story['uncertainties']['a']) == again.dynamics.a.size
+    assert len(story['uncertainties']['b']) == again.dynamics.b.size
+
+
+@pytest.mark.parametrize('noise', [1e-5, 1e-4, 5e-4])
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_seeds_and_noise(seed, noise):
+    result = identify(short(noise=noise, seed=seed), Settings(seed=seed))
+    assert result.delay.samples == 3
+    assert result.model.dynamics.is_stable
+    errors = sine_errors(PAPER.model, result.model)
+    assert max(errors) <= max(0.02, 200 * noise)
+
+
+def test_dense_truth_that_no_ten_thresholds_can_hit():
+    record = simulate(DENSE, FULL.build(), np.random.default_rng(1), 'dense')
+    for refine, limit in ((False, 0.25), (True, 0.05)):
+        model = identify(record, Settings(refine=refine)).model
+        sines, loops = sine_errors(DENSE.model, model), loop_error(DENSE.model, model)
+        assert max(*sines, loops) <= limit
+
+
+def test_dense_truth_from_a_short_programme():
+    # 1.5 s of noise leave 0.09 % above 10 Hz, whatever the thresholds
+    model = identify(short(DENSE), replace(QUICK, refine=True)).model
+    assert max(sine_errors(DENSE.model, model)) <= 0.12
+    assert loop_error(DENSE.model, model) <= 0.05
+
+
+def test_retracting_stage():
+    s = PAPER.model.scaling
+    model = replace(PAPER.model, scaling=Scaling(s.v0, s.V, 5e-5, -s.Y, s.range))
+    stage = SimulatedStage(model, PAPER.sensor)
+    result = identify(short(stage), QUICK)
+    assert result.model.scaling.Y < 0
+    assert np.all(result.model.hysteresis.weights >= 0)
+    assert max(sine_errors(model, result.model)) <= 0.02
+
+
+def test_delay_and_orders_may_be_given():
+    result = identify(short(), Settings(delay=3, order=(7, 6), solver='least_squares'))
+    assert result.delay.source == 'given'
+    assert result.dynamics.order == (7, 6)
+    assert result.model.dynamics.a.size == 7
+    assert result.swarm is None
+
+
+# -- stopping ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('step', ['delay', 'dynamics', 'hysteresis'])
+@pytest.mark.parametrize('refine', [False, True])
+@pytest.mark.parametrize('labelled', [False, True])
+def test_every_step_can_be_cancelled(step, refine, labelled):
+    record = short()
+    if not labelled:
+        p = record.pieces[0]
+        record = Record((Piece(p.v[-42_000:], p.y[-42_000:], p.sample_rate),))
+    seen: list[tuple[str, float]] = []
+
+    def progress(name, share):
+        seen.append((name, share))
+        if name == step:
+            raise Cancelled('on request')
+
+    with pytest.raises(Cancelled, match='on request'):
+        identify(record, replace(QUICK, refine=refine), progress=progress)
+    assert seen[-1][0] == step
+
+
+def test_swarm_can_be_cancelled_while_it_flies():
+    def progress(name, share):
+        if name == 'hysteresis' and share > 0.3:
+            raise Cancelled('in flight')
+
+    with pytest.raises(Cancelled, match='in flight'):
+        identify(short(), QUICK, progress=progress)
+
+
+def test_progress_rises_to_one_in_every_step():
+    for refine in (False, True):
+        seen: dict[str, list[float]] = {}
+        identify(
+            short(),
+            replace(QUICK, refine=refine),
+            progress=lambda name, share, seen=seen: seen.setdefault(name, []).append(share),
+        )
+        assert list(seen) == ['delay', 'dynamics', 'hysteresis']
+        for shares in seen.values():
+            assert np.all(np.diff(shares) >= -1e-12)
+            assert shares[0] == 0.0
+            assert shares[-1] == 1.0
+
+
+# -- what a lab really hands over --------------------------------------------------------------
+
+
+def measured(name: str) -> Record:
+    path = DATA / name
+    if not path.is_file():
+        pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA to the folder of measured records')
+    return read_record(path)
+
+
+@pytest.mark.parametrize(('refine', 'limit'), [(False, 0.30), (True, 0.20)])
+def test_measured_one_hertz_record(refine, limit):
+    result = identify(measured('piezo_1hz.csv'), Settings(refine=refine, hold_out=1.5))
+    (held,) = [row for row in result.errors if row.data == 'held out']
+    modes = result.model.dynamics.modes(result.model.sample_rate)
+    assert held.n == 7500
+    assert held.percent <= limit
+    assert result.delay.samples == 1
+    assert any(abs(f / 972 - 1) <= 0.05 for f, _ in modes)
+    assert result.warnings
+
+
+def test_measured_closed_loop_is_refused():
+    with pytest.raises(IdentificationError, match='position controller') as caught:
+        identify(measured('afm_hold.csv'))
+    # what the drive makes up for in the hold, a straight line over four decades of time
+    assert 'creep of 0.31 V a decade' in str(caught.value)
+
+
+def test_measured_open_loop_is_identified_with_a_warning():
+    result = identify(measured('afm_open_loop.csv'))
+    assert result.warnings
+    assert result.model.dynamics.is_stable
+    assert result.error('fitted') < 2.0
+
+
+# -- awkward records ---------------------------------------------------------------------------
+
+
+def part(*kinds: str, record: Record | None = None) -> Record:
+    """Return the record cut down to the segments of some kinds, side by side."""
+    piece = (record or short()).pieces[0]
+    cuts = [s for s in piece.segments if s.kind in kinds]
+    first, last = cuts[0].start, cuts[-1].stop
+    return Record((piece.cut(first, last),), '+'.join(kinds))
+
+
+def relabelled(record: Record, *keep: str) -> Record:
+    """Return the record with only some kinds of its labels."""
+    pieces = tuple(
+        replace(p, segments=tuple(s for s in p.segments if s.kind in keep)) for p in record
+    )
+    return Record(pieces, record.name)
+
+
+def changed(change: Callable[[np.ndarray, np.ndarray], tuple], base: Record | None = None):
+    p = (base or short()).pieces[0]
+    v, y = change(p.v, p.y)
+    return Record((Piece(v, y, p.sample_rate, 0.0, p.segments),), 'changed')
+
+
+def decimated(record: Record, by: int) -> Record:
+    p = record.pieces[0]
+    segments = tuple(
+        Segment(s.label, -(-s.start // by), -(-s.stop // by))
+        for s in p.segments
+        if -(-s.stop // by) > -(-s.start // by)
+    )
+    return Record((Piece(p.v[::by], p.y[::by], p.sample_rate / by, 0.0, segments),), 'slow')
+
+
+def stub(record: Record, n: int) -> Record:
+    """Return the record with segments of n samples."""
+    p = record.pieces[0]
+    segments = tuple(Segment(s.label, s.start, min(s.stop, s.start + n)) for s in p.segments)
+    return Record((replace(p, segments=segments),), 'stub')
+
+
+def two_records(order: int) -> list[Record]:
+    p = short().pieces[0]
+    cut = next(s for s in p.segments if s.kind == 'triangle').start
+    one, two = Record((p.cut(0, cut),), 'noise'), Record((p.cut(cut, p.n),), 'triangle')
+    return [one, two][:: order or 1]
+
+
+NOISY = np.random.default_rng(0)
+TALL = SHORT.replace(
+    '{signal: triangle, slope: 20}', '{signal: triangle, slope: 20, peaks: [3, 6]}'
+)
+FAST = SHORT.replace(
+    '{signal: triangle, slope: 20}',
+    '{signal: triangle, slope: 400, peaks: [' + ', '.join(['10'] * 40) + ']}',
+)
+
+
+def silent_noise(v, y):
+    s = next(s for s in short().pieces[0].segments if s.kind == 'noise')
+    v, y = v.copy(), y.copy()
+    v[s.start : s.stop], y[s.start : s.stop] = v[s.start], y[s.start]
+    return v, y
+
+
+def slow_noise(v, y):
+    s = next(s for s in short().pieces[0].segments if s.kind == 'noise')
+    v, y = v.copy(), y.copy()
+    v[s.start : s.stop] = np.linspace(5, 5.2, s.n)
+    y[s.start : s.stop] = y[s.start] + np.linspace(0, 1e-6, s.n)
+    return v, y
+
+
+AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
+    'only triangle': lambda: part('triangle'),
+    'only noise': lambda: part('noise'),
+    'only steps': lambda: part('step'),
+    'noise without triangle': lambda: part('idle', 'step', 'settle', 'noise'),
+    'unlabelled': lambda: relabelled(short()),
+    'strange labels': lambda: relabelled(short(), 'idle', 'ramp'),
+    'noise and triangle without steps': lambda: relabelled(short(), 'noise', 'triangle'),
+    'segments of 1 sample': lambda: stub(short(), 1),
+    'segments of 30 samples': lambda: stub(short(), 30),
+    'segments of 2500 samples': lambda: stub(short(), 2500),
+    'constant displacement': lambda: changed(lambda v, y: (v, np.full(y.size, 1e-3))),
+    'constant voltage': lambda: changed(lambda v, y: (np.full(v.size, 5.0), y)),
+    'displacement of rounding only': lambda: changed(
+        lambda v, y: (v, 1e-3 * (1 + 2.3e-16 * (np.arange(y.size) % 2)))
+    ),
+    'displacement of noise only': lambda: changed(
+        lambda v, y: (v, 1e-9 * np.random.default_rng(0).standard_normal(y.size))
+    ),
+    'one tenth of noise': lambda: short(noise=0.1),
+    'starts at 5 V': lambda: Record((short().pieces[0].cut(30_000, 102_200),), 'late'),
+    'triangle to 6 of 10 V': lambda: short(text=TALL.replace('step, bias: 5', 'step, bias: 9')),
+    'triangle far above the noise': lambda: short(text=SHORT.replace('bias: 5', 'bias: 0.6')),
+    'triangle of many fast cycles': lambda: short(text=FAST),
+    'one kilohertz': lambda: decimated(short(), 20),
+    'fifty hertz': lambda: decimated(short(), 400),
+    'silent noise': lambda: changed(silent_noise),
+    'noise that is a ramp': lambda: changed(slow_noise),
+    'two records': lambda: two_records(1),
+    'two records, other order': lambda: two_records(-1),
+    'the same twice': lambda: [short(), short(seed=2)],
+    'two rates': lambda: [short(), decimated(short(), 4)],
+    'a single sample': lambda: Record((Piece([1.0], [1e-6], 1e3),)),
+    'two samples': lambda: Record((Piece([1.0, 2.0], [1e-6, 2e-6], 1e3),)),
+    'hundred samples': lambda: Record(
+        (Piece(np.linspace(0, 1, 100), np.linspace(0, 1e-6, 100), 1e3),)
+    ),
+    'one jump': lambda: Record(
+        (Piece(np.arange(2000) // 1000, 1e-6 * (np.arange(2000) // 1000), 1e3),)
+    ),
+    'noise unlabelled': lambda: relabelled(part('noise')),
+}
+
+
+@pytest.mark.parametrize('refine', [False, True])
+@pytest.mark.parametrize('case', AWKWARD)
+def test_awkward_records_give_a_result_or_a_reason(case, refine):
+    records = AWKWARD[case]()
+    try:
+        result = identify(records, Settings(refine=refine, max_order=4, solver='least_squares'))
+    except PiezoIdentError as error:
+        assert isinstance(error, IdentificationError)
+        assert len(str(error)) > 20
+        assert '\n' not in str(error)
+        return
+    assert result.model.dynamics.is_stable
+    # a result is told of, and is no nonsense: it can be written, and does not explode
+    model_from_dict(model_to_dict(result.model))
+    low, high = result.model.scaling.range
+    sweep = np.concatenate([np.linspace(low, high, 2000), np.linspace(high, low, 2000)])
+    y = result.model.stream().process(sweep)
+    assert np.all(np.isfinite(y))
+    assert np.ptp(y) < 3 * result.stroke
+    assert all(np.isfinite(row.percent) for row in result.errors)
+
+
+def test_huge_offset_and_tiny_stroke():
+    base = short()
+    small = changed(lambda v, y: (v, 1e-3 + y * (1e-5 / 71e-6)), base)
+    result = identify(small, QUICK)
+    assert result.delay.samples == 3
+    plain = identify(base, QUICK)
+    v = np.concatenate([np.linspace(0, 10, 3000), np.linspace(10, 0, 3000)])
+    one = (result.model.stream().process(v) - 1e-3) / 1e-5
+    two = plain.model.stream().process(v) / 71e-6
+    assert np.abs(one - two).max() < 1e-6
+
+
+@pytest.mark.parametrize('scale', [1e-3, 1e3])
+def test_scale_does_not_matter(scale):
+    one = identify(short(), QUICK)
+    two = identify(changed(lambda v, y: (v * scale, y * scale)), QUICK)
+    assert two.delay.samples == one.delay.samples
+    assert two.error('selection') == pytest.approx(one.error('selection'), rel=1e-3)
+    assert two.hysteresis.hysteresis.weights == pytest.approx(
+        one.hysteresis.hysteresis.weights, abs=1e-6
+    )
+
+
+def test_noise_of_a_tenth_hides_the_delay_and_leaves_the_hysteresis():
+    with pytest.raises(IdentificationError, match='delay'):
+        identify(short(noise=0.1), Settings(max_order=4))
+    result = identify(short(noise=0.1), Settings(max_order=4, delay=3))
+    assert any('noise' in w for w in result.warnings)
+    errors = sine_errors(PAPER.model, result.model)
+    assert max(errors) < 10.0
+
+
+def test_segments_in_two_records_are_as_good_as_in_one():
+    for order in (1, -1):
+        result = identify(two_records(order), QUICK)
+        assert result.delay.samples == 3
+        assert max(sine_errors(PAPER.model, result.model)) <= 0.02
+
+
+def test_triangle_that_does_not_cover_the_range_warns():
+    result = identify(short(text=TALL.replace('step, bias: 5', 'step, bias: 9')), QUICK)
+    assert any('does not cover' in w for w in result.warnings)
+    assert result.model.scaling.range == pytest.approx((0.0, 6.0), abs=0.01)
+    wide = result.model.predict(simulate_truth(PAPER, FULL.build()))
+    assert wide.warnings
+
+
+def test_nothing_is_refused():
+    with pytest.raises(IdentificationError, match='no record'):
+        identify([])
+
+
+def test_faults_of_a_file_become_warnings():
+    dac = PAPER.sensor
+    stage = SimulatedStage(
+        PAPER.model, Sensor(dac.noise_rms, dac.dac, replace(dac.adc, high=6e-5))
+    )
+    result = identify(short(stage), QUICK)
+    assert any('clipping' in w for w in result.warnings)
+
+
+def test_creep_does_not_become_dynamics():
+    """Slow poles that stand for creep halved G at 80 Hz before slow motion was filtered out."""
+    setting = EffectSetting('creep', {'gain': [0.012] * 3, 'time_constant': [0.1, 1.0, 10.0]})
+    crept = replace(PAPER, model=replace(PAPER.model, effects=(setting,)))
+    record = simulate(crept, FULL.build(), np.random.default_rng(1), 'crept')
+    G = identify(record, QUICK).model.dynamics
+    f = np.array([10.0, 80.0, 300.0])
+    true = np.abs(PAPER.model.dynamics.normalised().response(f, 20_000.0))
+    np.testing.assert_allclose(np.abs(G.response(f, 20_000.0)), true, rtol=0.01)

@@ -1,0 +1,82 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What can be asked for, and what a result says of itself."""
+
+import numpy as np
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.identification.results import (
+    DelayResult,
+    ErrorRow,
+    Identification,
+    Settings,
+    silent,
+)
+from piezo_ident.identification.step1_delay import StepDelay
+import pytest
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'says'),
+    [
+        ({'thresholds': 1}, 'thresholds'),
+        ({'thresholds': 401}, 'thresholds'),
+        ({'solver': 'magic'}, 'solver'),
+        ({'max_order': 0}, 'max_order'),
+        ({'max_order': 51}, 'max_order'),
+        ({'order': (0, 1)}, 'order'),
+        ({'order': (1, 51)}, 'order'),
+        ({'order': (2,)}, 'order'),
+        ({'order': (2, 2, 2)}, 'order'),
+        ({'delay': -1}, 'delay'),
+        ({'delay': 10_001}, 'delay'),
+        ({'hold_out': 0.0}, 'hold_out'),
+        ({'hold_out': float('nan')}, 'hold_out'),
+        ({'hold_out': float('inf')}, 'hold_out'),
+        ({'seed': -1}, 'seed'),
+        ({'swarm_size': 1}, 'swarm_size'),
+        ({'swarm_iterations': 0}, 'swarm_iterations'),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(wrong, says):
+    with pytest.raises(ConfigError, match=says):
+        Settings(**wrong)
+
+
+def test_what_can_be_followed_is_taken():
+    assert Settings(order=(3, 2), delay=0, hold_out=0.5, refine=True).order == (3, 2)
+    silent('delay', 0.5)
+
+
+def step(samples):
+    return StepDelay(samples, 0.3, 4, 0.0, 0.0, np.zeros(1, dtype=int), np.zeros(1))
+
+
+def test_steps_and_scan_agree_within_a_sample():
+    assert DelayResult(3, 0.3, 'steps', step(3), scan=4).agree is True
+    assert DelayResult(3, 0.3, 'steps', step(3), scan=5).agree is False
+    assert DelayResult(3, 0.3, 'steps', step(3)).agree is None
+    assert DelayResult(3, 0.3, 'scan', step(None), scan=3).agree is None
+
+
+def test_error_over_rows_is_weighted_by_samples():
+    rows = (
+        ErrorRow('r', 'a', 3.0, 0, 0, 100, 'held out'),
+        ErrorRow('r', 'b', 1.0, 0, 0, 300, 'held out'),
+        ErrorRow('r', 'b', 50.0, 0, 0, 300, 'fitted'),
+    )
+    result = Identification(
+        None,
+        None,
+        None,
+        None,
+        rows,
+        None,
+        '',
+        1.0,
+        (),
+        (),
+        Settings(),  # type: ignore[arg-type]
+    )
+    assert result.error('held out') == pytest.approx(np.sqrt((9 * 100 + 300) / 400))
+    assert np.isnan(result.error('selection'))

@@ -1,0 +1,123 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Step 1: known delays, both signs, both directions, noise, and nothing to find."""
+
+import numpy as np
+from numpy.testing import assert_array_equal
+from paper_stage import A, B
+from piezo_ident.identification.step1_delay import (
+    average_step,
+    delay_from_loss,
+    delay_from_steps,
+    find_jumps,
+)
+from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.record.record import Piece
+import pytest
+
+FS = 20_000.0
+# its first coefficient is 2 % of the final value
+G = Dynamics(A, B)
+
+
+def steps(d, noise=0.0, gain=75e-7, seed=0, count=16, hold=1200, size=1.0):
+    """Return a piece of steps up and down, 75 um at 10 V and noise as a share of that."""
+    v = np.concatenate([np.full(hold, 5.0 + size * (k % 2)) for k in range(count)])
+    y = gain * Delay(d).apply(filter_arx(G.a, G.b, v))
+    return Piece(v, y + noise * 75e-6 * np.random.default_rng(seed).standard_normal(v.size), FS)
+
+
+@pytest.mark.parametrize('d', range(11))
+def test_known_delays_without_noise(d):
+    found = delay_from_steps([steps(d)])
+    assert found.samples == d
+    assert found.repeats == 15
+    assert found.std == pytest.approx(12**-0.5)
+
+
+@pytest.mark.parametrize('noise', [1e-5, 1e-4, 5e-4])
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('gain', [75e-7, -75e-7])
+def test_known_delays_in_noise(noise, seed, gain):
+    found = delay_from_steps([steps(3, noise, gain, seed)])
+    # at 5e-4 of stroke the first sample, 2e-4 of it after averaging, is not above the noise
+    assert found.samples == 3 or (noise == 5e-4 and 3 <= found.samples <= 4)
+    assert found.noise == pytest.approx(noise * 75e-6 / np.sqrt(15), rel=0.35)
+
+
+def test_one_direction_and_one_step_will_do():
+    for down in (False, True):
+        v = np.concatenate([np.full(500, 6.0 if down else 5.0), np.full(500, 5.5)])
+        y = 75e-7 * Delay(4).apply(filter_arx(G.a, G.b, v))
+        found = delay_from_steps([Piece(v, y, FS)])
+        assert found.samples == 4
+        assert found.repeats == 1
+
+
+def test_response_is_that_of_the_stage_in_metres_a_volt():
+    found = delay_from_steps([steps(3)])
+    expected = 75e-7 * Delay(3).apply(filter_arx(G.a, G.b, (np.arange(-100, 60) >= 0) * 1.0))
+    assert_array_equal(found.lag, np.arange(-100, 60))
+    assert np.abs(found.response - expected).max() < 1e-3 * expected.max()
+    responses, heights = average_step([steps(3)])
+    assert responses.shape == (15, 160)
+    assert_array_equal(heights, np.ones(15))
+
+
+def test_settling_stage_is_no_early_rise():
+    piece = steps(3, 1e-5)
+    drift = 75e-6 * 0.002 * np.log1p(np.arange(piece.n) % 1200)
+    assert delay_from_steps([Piece(piece.v, piece.y + drift, FS)]).samples in (2, 3)
+
+
+def test_no_step_and_none_above_the_noise():
+    rng = np.random.default_rng(0)
+    for v in (np.full(3000, 5.0), np.linspace(0, 10, 3000), np.array([5.0])):
+        found = delay_from_steps([Piece(v, 1e-9 * rng.standard_normal(v.size), FS)])
+        assert found.samples is None
+        assert found.std == float('inf')
+        assert found.repeats == 0
+    assert delay_from_steps([]).samples is None
+    deaf = [steps(3, noise=1.0, gain=0.0, seed=s) for s in range(20)]
+    assert sum(delay_from_steps([p]).samples is not None for p in deaf) <= 1
+
+
+@pytest.mark.filterwarnings('error')
+def test_displacement_that_never_moves_is_no_delay():
+    piece = steps(3)
+    for still in (0.0, 1e-3):
+        found = delay_from_steps([Piece(piece.v, np.full(piece.n, still), FS)])
+        assert found.samples is None
+
+
+def test_huge_offset_does_not_matter():
+    piece = steps(3, 1e-5)
+    assert delay_from_steps([Piece(piece.v, piece.y + 1e-3, FS)]).samples == 3
+
+
+def test_jackknife_sees_repeats_that_disagree():
+    # without the one early step the rest say 9
+    found = delay_from_steps([steps(3, count=2), steps(9, count=8)])
+    assert found.samples == 3
+    assert found.std == pytest.approx(np.sqrt(7 / 8 * (6.0**2 * 7 / 8)))
+    assert delay_from_steps([steps(3, 1e-5)]).std == pytest.approx(12**-0.5)
+
+
+def test_jumps_are_the_first_samples_after_a_rest():
+    v = np.concatenate([np.zeros(200), np.ones(150), np.full(30, 0.5), np.zeros(200)])
+    # the third jump has too short a rest before it
+    assert_array_equal(find_jumps(v, 100, 60), [200, 350])
+    assert_array_equal(find_jumps(v, 100, 290), [200])
+    assert find_jumps(np.zeros(50), 10, 10).size == 0
+    assert find_jumps(np.zeros(1), 10, 10).size == 0
+    measured = v + 1e-4 * np.random.default_rng(0).standard_normal(v.size)
+    assert_array_equal(find_jumps(measured, 100, 60), [200, 350])
+
+
+def test_delay_from_loss_is_the_largest_that_costs_nothing():
+    assert delay_from_loss(np.array([1.0, 1.0, 1.01, 1.3, 5.0])) == 2
+    assert delay_from_loss(np.array([1.3, 1.0, 1.5])) == 1
+    # a loss that never rises tells nothing
+    assert delay_from_loss(np.zeros(3)) is None
+    assert delay_from_loss(np.array([1.0, 1.01, 1.0])) is None

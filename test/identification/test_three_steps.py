@@ -1,0 +1,129 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delay from steps or scan, G with the hysteresis undone, and which samples are used."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.prepare import runs_of, scaling_of
+from piezo_ident.identification.results import Settings, silent
+from piezo_ident.identification.step3_hysteresis import factorise
+from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+
+pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = load_stage(ROOT / 'config/stage_paper.yaml')
+PROGRAM = """
+limits: [0, 10]
+sample_rate: 20000
+slew: 40
+segments:
+  - {signal: idle, duration: 0.05}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 12}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
+  - {signal: triangle, slope: 30}
+"""
+
+
+def runs(*records):
+    pieces = [p for r in records for p in r]
+    return runs_of(records, 20_000.0, scaling_of(pieces))
+
+
+def record(stage=PAPER, labels=('step', 'settle', 'noise', 'triangle')):
+    made = simulate(stage, parse_program(PROGRAM).build(), np.random.default_rng(0))
+    p = made.pieces[0]
+    return Record((replace(p, segments=tuple(s for s in p.segments if s.kind in labels)),))
+
+
+def with_delay(d):
+    return replace(PAPER, model=replace(PAPER.model, delay=Delay(d)))
+
+
+@pytest.mark.parametrize('d', [0, 1, 7])
+def test_delay_from_steps_and_from_the_scan_agree(d):
+    found = first_step(runs(record(with_delay(d))), Settings(), silent)
+    assert (found.samples, found.source, found.agree) == (d, 'steps', True)
+
+
+def test_delay_from_noise_alone_has_the_doubt_of_its_band():
+    found = first_step(runs(record(labels=('noise', 'triangle'))), Settings(), silent)
+    assert found.source == 'scan'
+    # half a period of 3 kHz is 3.3 samples
+    assert abs(found.samples - 3) <= found.std
+    assert 2 < found.std < 4
+
+
+def test_given_delay_is_taken():
+    found = first_step(runs(record()), Settings(delay=5), silent)
+    assert (found.samples, found.source, found.std) == (5, 'given', 0.0)
+
+
+def test_dynamics_are_found_with_the_hysteresis_undone():
+    result, G = second_step(runs(record()), Delay(3), Settings(order=(10, 10)), silent)
+    truth = PAPER.model.dynamics
+    f = np.array([1.0, 50, 120, 500, 1500, 2500])
+    error = G.response(f, 2e4) - truth.response(f, 2e4) / truth.gain
+    assert np.abs(error).max() < 2e-3
+    assert G.is_stable
+    assert G.gain == pytest.approx(1.0, abs=1e-9)
+    assert result.covariance.shape == (20, 20)
+    assert set(result.methods) == {'least squares', 'instrumental variables', 'output error'}
+    assert result.methods['output error'] <= min(result.methods.values()) * 1.05
+    assert 3000 < result.band < 4500
+    assert result.slope_measured == pytest.approx(result.slope_model, rel=0.02)
+
+
+def test_short_and_silent_noise_are_refused():
+    p = record().pieces[0]
+    noise = p.find('noise')[0]
+    cut = replace(
+        p,
+        segments=tuple(
+            Segment(s.label, s.start, s.start + 1000) if s is noise else s for s in p.segments
+        ),
+    )
+    with pytest.raises(IdentificationError, match='at least 2000'):
+        second_step(runs(Record((cut,))), Delay(3), Settings(max_order=3), silent)
+    v = p.v.copy()
+    v[noise.start : noise.stop] = 5.0
+    still = Record((Piece(v, p.y, p.sample_rate, 0.0, p.segments),))
+    with pytest.raises(IdentificationError, match='constant in the noise'):
+        second_step(runs(still), Delay(3), Settings(max_order=3), silent)
+
+
+def test_fitted_and_held_out_triangles_are_the_same_runs():
+    slow = record()
+    quick = Record(
+        (
+            Piece(
+                np.tile([0.0, 5.0], 3000),
+                np.zeros(6000),
+                2e4,
+                0.0,
+                (Segment('triangle', 0, 6000),),
+            ),
+        )
+    )
+    made = runs(slow, quick)
+    fit, held = triangle_excerpts(made), triangle_excerpts(made, held=True)
+    assert len(fit) == len(held) == 2
+    assert not held[1].use.any()
+    for one, two in zip(fit, held, strict=True):
+        assert not np.any(one.use & two.use)
+    assert_array_equal(fit[0].use | held[0].use, made[0].mask('triangle'))
+    # an excerpt of nothing adds nothing
+    G = Dynamics(np.array([-0.5]), np.array([0.5]))
+    R, more = (factorise(part, np.array([0.2, 0.6]), G, Delay(3)) for part in (held[:1], held))
+    assert_allclose((more.T @ more)[2:, 2:], (R.T @ R)[1:, 1:], rtol=1e-9)

@@ -1,0 +1,110 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One record without labels: what it excites is found, what it does not is named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.testing import assert_allclose
+from piezo_ident.common.config import find_config
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.prepare import runs_of, scaling_of
+from piezo_ident.identification.results import Settings, silent
+from piezo_ident.identification.unlabelled import joint_fit
+from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.record.record import Piece, Record
+import pytest
+
+pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
+
+ROOT = Path(__file__).resolve().parents[2]
+FS = 5000.0
+# a lightly damped mode at 700 Hz, as a small stage at 5 kHz has it
+POLE = np.exp(2 * np.pi * 700 / FS * (-0.03 + 1j * np.sqrt(1 - 0.03**2)))
+G = Dynamics(np.real(np.poly([POLE, np.conj(POLE)]))[1:], [0.3, 0.3]).normalised()
+STAGE = replace(
+    load_stage(ROOT / 'config/stage_paper.yaml').model, sample_rate=FS, dynamics=G, delay=Delay(2)
+)
+
+
+def run_of(v, noise=1e-5, memory=None):
+    v = np.asarray(v, dtype=float)
+    y = STAGE.stream(memory).process(v)
+    y = y + noise * 75e-6 * np.random.default_rng(0).standard_normal(v.size)
+    piece = Piece(v, y, FS)
+    scaling = scaling_of([piece])
+    return runs_of([Record((piece,))], FS, scaling)[0], scaling
+
+
+def sine(seconds, f=2.0, phase=0.0):
+    return 5 - 5 * np.cos(2 * np.pi * f * np.arange(int(seconds * FS)) / FS + phase)
+
+
+def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
+    steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 1500)
+    run, scaling = run_of(np.concatenate([steps, sine(2.0)]))
+    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
+    assert fit.delay.samples == 2
+    assert fit.delay.source == 'steps'
+    assert fit.not_identified == ()
+    assert any(abs(f / 700 - 1) < 0.03 for f, _ in fit.G.modes(FS))
+    assert fit.G.is_stable
+    assert fit.G.gain == pytest.approx(1.0, abs=1e-9)
+
+
+def test_slow_record_leaves_delay_and_dynamics_neutral_and_says_so():
+    run, scaling = run_of(sine(2.0))
+    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
+    assert [what for what, _ in fit.not_identified] == ['delay', 'dynamics']
+    assert (fit.delay.samples, fit.delay.source, fit.delay.std) == (0, 'none', float('inf'))
+    assert fit.G.a.size == 0
+    assert fit.dynamics.order == (0, 1)
+
+
+def test_memory_of_a_start_in_the_middle_is_found():
+    rng = np.random.default_rng(4)
+    r = STAGE.hysteresis.thresholds
+    truth = 0.5 - np.cumsum(np.diff(np.concatenate([[0.0], r])) * rng.uniform(0, 1, r.size))
+    run, scaling = run_of(sine(2.0, phase=np.pi / 2), memory=truth)
+    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
+    assert fit.memory is not None
+    found = fit.memory(fit.hysteresis.thresholds)
+    u = run.u
+    with_it, without = fit.hysteresis(u, found), fit.hysteresis(u)
+
+    def early(w):
+        e = (run.x - w)[:1000]
+        return np.std(e - np.mean((run.x - w)[-5000:]))
+
+    assert early(with_it) < 0.5 * early(without)
+    assert np.all(found <= u[0] + 1e-12)
+    assert np.all(found >= u[0] - fit.hysteresis.thresholds - 1e-12)
+    # thresholds of another grid get a memory that can be, too
+    other = np.array([0.01, 0.33, 0.97])
+    assert np.all(fit.memory(other) >= u[0] - other - 1e-12)
+
+
+def test_given_delay_is_taken_and_too_little_is_refused():
+    run, scaling = run_of(sine(1.0))
+    assert joint_fit(run, run.piece.n, scaling, Settings(delay=4), silent).delay.samples == 4
+    with pytest.raises(IdentificationError, match='too few'):
+        joint_fit(run, 50, scaling, Settings(), silent)
+    flat, scaling = run_of(np.concatenate([np.zeros(1000), sine(1.0)]))
+    with pytest.raises(IdentificationError, match='moves by 0'):
+        joint_fit(flat, 900, scaling, Settings(), silent)
+    assert_allclose(flat.u[:900], 0.0)
+
+
+def test_steps_alone_do_not_identify_hysteresis():
+    stage = load_stage(find_config('paper', 'stage'))
+    text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.1, count: 40}'
+    played = simulate(stage, parse_program(text).build(20000.0), np.random.default_rng(1))
+    steps = played.find('step')[0]
+    record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
+    missing = dict(identify(record).not_identified)
+    assert 'triangle' in missing['hysteresis']

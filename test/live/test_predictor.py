@@ -1,0 +1,366 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""A model beside a running stage, and what is made of its residual."""
+
+import numpy as np
+from piezo_ident.common.errors import ModelError
+from piezo_ident.live.monitor import LiveError, Matcher, Preview
+from piezo_ident.live.predictor import (
+    expected_error,
+    memory_after,
+    Predictor,
+    TurningPoints,
+    warm_up,
+)
+from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.blocks import Samples
+from piezo_ident.record.record import Piece
+import pytest
+
+RATE = 10_000.0
+
+
+def model(seed=0, rate=RATE, v0=0.0, **kwargs):
+    rng = np.random.default_rng(seed)
+    return StageModel(
+        sample_rate=rate,
+        scaling=Scaling(v0, 10.0, 0.0, 75e-6, (v0, v0 + 10.0)),
+        hysteresis=Hysteresis(
+            thresholds=np.linspace(0.05, 0.95, 10), weights=rng.random(10), p1=-0.2, p2=0.5
+        ),
+        dynamics=Dynamics(a=np.array([-1.5, 0.6]), b=np.array([0.06, 0.04])),
+        delay=Delay(3),
+        **kwargs,
+    )
+
+
+def drive(n, seed=1):
+    """Return a walk between 0 and 10 V that starts at 0, with loops of all sizes."""
+    rng = np.random.default_rng(seed)
+    corners = np.concatenate([[0.0], rng.uniform(0.0, 10.0, n // 300)])
+    return np.interp(np.arange(n), np.arange(corners.size) * 300, corners)
+
+
+def cut(v, size=100, start=0, rate=RATE):
+    t = (start + np.arange(v.size)) / rate
+    return [Samples(t[i : i + size], v[i : i + size], 'noise') for i in range(0, v.size, size)]
+
+
+def predicted(predictor, blocks):
+    made = [predictor.process(b) for b in blocks]
+    return np.concatenate([m.values for m in made if m is not None])
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_turning_points_hold_the_memory_of_any_model_exactly(seed):
+    v = drive(20_000, seed)
+    points = TurningPoints()
+    for block in np.split(v, [7, 100, 5000, 5001, 12_345]):
+        points.add(block)
+    assert points.values.size < 30
+    for m in (model(seed), model(seed + 1, v0=-2.0), model(seed, v0=3.0)):
+        np.testing.assert_array_equal(memory_after(m, points.values), memory_after(m, v))
+
+
+def test_turning_points_of_constant_and_monotone_voltage_are_its_ends():
+    points = TurningPoints()
+    points.add(np.full(10, 2.0))
+    assert points.values.tolist() == [2.0]
+    points.add(np.array([2.0, 3.0, 3.0, 4.0]))
+    assert points.values.tolist() == [2.0, 4.0]
+
+
+def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
+    v, m = drive(20_000), model()
+    predictor = Predictor()
+    predictor.set_model(m)
+    blocks = cut(v[:10_000], 100) + cut(v[10_000:], 33, start=10_000)
+    made = predicted(predictor, blocks)
+    np.testing.assert_array_equal(made, m.predict_piece(Piece(v, np.zeros_like(v), RATE)))
+    assert predictor.problem == '' and predictor.lost == predictor.late == 0
+    assert predictor.memory_known
+
+
+def test_prediction_carries_time_and_segment_of_the_voltage():
+    predictor = Predictor()
+    predictor.set_model(model())
+    block = cut(drive(300), 300)[0]
+    made = predictor.process(block)
+    np.testing.assert_array_equal(made.t, block.t)
+    assert (made.segment, made.quantity) == ('noise', 'displacement')
+
+
+@pytest.mark.parametrize('n', [20_000, 120_000], ids=['whole run at hand', 'longer than kept'])
+def test_a_new_model_is_where_it_would_be_had_it_run_all_along(n):
+    v, old, new = drive(n + 5000), model(0), model(5)
+    predictor = Predictor()
+    predictor.set_model(old)
+    predicted(predictor, cut(v[:n]))
+    predictor.set_model(new)
+    made = predicted(predictor, cut(v[n:], start=n))
+    whole = new.predict_piece(Piece(v, np.zeros_like(v), RATE))[n:]
+    np.testing.assert_allclose(made, whole, rtol=0, atol=1e-12 * 75e-6)
+    assert predictor.memory_known
+
+
+def test_history_is_kept_without_a_model():
+    v, m = drive(3000), model()
+    predictor = Predictor()
+    assert [predictor.process(b) for b in cut(v[:2000])] == [None] * 20
+    assert not predictor.memory_known
+    predictor.set_model(m)
+    assert predictor.memory_known
+    made = predicted(predictor, cut(v[2000:], start=2000))
+    np.testing.assert_array_equal(made, m.predict_piece(Piece(v, v, RATE))[2000:])
+
+
+def test_a_restart_begins_anew():
+    v, m = drive(2000), model()
+    predictor = Predictor()
+    predictor.set_model(m)
+    blocks = cut(v)
+    first = predicted(predictor, blocks)
+    np.testing.assert_array_equal(predicted(predictor, blocks), first)
+    assert predictor.restarts == 1 and predictor.late == 0
+
+
+def test_a_lost_block_is_bridged_and_counted():
+    v, m = 5.0 - 5.0 * np.cos(2 * np.pi * 5.0 * np.arange(6000) / RATE), model()
+    predictor = Predictor()
+    predictor.set_model(m)
+    blocks = cut(v)
+    made = predicted(predictor, blocks[:25] + blocks[26:])
+    assert predictor.lost == 100
+    assert '100 samples of voltage are missing before t = 0.26 s' in predictor.problem
+    whole = m.predict_piece(Piece(v, v, RATE))
+    # a straight line is close to 10 ms of a slow sine, and behind it nothing is left of the gap
+    error = np.abs(made - np.delete(whole, slice(2500, 2600))) / 75e-6
+    assert error.max() < 0.02 and error[2800:].max() < 1e-6
+
+
+def test_memory_is_unknown_behind_a_gap_until_the_voltage_was_at_its_lowest():
+    v = 5.0 - 5.0 * np.cos(2 * np.pi * 5.0 * np.arange(6000) / RATE)
+    predictor = Predictor()
+    predictor.set_model(model())
+    blocks = cut(v)
+    predicted(predictor, blocks[:5] + blocks[6:12])
+    assert not predictor.memory_known
+    predicted(predictor, blocks[12:22])
+    assert predictor.memory_known
+
+
+def test_a_long_gap_is_another_run():
+    v, m = drive(20_000), model()
+    predictor = Predictor()
+    predictor.set_model(m)
+    blocks = cut(v)
+    predicted(predictor, blocks[:20])
+    made = predicted(predictor, blocks[150:])
+    alone = m.predict_piece(Piece(v[15_000:], v[15_000:], RATE, start_time=1.5))
+    np.testing.assert_array_equal(made, alone)
+    assert predictor.lost == 13_000
+
+
+def test_late_and_repeated_blocks_leave_no_trace():
+    v, m = drive(3000), model()
+    predictor = Predictor()
+    predictor.set_model(m)
+    b = cut(v)
+    made = predicted(predictor, [b[0], b[0], b[1], b[2], b[1], b[2], *b[3:]])
+    np.testing.assert_array_equal(made, m.predict_piece(Piece(v, v, RATE)))
+    assert predictor.late == 300 and predictor.restarts == 0
+    # blocks of another size that overlap are cut to what is new
+    more = Samples(np.arange(2950, 3050) / RATE, np.full(100, v[-1]))
+    assert predictor.process(more).t.size == 50
+
+
+def test_a_block_with_nan_is_left_out():
+    v = drive(3000)
+    predictor = Predictor()
+    predictor.set_model(model())
+    blocks = cut(v)
+    bad = Samples(blocks[5].t, np.where(np.arange(100) == 50, np.nan, blocks[5].values))
+    made = predicted(predictor, [*blocks[:5], bad, *blocks[6:]])
+    assert np.isfinite(made).all() and made.size == 2900
+    assert predictor.lost == 100
+
+
+def test_ragged_time_is_left_out():
+    predictor = Predictor()
+    t = np.array([0.0, 1.0, 2.0, 5.0, 6.0]) / RATE
+    assert predictor.process(Samples(t, np.zeros(5))) is None
+    assert 'not uniform' in predictor.problem
+
+
+def test_another_sampling_rate_is_refused():
+    predictor = Predictor()
+    predictor.process(cut(drive(300))[0])
+    with pytest.raises(ModelError, match='sampled at 10000 Hz, the model holds for 20000 Hz'):
+        predictor.set_model(model(rate=20_000.0))
+    other = Predictor()
+    other.set_model(model(rate=20_000.0))
+    assert other.process(cut(drive(300))[0]) is None
+    assert 'identify a model at the rate of the stream' in other.problem
+
+
+def test_warm_up_runs():
+    warm_up()
+
+
+def test_expected_error_prefers_what_was_held_out():
+    assert expected_error(model()) is None
+    errors = {'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'unit': '% of stroke'}
+    assert expected_error(model(identification={'errors': errors})) == 0.3
+    del errors['held_out']
+    assert expected_error(model(identification={'errors': errors})) == 0.2
+
+
+def block(first, n, value=0.0):
+    return Samples(np.arange(first, first + n) / RATE, np.full(n, value), 'sine:50Hz')
+
+
+def test_a_block_of_one_sample_does_not_set_the_rate():
+    predictor = Predictor()
+    predictor.set_model(model())
+    v = drive(1000)
+    assert predictor.process(cut(v, 1)[0]) is None
+    assert 'tells no sampling rate' in predictor.problem
+    assert predictor.process(cut(v[1:], 100, start=1)[0]) is not None
+    # behind others its rate is known
+    assert predictor.process(cut(v[101:], 1, start=101)[0]).t.size == 1
+
+
+def test_a_stretch_longer_than_the_window_is_the_window():
+    error = LiveError(0.01)
+    for k in (0, 400, 800):
+        error.add(np.arange(k, k + 400) / RATE, np.full(400, 2e-9))
+        assert error.rms == pytest.approx(2e-9)
+
+
+@pytest.mark.parametrize('measured_first', [True, False])
+def test_streams_match_whichever_comes_first(measured_first):
+    matcher = Matcher()
+    calls = [
+        lambda: matcher.measured(block(0, 100, 3.0)),
+        lambda: matcher.predicted(block(0, 100, 1.0)),
+    ]
+    one, two = calls if measured_first else calls[::-1]
+    assert one() == []
+    (pair,) = two()
+    np.testing.assert_array_equal(pair.residual.values, np.full(100, 2.0))
+    assert pair.residual.segment == 'sine:50Hz'
+
+
+def test_streams_match_however_they_are_cut():
+    matcher = Matcher()
+    pairs = matcher.predicted(block(0, 100)) + matcher.predicted(block(100, 100))
+    for first, n in ((0, 30), (30, 100), (130, 70)):
+        pairs += matcher.measured(block(first, n))
+    t = np.concatenate([p.t for p in pairs])
+    np.testing.assert_array_equal(t, np.arange(200) / RATE)
+    assert matcher.unmatched == 0
+
+
+def test_what_finds_no_partner_is_forgotten_and_counted():
+    matcher = Matcher()
+    matcher.measured(block(0, 100))
+    assert matcher.measured(block(30_000, 100)) == []
+    assert matcher.unmatched == 100
+    assert matcher.predicted(block(0, 100)) == []
+
+
+def test_runs_of_the_clock_are_not_mixed_up():
+    matcher = Matcher()
+    for k in range(0, 3000, 100):
+        matcher.predicted(block(k, 100, 1.0))  # never measured
+    # the new run is measured first, and has the times of the old one
+    assert matcher.measured(block(0, 100, 5.0)) != []
+    for k in range(100, 3000, 100):
+        matcher.measured(block(k, 100, 5.0))
+    assert matcher.measured(block(0, 100, 9.0)) == []
+    assert matcher.measured(block(100, 100, 9.0)) == []
+    pairs = matcher.predicted(block(0, 100, 2.0)) + matcher.predicted(block(100, 100, 2.0))
+    assert [p.residual.values[0] for p in pairs] == [7.0, 7.0]
+    # the next is predicted first
+    for k in range(200, 3000, 100):
+        matcher.predicted(block(k, 100, 2.0))
+    matcher.predicted(block(0, 100, 3.0))
+    (pair,) = matcher.measured(block(0, 100, 4.0))
+    assert pair.residual.values[0] == 1.0
+
+
+def test_streams_find_together_after_one_was_silent_at_a_restart():
+    matcher = Matcher()
+    matcher.measured(block(100, 100))
+    for first in (0, 0, 0):
+        for k in range(first, 3000, 100):
+            matcher.predicted(block(k, 100))
+    pairs = []
+    for k in range(3000, 18_000, 100):
+        matcher.predicted(block(k, 100))
+        pairs += matcher.measured(block(k, 100))
+    assert pairs and pairs[-1].t[-1] == 17_999 / RATE
+
+
+def test_preview_bins_hold_mean_least_and_largest():
+    preview = Preview(50.0)
+    t = np.arange(600) / RATE
+    done = []
+    for i in range(0, 600, 70):
+        done += preview.add('displacement', t[i : i + 70], np.arange(600.0)[i : i + 70])
+    assert [b.t for b in done] == [0.0, 0.02]
+    assert done[0].values == {'displacement': (99.5, 0.0, 199.0)}
+    assert done[1].values == {'displacement': (299.5, 200.0, 399.0)}
+
+
+def test_preview_waits_for_a_late_quantity_but_not_for_ever():
+    preview = Preview(50.0)
+    assert preview.add('prediction', np.array([0.0]), np.ones(1)) == []
+    assert preview.add('displacement', np.array([0.03]), np.ones(1)) == []
+    done = preview.add('prediction', np.array([0.03]), np.ones(1))
+    assert [b.t for b in done] == [0.0]
+    done = preview.add('displacement', np.array([2.0]), np.ones(1))
+    assert [b.t for b in done] == [0.02]
+
+
+def test_preview_begins_anew_behind_a_restart():
+    preview = Preview(50.0)
+    preview.add('prediction', np.array([1.0]), np.ones(1))
+    assert [b.t for b in preview.add('prediction', np.array([0.0]), np.ones(1))] == [1.0]
+    assert [b.t for b in preview.add('prediction', np.array([0.02]), np.ones(1))] == [0.0]
+
+
+def test_preview_leaves_out_what_is_no_number():
+    preview = Preview(50.0)
+    preview.add('residual', np.array([0.0, 0.001]), np.array([np.nan, 2.0]))
+    (done,) = preview.add('residual', np.array([0.02]), np.ones(1))
+    assert done.values['residual'] == (2.0, 2.0, 2.0)
+
+
+def test_live_error_is_the_rms_of_the_window():
+    live = LiveError(1.0)
+    assert np.isnan(live.rms)
+    for second, value in ((0, 100.0), (1, 3.0), (2, 4.0)):
+        for k in range(0, 10_000, 100):
+            b = block(second * 10_000 + k, 100, value)
+            live.add(b.t, b.values)
+    assert live.rms == pytest.approx(4.0)
+    assert live.seconds == pytest.approx(1.0, abs=0.02)
+    live.add(np.array([0.0]), np.array([7.0]))
+    assert live.rms == 7.0
+
+
+def test_a_clock_faster_than_any_card_is_left_out_and_blocks_are_bounded(monkeypatch):
+    monkeypatch.setattr('piezo_ident.live.predictor.MOST_BLOCKS', 50)
+    predictor = Predictor()
+    t = 1e-9 * np.arange(100)
+    assert predictor.process(Samples(t, np.zeros(100))) is None
+    assert 'not uniform' in predictor.problem
+    predictor.process(Samples(np.arange(2) / 20_000.0, np.zeros(2)))
+    for k in range(2, 200):
+        predictor.process(Samples(np.array([k / 20_000.0]), np.zeros(1)))
+    assert len(predictor._recent) == 50

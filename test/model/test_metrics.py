@@ -1,0 +1,45 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The error numbers against their formulas."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+from piezo_ident.model.metrics import fit_percent, percent_of_stroke
+import pytest
+
+Y = np.array([0.0, 1.0, 2.0, 4.0])
+
+
+def test_percent_of_stroke_by_hand():
+    # errors 0, 0, 0, 0.4: rms 0.2, stroke 4
+    assert percent_of_stroke(Y, Y - [0, 0, 0, 0.4]) == pytest.approx(5.0)
+    assert percent_of_stroke(Y, Y - [0, 0, 0, 0.4], stroke=2.0) == pytest.approx(10.0)
+
+
+def test_fit_is_that_of_compare():
+    # a prediction by the mean fits by 0 %, a perfect one by 100 %
+    assert fit_percent(Y, np.full(4, Y.mean())) == pytest.approx(0.0)
+    assert fit_percent(Y, Y) == 100.0
+    assert fit_percent(Y, 2 * Y.mean() - Y) == pytest.approx(-100.0)
+
+
+def test_no_stroke_is_no_division_by_zero():
+    still = np.ones(4)
+    assert percent_of_stroke(still, still) == 0.0
+    assert percent_of_stroke(still, still + 1) == float('inf')
+    assert fit_percent(still, still) == 100.0
+    assert fit_percent(still, still + 1) == float('-inf')
+
+
+@given(
+    st.floats(1e-9, 1e3),
+    st.floats(-1e-3, 1e-3),
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4),
+)
+def test_percentages_do_not_depend_on_the_unit(scale, shift, errors):
+    e = np.array(errors)
+    one, two = (Y, Y + e), (scale * (Y + shift), scale * (Y + e + shift))
+    assert percent_of_stroke(*two) == pytest.approx(percent_of_stroke(*one), rel=1e-6, abs=1e-9)
+    assert fit_percent(*two) == pytest.approx(fit_percent(*one), rel=1e-6, abs=1e-6)

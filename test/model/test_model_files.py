@@ -1,0 +1,372 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Model files: exact, whole, and safe to read from anybody."""
+
+import copy
+from dataclasses import replace
+import os
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_array_equal
+from piezo_ident.common.errors import ConfigError, DataError, ModelError
+from piezo_ident.model.files import (
+    load_model,
+    load_yaml,
+    model_from_dict,
+    model_to_dict,
+    model_to_yaml,
+    plain,
+    save_model,
+    SCHEMA_VERSION,
+    write_text,
+)
+from piezo_ident.model.simulated_stage import load_stage, stage_from_dict
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Delay
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = replace(
+    load_stage(ROOT / 'config/stage_paper.yaml').model,
+    delay=Delay(3, 0.25),
+    effects=(EffectSetting('creep', {'gain': [0.012, 0.01], 'time_constant': [0.1, 1 / 3]}),),
+    identification={
+        'method': 'three steps',
+        'records': ['a.csv', 'b: c.csv'],
+        'uncertainties': {'weights': np.array([1e-5, 2 / 3]), 'delay': np.float64(0.3)},
+        'warnings': ['the sensor noise is 2 % of stroke: "µm"'],
+    },
+)
+
+
+def data() -> dict:
+    return copy.deepcopy(model_to_dict(PAPER))
+
+
+def test_save_and_load_is_exact(tmp_path):
+    save_model(PAPER, tmp_path / 'model.yaml')
+    again = load_model(tmp_path / 'model.yaml')
+    assert model_to_dict(again) == model_to_dict(PAPER)
+    assert again.scaling == PAPER.scaling
+    assert again.delay == PAPER.delay
+    for part, name in (
+        ('hysteresis', 'thresholds'),
+        ('hysteresis', 'weights'),
+        ('dynamics', 'a'),
+        ('dynamics', 'b'),
+    ):
+        one, two = (getattr(getattr(m, part), name) for m in (PAPER, again))
+        assert_array_equal(one, two)
+    v = np.linspace(0, 10, 500)
+    assert_array_equal(again.stream().process(v), PAPER.stream().process(v))
+    # and writing it again gives the same text
+    assert model_to_yaml(again) == (tmp_path / 'model.yaml').read_text(encoding='utf-8')
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    st.lists(st.floats(0, 1e3, allow_subnormal=True), min_size=2, max_size=2),
+    st.floats(-1e300, 1e300),
+)
+def test_any_number_survives(weights, p1):
+    d = data()
+    d['hysteresis'] = {'thresholds': [0.1, 1 / 3], 'weights': weights, 'p1': p1, 'p2': -1e-300}
+    text = yaml.safe_dump(model_to_dict(model_from_dict(d)))
+    again = model_from_dict(yaml.safe_load(text))
+    assert again.hysteresis.weights.tolist() == weights
+    assert again.hysteresis.p1 == p1
+    assert again.hysteresis.p2 == -1e-300
+
+
+def test_weight_at_zero_is_folded_on_loading():
+    d = data()
+    d['hysteresis'] = {'thresholds': [0, 0.2], 'weights': [0.5, 0.1], 'p1': 0, 'p2': 0.25}
+    h = model_from_dict(d).hysteresis
+    assert h.p2 == 0.75
+    assert_array_equal(h.thresholds, [0.2])
+
+
+def test_numbers_as_people_write_them(tmp_path):
+    text = (ROOT / 'config/stage_paper.yaml').read_text(encoding='utf-8').split('sensor:')[0]
+    # YAML 1.1 takes 75e-6 for text
+    path = tmp_path / 'model.yaml'
+    path.write_text(text.replace('75.0e-6', '75e-6').replace('20000.0', '2e4'), encoding='utf-8')
+    model = load_model(path)
+    assert model.scaling.Y == 75e-6
+    assert model.sample_rate == 2e4
+
+
+@pytest.mark.parametrize('version', [SCHEMA_VERSION + 1, 99])
+def test_later_schema_is_refused(version):
+    with pytest.raises(ModelError, match='update piezo_ident'):
+        model_from_dict({**data(), 'schema_version': version})
+
+
+@pytest.mark.parametrize('version', [0, -1, 1.5, 'one', None, True, [1]])
+def test_what_is_no_schema_is_refused(version):
+    with pytest.raises(ModelError, match='schema_version'):
+        model_from_dict({**data(), 'schema_version': version})
+
+
+def test_file_without_a_schema_is_one_of_today():
+    d = data()
+    del d['schema_version'], d['package_version'], d['identification'], d['effects']
+    assert model_from_dict(d).effects == ()
+
+
+@pytest.mark.parametrize(
+    'key', ['sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics']
+)
+def test_missing_part_is_named(key):
+    d = data()
+    del d[key]
+    with pytest.raises(ModelError, match=f'missing {key}'):
+        model_from_dict(d, 'm.yaml')
+
+
+def test_unknown_keys_are_named():
+    with pytest.raises(ModelError, match=r'm.yaml: unknown keys 7, dynmics'):
+        model_from_dict({**data(), 'dynmics': {}, 7: 1}, 'm.yaml')
+
+
+@pytest.mark.parametrize(
+    ('part', 'key', 'said'),
+    [
+        ('input', 'v', 'unknown keys v in input; did you mean'),
+        ('output', 'y', 'unknown keys y in output; did you mean'),
+        ('delay', 'sample', 'unknown keys sample in delay; did you mean samples?'),
+        ('hysteresis', 'wieghts', 'unknown keys wieghts in hysteresis; did you mean weights?'),
+        ('hysteresis', 'P1', 'unknown keys P1 in hysteresis; did you mean p1?'),
+        ('hysteresis', 'zzz', 'it knows thresholds, weights, p1, p2'),
+        ('dynamics', 3, 'unknown keys 3 in dynamics; it knows a, b'),
+    ],
+)
+def test_unknown_keys_inside_are_named(part, key, said):
+    d = data()
+    d[part][key] = 1.0
+    with pytest.raises(ModelError) as caught:
+        model_from_dict(d, 'm.yaml')
+    assert str(caught.value).startswith('m.yaml: ')
+    assert said in str(caught.value)
+
+
+def test_misspelt_keys_are_named_before_what_they_leave_out():
+    d = data()
+    d['hysteresis']['wieghts'] = d['hysteresis'].pop('weights')
+    with pytest.raises(ModelError, match=r'wieghts in hysteresis; did you mean weights\?'):
+        model_from_dict(d)
+    d = data()
+    d['dynmics'] = d.pop('dynamics')
+    with pytest.raises(ModelError, match=r'unknown keys dynmics; did you mean dynamics\?'):
+        model_from_dict(d)
+    d = data()
+    d['effects'][0]['paramters'] = d['effects'][0].pop('parameters')
+    with pytest.raises(ModelError, match=r'paramters in effects; did you mean parameters\?'):
+        model_from_dict(d)
+
+
+def test_unknown_sensor_keys_are_named():
+    with pytest.raises(ConfigError, match=r'unknown noise_rsm in sensor; it knows noise_rms'):
+        stage_from_dict({**data(), 'sensor': {'noise_rsm': 1e-9}})
+
+
+HUGE = 10**400
+WRONG = [
+    ('sample_rate', 'fast'),
+    ('sample_rate', True),
+    ('sample_rate', None),
+    ('sample_rate', [1]),
+    ('sample_rate', 0),
+    ('sample_rate', '.nan'),
+    ('sample_rate', HUGE),
+    ('input', [1]),
+    ('input.V', -1),
+    ('input.V', {}),
+    ('input.range', [0]),
+    ('input.range', '0..10'),
+    ('input.range', [10, 0]),
+    ('input.range', [0, 'ten']),
+    ('input.range', [0, HUGE]),
+    ('output.Y', 0),
+    ('output.Y', float('inf')),
+    ('delay.samples', 1.5),
+    ('delay.samples', -1),
+    ('delay.samples', float('nan')),
+    ('delay.samples', float('inf')),
+    ('delay.samples', 1e18),
+    ('delay.fraction', 1),
+    ('hysteresis.weights', [0.1]),
+    ('hysteresis.weights', {}),
+    ('hysteresis.weights', None),
+    ('hysteresis.p1', 'x'),
+    ('hysteresis.thresholds', [[0.1]]),
+    ('dynamics.a', [-1.1]),
+    ('dynamics.a', 'none'),
+    ('dynamics.b', []),
+    ('dynamics.b', [True]),
+    ('dynamics.b', [HUGE]),
+    ('effects', {'name': 'creep'}),
+    ('effects', ['creep']),
+    ('effects', [{'name': 'creep'}]),
+    ('effects', [{'name': 'magic', 'parameters': {}}]),
+    ('effects', [{'name': None, 'parameters': {}}]),
+    ('effects', [{'name': 'creep', 'parameters': {1: 2, 'gain': [1]}}]),
+    ('effects', [{'name': 'creep', 'parameters': {'gain': [HUGE], 'time_constant': [1]}}]),
+    ('effects', [{'name': 'creep', 'parameters': {'gain': [[1]], 'time_constant': [1]}}]),
+    ('identification', [1]),
+]
+
+
+@pytest.mark.parametrize(('key', 'value'), WRONG)
+def test_wrong_values_are_refused_in_one_line(key, value):
+    d = data()
+    *path, last = key.split('.')
+    place = d
+    for name in path:
+        place = place[name]
+    place[last] = value
+    with pytest.raises(ModelError) as caught:
+        model_from_dict(d, 'm.yaml')
+    assert str(caught.value).startswith('m.yaml')
+    assert '\n' not in str(caught.value)
+
+
+HOSTILE = [
+    '',
+    'just text',
+    '- a\n- list',
+    '{',
+    'a: !!python/object/apply:os.system ["true"]',
+    'a: !!python/name:os.system',
+    'a: !!python/object:builtins.dict {}',
+    '!!int ""',
+    'a: !!int ""',
+    'a: !!float ""',
+    'a: !!bool perhaps',
+    'a: !!timestamp yesterday',
+    'a: 2026-99-99',
+    'a: !!binary "?"',
+    '? [a, b]\n: 1',
+    '? {a: b}\n: 1',
+    'a: *nowhere',
+    'a: &x [*x',
+    'a: ' + '9' * 5000,
+    'a: ' + '1:' * 400 + '1.0',
+    '[' * 5000,
+    'a: \x00',
+    '--- a\n--- b',
+    '<<: 1',
+    '<<: [1]',
+]
+
+
+@pytest.mark.parametrize('text', HOSTILE)
+def test_hostile_yaml_gives_an_error_of_ours(tmp_path, text):
+    path = tmp_path / 'model.yaml'
+    path.write_text(text, encoding='utf-8')
+    with pytest.raises((ConfigError, ModelError)) as caught:
+        load_model(path)
+    assert '\n' not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+BOMB = 'a0: &a0 [1, 1]\n' + ''.join(f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n' for i in range(1, 40))
+
+
+@pytest.mark.parametrize(
+    'where', ['sample_rate', 'schema_version', 'identification', 'effects', 'input', 'dynamics']
+)
+def test_anchors_that_multiply_do_not_explode(tmp_path, where):
+    # 2^40 numbers behind 40 lines
+    bomb = yaml.safe_load(BOMB)['a39']
+    d = data()
+    if where in ('input', 'dynamics'):
+        d[where] = {**d[where], 'V': bomb, 'a': bomb}
+    elif where == 'identification':
+        d[where] = {'warnings': bomb}
+    elif where == 'effects':
+        d[where] = [{'name': 'creep', 'parameters': {'gain': bomb, 'time_constant': bomb}}]
+    else:
+        d[where] = bomb
+    with pytest.raises(ModelError) as caught:
+        model_from_dict(d, 'm.yaml')
+    assert len(str(caught.value)) < 1000
+
+
+def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
+    path = tmp_path / 'model.yaml'
+    path.write_text(BOMB, encoding='utf-8')
+    with pytest.raises(ConfigError, match='too large'):
+        load_model(path)
+    path.write_text(
+        model_to_yaml(replace(PAPER, identification={}, effects=())).replace(
+            'identification: {}', 'identification: &me {x: *me}'
+        ),
+        encoding='utf-8',
+    )
+    with pytest.raises(ConfigError, match='identification'):
+        load_model(path)
+
+
+def test_unreadable_files_are_named(tmp_path):
+    looped = tmp_path / 'loop.yaml'
+    looped.symlink_to('loop.yaml')
+    with pytest.raises(ConfigError, match='leads back to itself; mend the link'):
+        load_yaml(looped)
+    with pytest.raises(ConfigError, match='no such file'):
+        load_yaml(tmp_path / 'nothing.yaml')
+    with pytest.raises(ConfigError, match='cannot be read'):
+        load_yaml(tmp_path)
+    (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x80')
+    with pytest.raises(ConfigError, match='cannot be read'):
+        load_yaml(tmp_path / 'binary.yaml')
+
+
+def test_old_file_stays_whole_when_writing_fails(tmp_path, monkeypatch):
+    path = tmp_path / 'model.yaml'
+    save_model(PAPER, path)
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    for name in ('fsync', 'replace'):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, full)
+            with pytest.raises(DataError, match='No space left'):
+                save_model(replace(PAPER, sample_rate=1.0), path)
+        assert path.read_bytes() == before
+        assert os.listdir(tmp_path) == ['model.yaml']
+
+
+def test_interrupt_leaves_no_rubbish(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, 'fsync', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(tmp_path / 'a.txt', 'text')
+    assert os.listdir(tmp_path) == []
+
+
+def test_impossible_places_are_named(tmp_path):
+    with pytest.raises(DataError, match='cannot be written'):
+        save_model(PAPER, tmp_path / 'no folder' / 'model.yaml')
+    (tmp_path / 'folder').mkdir()
+    with pytest.raises(DataError, match='cannot be written'):
+        write_text(tmp_path / 'folder', 'x')
+
+
+def test_plain_data_are_plain():
+    class Tagged(dict):
+        """A mapping of another class."""
+
+    given_ = {'a': np.float64(1.5), 1: np.array([1, 2]), 'c': (np.bool_(True), Tagged(x=None))}
+    assert plain(given_) == {'a': 1.5, '1': [1, 2], 'c': [True, {'x': None}]}
+    assert type(plain(given_)['c'][0]) is bool
+    assert type(plain(given_)['1'][0]) is int

@@ -1,0 +1,243 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The model: a stream is the batch, scaling with either sign, rates, ranges."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.common.errors import ModelError
+from piezo_ident.effects import catalogue, View
+from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.stage_model import CHUNK, EffectSetting, Scaling, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Piece, Record
+import pytest
+
+FS = 20_000.0
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
+
+
+#: what effects may know of the signals of this file
+VIEW = View(
+    sample_rate=FS,
+    low=0.0,
+    high=1.0,
+    speeds=np.linspace(10.0, 60.0, 8),
+    duration=1.0,
+    channels={'other_axis': (0.0, 1.0)},
+    lines=(50.0,),
+    modes=tuple(PAPER.dynamics.modes(FS)),
+    thresholds=PAPER.hysteresis.thresholds,
+)
+
+
+def inside(effect) -> dict:
+    """Return a setting of any effect away from its neutral values, from what it declares."""
+    trial = effect.trials(VIEW)[0]
+    values = dict(trial.values)
+    for (name, index), step in zip(trial.moves, trial.steps, strict=True):
+        if index is None:
+            values[name] = values[name] + 3 * step
+        else:
+            values[name] = np.array(values[name])
+            values[name][index] += 3 * step
+    return values
+
+
+EVERY = {name: inside(effect) for name, effect in catalogue().items()}
+
+
+def long_signal(n=3 * CHUNK + 100):
+    t = np.arange(n) / FS
+    return 5 - 5 * np.cos(2 * np.pi * 20 * t) * np.minimum(1, 0.5 + t)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    cuts=st.lists(st.integers(0, 4000), max_size=10),
+    names=st.lists(st.sampled_from(sorted(EVERY)), unique=True),
+    d=st.integers(0, 5),
+    fraction=st.sampled_from([0.0, 0.3]),
+    sign=st.sampled_from([-1.0, 1.0]),
+)
+def test_streamed_is_batch_with_every_effect_of_the_catalogue(cuts, names, d, fraction, sign):
+    model = replace(
+        PAPER,
+        delay=Delay(d, fraction),
+        scaling=replace(PAPER.scaling, Y=sign * 75e-6),
+        effects=tuple(EffectSetting(name, EVERY[name]) for name in names),
+    )
+    v = long_signal(4000)
+    other = np.sin(np.arange(v.size) / 50)
+    record = Record((Piece(v, np.zeros(v.size), FS, channels={'other_axis': other}),))
+    (batch,) = model.predict(record).pieces
+    stream, edges = model.stream(), [0, *sorted(cuts), v.size]
+    parts = [
+        stream.process(v[a:b], channels={'other_axis': other[a:b]}) for a, b in pairwise(edges)
+    ]
+    assert_allclose(np.concatenate(parts), batch, rtol=0, atol=1e-12 * 75e-6)
+    assert np.all(np.isfinite(batch))
+
+
+def test_prediction_does_not_show_its_own_chunks():
+    v = long_signal()
+    (batch,) = PAPER.predict(Record((Piece(v, np.zeros(v.size), FS),))).pieces
+    assert_array_equal(PAPER.stream().process(v), batch)
+
+
+def test_chain_is_h_then_g_then_delay():
+    model = replace(PAPER, delay=Delay(4))
+    v = long_signal(2000)
+    w = model.hysteresis(v / 10)
+    x = np.zeros(v.size)
+    a, b = model.dynamics.a, model.dynamics.b
+    delayed = np.concatenate([np.full(4, w[0]), w[:-4]])
+    pad = np.concatenate([np.full(20, w[0]), delayed])
+    out = np.full(pad.size, w[0] * model.dynamics.gain)
+    # eq. (4), as it is printed
+    for k in range(20, pad.size):
+        out[k] = -sum(a[i] * out[k - 1 - i] for i in range(10))
+        out[k] += sum(b[j] * pad[k - j] for j in range(10))
+    x = out[20:]
+    assert_allclose(model.stream().process(v), 75e-6 * x, atol=1e-12 * 75e-6)
+
+
+def test_stage_that_retracts_is_the_mirror_image():
+    v = long_signal(2000)
+    s = PAPER.scaling
+    mirrored = replace(PAPER, scaling=Scaling(s.v0, s.V, 1e-5, -s.Y, s.range))
+    assert_allclose(
+        mirrored.stream().process(v), 1e-5 - PAPER.stream().process(v), atol=1e-17, rtol=1e-12
+    )
+
+
+def test_scaling_goes_both_ways():
+    s = Scaling(v0=-150.0, V=300.0, y0=2e-6, Y=-40e-6, range=(-150, 150))
+    assert_allclose(s.u([-150, 0, 150]), [0, 0.5, 1])
+    y = np.linspace(-1e-5, 1e-5, 7)
+    assert_allclose(s.y(s.x(y)), y, atol=1e-20)
+    assert float(s.y(1.0)) == pytest.approx(-38e-6)
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    [
+        {'V': 0.0},
+        {'V': -1.0},
+        {'Y': 0.0},
+        {'v0': float('nan')},
+        {'range': (1.0, 1.0)},
+        {'range': (2.0, 1.0)},
+        {'range': (0.0, float('inf'))},
+    ],
+)
+def test_scaling_that_cannot_be_is_refused(wrong):
+    with pytest.raises(ModelError, match='scaling'):
+        Scaling(**{'v0': 0.0, 'V': 10.0, 'y0': 0.0, 'Y': 1e-5, 'range': (0.0, 10.0), **wrong})
+
+
+def test_unstable_dynamics_and_bad_rates_are_refused():
+    with pytest.raises(ModelError, match='unstable'):
+        replace(PAPER, dynamics=Dynamics([-1.01], [1.0]))
+    for rate in (0.0, -1.0, float('nan'), float('inf')):
+        with pytest.raises(ModelError, match='sample_rate'):
+            replace(PAPER, sample_rate=rate)
+
+
+def record(v, rate=FS, name='mine'):
+    v = np.asarray(v, dtype=float)
+    return Record((Piece(v, np.zeros(v.size), rate),), name)
+
+
+def test_other_rates_are_refused_unless_nothing_depends_on_them():
+    v = np.linspace(0, 10, 100)
+    with pytest.raises(ModelError, match='5000 Hz'):
+        PAPER.predict(record(v, 5000.0))
+    PAPER.predict(record(v, FS * (1 + 1e-8)))
+    static = replace(PAPER, dynamics=Dynamics.unit(), delay=Delay(0))
+    assert static.is_static
+    assert static.without_dynamics().is_static
+    static.predict(record(v, 5000.0))
+    assert not PAPER.is_static
+
+
+def test_leaving_the_identified_range_warns_with_numbers():
+    assert PAPER.predict(record(np.linspace(0, 10, 100))).warnings == ()
+    # rounding at the ends is no extrapolation
+    assert PAPER.predict(record([0, -1e-3, 10.004])).warnings == ()
+    (warning,) = PAPER.predict(record([0, 5, 10, 12])).warnings
+    assert warning.startswith('mine: 25.0%')
+    assert '0 .. 10 V' in warning
+    assert '12 V' in warning
+
+
+def test_millivolts_are_taken_for_what_they_are():
+    (warning,) = PAPER.predict(record([0, 5e-3, 10e-3])).warnings
+    assert 'mine: ' in warning
+    assert 'are they in volts?' in warning
+    # a small signal is a signal, and a stage at 0 V is at rest
+    assert PAPER.predict(record([0, 0.05, 0.03])).warnings == ()
+    assert PAPER.predict(record([0, 0, 0])).warnings == ()
+
+
+def test_hysteresis_alone_keeps_the_static_gain():
+    model = replace(PAPER, effects=(EffectSetting('creep', EVERY['creep']),))
+    alone = model.without_dynamics()
+    assert alone.effects == ()
+    assert alone.delay.total == 0.0
+    v = np.linspace(0, 10, 50)
+    expected = 75e-6 * PAPER.dynamics.gain * PAPER.hysteresis(v / 10)
+    assert_allclose(alone.stream().process(v), expected, rtol=1e-13)
+
+
+def test_stream_comes_to_rest_where_it_is_told():
+    stream = PAPER.stream()
+    rest = stream.reset(4.0)
+    assert_allclose(stream.process(np.full(500, 4.0)), rest, rtol=1e-12)
+    stream.process(long_signal(500))
+    assert stream.reset(4.0) == rest
+    assert stream.process([]).size == 0
+
+
+def test_each_piece_starts_afresh_and_from_the_memory_given():
+    v = 5 + np.linspace(0, 2, 200)
+    pieces = Record((Piece(v, 0 * v, FS), Piece(v, 0 * v, FS)))
+    top = v[0] / 10 - 0 * PAPER.hysteresis.thresholds
+    one, two = PAPER.predict(pieces, (None, top)).pieces
+    assert_array_equal(one, PAPER.stream().process(v))
+    assert_array_equal(two, PAPER.stream(top).process(v))
+    assert np.abs(one - two).max() > 1e-6
+    with pytest.raises(ValueError, match='shorter'):
+        PAPER.predict(pieces, (None,))
+
+
+def test_unknown_effect_is_refused():
+    with pytest.raises(ModelError, match='magic'):
+        EffectSetting('magic', {})
+
+
+def test_prediction_changes_nothing_it_was_given():
+    v = long_signal(300)
+    before = v.copy()
+    memory = np.zeros(9)
+    PAPER.stream(memory).process(v)
+    assert_array_equal(v, before)
+    assert_array_equal(memory, np.zeros(9))
+
+
+def test_zero_threshold_gives_the_same_stage():
+    h = PAPER.hysteresis
+    split = Hysteresis(
+        np.concatenate([[0.0], h.thresholds]), np.concatenate([[0.3], h.weights]), h.p1, h.p2 - 0.3
+    )
+    v = long_signal(500)
+    other = StageModel(FS, PAPER.scaling, split, PAPER.dynamics, PAPER.delay)
+    assert_allclose(other.stream().process(v), PAPER.stream().process(v), atol=1e-19)

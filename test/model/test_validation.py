@@ -1,0 +1,103 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Free runs over records, and the steady-state error of sines against sums done by hand."""
+
+import numpy as np
+from piezo_ident.common.errors import ModelError
+from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.validation import free_runs, sine_errors, sine_frequency
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+
+RATE = 1000.0
+
+
+def linear_stage(delay: int = 0, weights: tuple[float, ...] = ()) -> StageModel:
+    """7.5 um/V over 0..10 V, without dynamics."""
+    thresholds = np.linspace(0.2, 0.6, len(weights))
+    return StageModel(
+        RATE,
+        Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
+        Hysteresis(thresholds, weights, 0.0, 1.0),
+        Dynamics.unit(),
+        Delay(delay),
+    )
+
+
+def sine(frequency: float, seconds: float) -> np.ndarray:
+    return 5 + 5 * np.sin(2 * np.pi * frequency * np.arange(round(seconds * RATE)) / RATE)
+
+
+def record(v: np.ndarray, y: np.ndarray, *labels: tuple[str, int, int]) -> Record:
+    return Record((Piece(v, y, RATE, 0.0, tuple(Segment(*s) for s in labels)),), 'r')
+
+
+def test_sine_error_is_that_of_a_hand_calculation():
+    v = sine(4.0, 3.0)
+    t = np.arange(v.size) / RATE
+    e = 1e-7 * np.cos(2 * np.pi * 4.0 * t)
+    # whatever happens in the first second must not count
+    e[: round(RATE)] += 3e-6
+    (row,) = sine_errors(linear_stage(), record(v, 7.5e-6 * v + e, ('sine:4Hz', 0, v.size)))
+    # amplitude of 7.5e-6 * 5 sin + 1e-7 cos, and rms of a cosine
+    stroke = 2 * np.hypot(37.5e-6, 1e-7)
+    assert row.frequency == 4.0
+    assert row.n == 2000
+    assert row.percent == pytest.approx(100 * 1e-7 / np.sqrt(2) / stroke, rel=1e-4)
+    assert row.static_percent == row.percent
+
+
+def test_hysteresis_alone_lacks_the_delay():
+    v = sine(5.0, 2.0)
+    y = 7.5e-6 * np.concatenate([np.full(3, v[0]), v[:-3]])
+    (row,) = sine_errors(linear_stage(delay=3), record(v, y, ('sine:5Hz', 0, v.size)))
+    # sin(x) - sin(x - c) = 2 sin(c/2) cos(x - c/2)
+    amplitude = 2 * np.sin(np.pi * 5.0 * 3 / RATE)
+    assert row.percent == pytest.approx(0.0, abs=1e-9)
+    assert row.static_percent == pytest.approx(100 * amplitude / np.sqrt(2) / 2, rel=1e-3)
+
+
+def test_at_least_one_period_is_dropped_and_one_is_left():
+    v = np.concatenate([sine(0.5, 6.0), sine(2.0, 1.2), sine(10.0, 1.5)])
+    labels = [('sine:0.5Hz', 0, 6000), ('sine:2Hz', 6000, 7200), ('sine:10Hz', 7200, 8700)]
+    rows = sine_errors(linear_stage(), record(v, 7.5e-6 * v, *labels))
+    # 2 s of the slow one are a period; of 2 Hz, 0.2 s are left, less than a period
+    assert [(row.frequency, row.n) for row in rows] == [(0.5, 4000), (10.0, 500)]
+    assert all(row.percent < 1e-12 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ('label', 'frequency'),
+    [
+        ('sine:50Hz', 50.0),
+        ('sine:0.5Hz', 0.5),
+        ('sine:50Hz-2', 50.0),
+        ('sine:1e2Hz', 100.0),
+        ('sine', None),
+        ('sine:0Hz', None),
+        ('sine:50Hzz', None),
+        ('multisine:50Hz', None),
+    ],
+)
+def test_frequency_of_a_label(label, frequency):
+    assert sine_frequency(label) == frequency
+
+
+def test_another_rate_is_refused_for_sines_and_left_out_of_free_runs():
+    v = sine(5.0, 2.0)
+    other = Record((Piece(v, v, 500.0, 0.0, (Segment('sine:5Hz', 0, v.size),)),), 'r')
+    model = linear_stage(delay=1)
+    with pytest.raises(ModelError, match='500 Hz'):
+        sine_errors(model, other)
+    assert free_runs(model, other) == []
+
+
+def test_free_run_of_a_piece_from_an_unknown_start():
+    model = linear_stage(weights=(0.2, 0.2))
+    v = sine(1.0, 3.0)
+    y = model.predict_piece(Piece(v, v, RATE), memory=np.array([0.4, 0.1]))
+    (run,) = free_runs(model, Record((Piece(v, y, RATE),), 'r'))
+    assert np.abs(run.y_hat - y).max() < 1e-8

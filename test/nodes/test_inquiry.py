@@ -1,0 +1,208 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""The course of a diagnosis on the graph, without a graph: judge, ask, judge again, conclude."""
+
+import itertools
+
+from diagnosis_examples import base_model, example, measured
+import numpy as np
+from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.diagnosis.diagnosis_json import json_text
+from piezo_ident.diagnosis.next_experiment import Experiment
+from piezo_ident.model.files import model_to_yaml
+from piezo_ident.nodes import inquiry as module
+from piezo_ident.nodes.diagnosis_jobs import diagnose_job, Judgement, records_of_runs
+from piezo_ident.nodes.inquiry import Inquiry
+from piezo_ident.record.blocks import cut_blocks, Samples
+from piezo_ident.record.capture import Capture
+from piezo_ident.record.record import Piece, Record
+import pytest
+
+HOLDS = Experiment('holds', 'this and that cannot be told apart')
+SWEEPS = Experiment('sweeps', 'this cannot be tested')
+
+
+def feed(capture, record, at=0):
+    """Let a capture hear a record."""
+    (piece,) = record
+    for start, stop, label in cut_blocks(piece.n, piece.segments, 500):
+        t = piece.t[start:stop]
+        capture.add('voltage', Samples(t, piece.v[start:stop], label, 'voltage'), at)
+        capture.add('displacement', Samples(t, piece.y[start:stop], label, 'displacement'), at)
+
+
+class Lab:
+    """A host that plays what is asked for, and writes down what it is told."""
+
+    def __init__(self, requests=2, there=True, refusal=None):
+        self.values = {
+            'requests': requests,
+            'seed': 0,
+            'sweeps_program': 'diagnosis',
+            'holds_program': 'holds',
+        }
+        self.there, self.refusal = there, refusal
+        self.capture = Capture()
+        self.inquiry = Inquiry(self, self.capture)
+        self.said, self.end, self.clock = [], None, itertools.count()
+        self.jobs, self.answers = [], []
+
+    def may_ask(self):
+        return self.there
+
+    def ask(self, program, why, ended):
+        self.said.append(why)
+        self.answers.append((program, ended))
+
+    def judge(self, job, seconds):
+        self.said.append('judging')
+        self.jobs.append((job, seconds))
+
+    def give_verdict(self, found, notes):
+        self.end = (found, notes)
+
+    def fail(self, reason):
+        self.end = reason
+
+    def play(self):
+        """Answer what was asked last."""
+        _, ended = self.answers[-1]
+        if self.refusal is None:
+            feed(self.capture, measured(), next(self.clock))
+        ended(self.refusal)
+
+
+@pytest.fixture
+def lab(monkeypatch):
+    """Return a lab whose diagnoses are not worked out; each job is the data it would judge."""
+    monkeypatch.setattr(module, 'diagnose_job', lambda *arguments: arguments)
+    found = Lab()
+    found.inquiry.take(base_model(), {})
+    return found
+
+
+def judged(verdict, wanted=None):
+    found = example(verdict)
+    return Judgement(found, found.sentence, json_text(found), model_to_yaml(found.model), wanted)
+
+
+def test_without_a_model_or_data_and_an_excitation_it_refuses(lab):
+    with pytest.raises(PiezoIdentError, match='no model to judge; call ~/run'):
+        Lab().inquiry.begin()
+    lab.there = False
+    with pytest.raises(
+        DataError, match=r'nothing was captured.*no excitation and stage are there'
+    ):
+        lab.inquiry.begin()
+    lab.there, lab.values['requests'] = True, 0
+    with pytest.raises(DataError, match=r'nothing was captured.*no more than 0 requests'):
+        lab.inquiry.begin()
+    assert not lab.said
+
+
+def test_what_the_model_was_made_from_does_not_judge_it(lab):
+    feed(lab.capture, measured())
+    lab.inquiry.take(base_model(), lab.capture.mark())
+    assert lab.inquiry.begin().startswith('asking for sweeps: no motion was captured beside')
+    lab.play()
+    (snapshot, given, asked, _), seconds = lab.jobs[-1]
+    assert given is base_model() and asked == ('sweeps',)
+    assert seconds == pytest.approx(measured().duration, abs=0.01)
+    assert snapshot.record().n == measured().n
+
+
+def test_it_judges_asks_judges_everything_and_concludes(lab):
+    feed(lab.capture, measured())
+    assert lab.inquiry.begin() == 'diagnosis has begun'
+    lab.inquiry.weigh(judged('class', HOLDS))
+    assert lab.said == ['judging', 'asking for holds: this and that cannot be told apart']
+    assert lab.end is None and lab.answers[-1][0] == 'holds'
+    lab.play()
+    (snapshot, given, asked, _), _ = lab.jobs[-1]
+    assert given is base_model() and asked == ('holds',)
+    assert snapshot.record().n == 2 * measured().n
+    last = judged('named')
+    lab.inquiry.weigh(last)
+    assert lab.end == (last, ()) and lab.inquiry.diagnosis is last.diagnosis
+
+
+def test_requests_are_bounded(lab):
+    lab.inquiry.begin()
+    lab.play()
+    lab.inquiry.weigh(judged('class', HOLDS))
+    lab.play()
+    last = judged('class', SWEEPS)
+    lab.inquiry.weigh(last)
+    assert len(lab.answers) == 2
+    assert lab.end == (last, ('this cannot be tested, and no more than 2 requests are allowed',))
+    # the next one begins to count anew
+    lab.end = None
+    lab.inquiry.begin()
+    lab.inquiry.weigh(judged('class', HOLDS))
+    assert lab.end is None and len(lab.answers) == 3
+
+
+def test_an_excitation_that_refuses_or_is_gone_leaves_the_verdict_as_it_is(lab):
+    feed(lab.capture, measured())
+    first = judged('class', HOLDS)
+    lab.inquiry.begin()
+    lab.inquiry.weigh(first)
+    lab.refusal = 'the excitation does not start: another one plays'
+    lab.play()
+    assert lab.end[0] is first
+    assert lab.end[1] == (
+        'holds were asked for in vain: the excitation does not start: another one plays',
+    )
+    lab.there = False
+    lab.inquiry.begin()
+    lab.inquiry.weigh(first)
+    assert lab.end[0] is first
+    assert lab.end[1] == (
+        'this and that cannot be told apart, and no excitation and stage are there to be asked',
+    )
+
+
+def test_without_any_data_a_refusal_is_a_failure(lab):
+    lab.refusal = 'no sign'
+    lab.inquiry.begin()
+    lab.play()
+    assert lab.end == 'there is nothing to judge: no sign'
+
+
+def test_a_capture_without_motion_asks_and_fails_where_nobody_can_be_asked(lab):
+    (piece,) = measured()
+    still = Record((Piece(np.zeros(4000), piece.y[:4000], piece.sample_rate),))
+    feed(lab.capture, still)
+    found = diagnose_job(lab.capture.snapshot(), base_model(), (), None)(lambda *_: None)
+    assert found.diagnosis is None and found.wanted.kind == 'sweeps'
+    lab.inquiry.begin()
+    lab.inquiry.weigh(found)
+    assert len(lab.answers) == 1
+    lab.there = False
+    lab.inquiry.begin()
+    lab.inquiry.weigh(found)
+    assert lab.end.startswith('there is nothing to judge: what was captured holds no motion')
+
+
+def test_another_model_forgets_the_verdict(lab):
+    feed(lab.capture, measured())
+    lab.inquiry.begin()
+    lab.inquiry.weigh(judged('named'))
+    lab.inquiry.take(base_model(), lab.capture.mark())
+    assert lab.inquiry.diagnosis is None and not lab.inquiry.seconds
+    lab.capture.clear()
+    lab.inquiry.forget()
+    feed(lab.capture, measured())
+    assert lab.inquiry.seconds == pytest.approx(measured().duration, abs=0.01)
+
+
+def test_runs_of_the_clock_are_records_of_their_own():
+    capture = Capture()
+    for i in range(3):
+        feed(capture, measured(), i)
+    records = records_of_runs(capture.record('capture'))
+    assert [r.name for r in records] == ['capture 1', 'capture 2', 'capture 3']
+    assert [r.n for r in records] == [measured().n] * 3
+    assert [r.name for r in records_of_runs(measured())] == [measured().name]

@@ -1,0 +1,222 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""G and the delay: against SciPy, at rest, at any order, however the stream is cut."""
+
+from itertools import pairwise
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import A, B
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import STILL
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.dynamics import (
+    Delay,
+    DelayOperator,
+    Dynamics,
+    DynamicsOperator,
+    filter_arx,
+)
+import pytest
+from scipy import signal
+
+PAPER = Dynamics(A, B)
+
+
+@st.composite
+def stable(draw, na_max=6, nb_max=8):
+    """Draw stable dynamics of any orders, numerator longer or shorter than the denominator."""
+    poles = []
+    while len(poles) < draw(st.integers(0, na_max)):
+        radius = draw(st.floats(0.0, 0.97))
+        if draw(st.booleans()):
+            angle = draw(st.floats(0.05, 3.1))
+            pole = radius * np.exp(1j * angle)
+            poles += [pole, np.conj(pole)]
+        else:
+            poles.append(draw(st.sampled_from([-1.0, 1.0])) * radius)
+    b = draw(st.lists(st.floats(-1, 1), min_size=1, max_size=nb_max))
+    return Dynamics(np.real(np.poly(poles))[1:] if poles else [], b)
+
+
+@settings(deadline=None)
+@given(stable(), st.integers(0, 2**32 - 1))
+def test_filter_is_that_of_scipy(G, seed):
+    x = np.random.default_rng(seed).standard_normal(80)
+    expected = signal.lfilter(G.b, np.concatenate([[1.0], G.a]), x)
+    got = filter_arx(G.a, G.b, x, at_rest=False)
+    assert_allclose(got, expected, atol=1e-9 * max(1.0, np.abs(expected).max()))
+
+
+@pytest.mark.parametrize('na', [0, 1, 2, 5])
+@pytest.mark.parametrize('nb', [1, 2, 3, 6, 7])
+def test_filter_at_every_mix_of_orders(na, nb):
+    rng = np.random.default_rng(na * 10 + nb)
+    a, b = 0.15 * rng.standard_normal(na), rng.standard_normal(nb)
+    x = rng.standard_normal(60)
+    expected = signal.lfilter(b, np.concatenate([[1.0], a]), x)
+    assert_allclose(filter_arx(a, b, x, at_rest=False), expected, atol=1e-12)
+    # an impulse through B alone shows every coefficient
+    pulse = np.zeros(20)
+    pulse[3] = 1.0
+    assert_allclose(filter_arx(np.zeros(0), b, pulse)[3 : 3 + nb], b, atol=1e-15)
+
+
+@settings(deadline=None)
+@given(stable(), st.floats(-2, 2))
+def test_equilibrium_stays_at_rest(G, level):
+    rest = level * G.gain
+    out = filter_arx(G.a, G.b, np.full(200, level))
+    assert_allclose(out, rest, atol=1e-8 * max(1.0, abs(rest)))
+    operator = DynamicsOperator(G)
+    assert operator.reset(0.0, level) == pytest.approx(rest)
+    x = operator.process(Block(np.zeros(50), np.zeros(50), np.full(50, level))).x
+    assert_allclose(x, rest, atol=1e-8 * max(1.0, abs(rest)))
+
+
+@settings(deadline=None)
+@given(
+    stable(),
+    st.integers(0, 7),
+    st.sampled_from([0.0, 0.25, 0.9]),
+    st.lists(st.integers(0, 100), max_size=6),
+)
+def test_streams_are_the_batch(G, d, fraction, cuts):
+    x = np.random.default_rng(d).standard_normal(100)
+    delay = Delay(d, fraction)
+    batch = delay.apply(filter_arx(G.a, G.b, x))
+    g, z = DynamicsOperator(G), DelayOperator(delay)
+    z.reset(0.0, g.reset(0.0, x[0]))
+    parts = []
+    for start, stop in pairwise([0, *sorted(cuts), 100]):
+        part = x[start:stop]
+        parts.append(z.process(g.process(Block(part, part, part))).x)
+    assert_allclose(np.concatenate(parts), batch, atol=1e-9)
+
+
+def test_delay_shifts_whole_samples_and_parts_of_them():
+    x = np.arange(1.0, 8.0) ** 2
+    assert_array_equal(Delay(0).apply(x), x)
+    assert_array_equal(Delay(2).apply(x), [1, 1, 1, 4, 9, 16, 25])
+    assert_allclose(Delay(1, 0.25).apply(x), 0.75 * Delay(1).apply(x) + 0.25 * Delay(2).apply(x))
+    # a straight line is delayed by the exact amount
+    line = np.arange(10.0)
+    assert_allclose(Delay(1, 0.4).apply(line)[3:], line[3:] - 1.4)
+    assert Delay(3, 0.4).total == 3.4
+    assert_array_equal(Delay(9).apply(x), np.ones(7))
+
+
+def test_delay_leaves_its_input_alone():
+    x = np.arange(5.0)
+    for delay in (Delay(0), Delay(2), Delay(1, 0.5)):
+        delay.apply(x)
+        assert_array_equal(x, np.arange(5.0))
+
+
+@settings(deadline=None)
+@given(stable())
+def test_response_is_freqz(G):
+    f = np.linspace(1, 9999, 40)
+    _, expected = signal.freqz(G.b, np.concatenate([[1.0], G.a]), worN=f, fs=20_000)
+    scale = max(1.0, np.abs(expected).max())
+    assert_allclose(G.response(f, 20_000), expected, atol=1e-9 * scale)
+
+
+def test_modes_of_a_known_resonance():
+    f0, zeta, fs = 972.0, 0.021, 5000.0
+    pole = np.exp(2 * np.pi * f0 / fs * (-zeta + 1j * np.sqrt(1 - zeta**2)))
+    a = np.real(np.poly([pole, np.conj(pole), 0.4, -0.3]))[1:]
+    ((f, damping),) = Dynamics(a, [1.0]).modes(fs)
+    assert f == pytest.approx(f0, rel=1e-9)
+    assert damping == pytest.approx(zeta, rel=1e-9)
+    assert Dynamics([0.1], [1.0]).modes(fs) == []
+
+
+def test_paper_stage():
+    # sum b / (1 + sum a) of the printed coefficients; the largest pole has radius 0.944
+    assert PAPER.gain == pytest.approx(0.6411, abs=5e-5)
+    assert PAPER.radius == pytest.approx(0.944, abs=5e-4)
+    assert PAPER.is_stable
+    one = PAPER.normalised()
+    assert one.gain == pytest.approx(1.0, abs=1e-13)
+    assert_array_equal(one.a, PAPER.a)
+    assert_allclose(one.response([10.0, 900.0], 2e4) * PAPER.gain, PAPER.response([10, 900], 2e4))
+
+
+def test_poles_and_stability():
+    assert Dynamics.unit().radius == 0.0
+    assert Dynamics.unit().is_stable
+    assert Dynamics.unit().gain == 1.0
+    assert not Dynamics([-1.0], [1.0]).is_stable
+    assert Dynamics([-0.999], [1.0]).is_stable
+    assert not Dynamics([-2.0], [1.0]).is_stable
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_stability_is_that_of_the_poles(seed):
+    rng = np.random.default_rng(seed)
+    for n in range(1, 16):
+        angle, pairs = rng.uniform(0, np.pi, n // 2), rng.uniform(0.6, 1.01, n // 2)
+        poles = np.concatenate([pairs * np.exp(1j * angle), pairs * np.exp(-1j * angle)])
+        poles = np.concatenate([poles, rng.uniform(-1, 1, n % 2)])
+        G = Dynamics(np.real(np.poly(poles))[1:], [1.0])
+        assert G.is_stable == (G.radius < 1.0)
+        assert_array_equal(G.a, np.real(np.poly(poles))[1:])
+
+
+@pytest.mark.parametrize('a', [[-1.0], [0.0, 1.0], [-2.0, 1.0], [0.5, -1.5]])
+def test_a_pole_on_the_circle_is_not_stable(a):
+    assert not Dynamics(a, [1.0]).is_stable
+
+
+@pytest.mark.parametrize('cut', [1, 2, 3, 500, 20_001])
+def test_what_has_died_away_is_zero_wherever_the_stream_is_cut(cut):
+    x = np.zeros(40_000)
+    x[:50] = np.random.default_rng(0).standard_normal(50)
+    x[30_000] = 1.0
+    whole = filter_arx(PAPER.a, PAPER.b, x, at_rest=False)
+    size = np.abs(whole[whole != 0.0])
+    assert size.min() >= STILL
+    assert np.count_nonzero(whole[20_000:30_000]) == 0
+    operator = DynamicsOperator(PAPER)
+    parts = [Block(np.zeros(part.size), part, part) for part in np.split(x, [cut, 29_999])]
+    assert_array_equal(np.concatenate([operator.process(part).x for part in parts]), whole)
+
+
+def test_no_number_stays_no_number():
+    y = filter_arx(PAPER.a, PAPER.b, np.array([1.0, np.nan, *np.zeros(20)]), at_rest=False)
+    assert np.isnan(y[1:]).all()
+
+
+@pytest.mark.parametrize('b', [[0.0], [1.0, -1.0]])
+def test_no_static_gain_cannot_be_normalised(b):
+    with pytest.raises(ModelError, match='cannot be scaled'):
+        Dynamics([0.1], b).normalised()
+
+
+def test_integrator_cannot_be_normalised():
+    with pytest.raises(ModelError, match='cannot be scaled'):
+        Dynamics([-1.0], [1.0]).normalised()
+
+
+@pytest.mark.parametrize(
+    ('a', 'b'), [([np.nan], [1]), ([0.1], [np.inf]), ([0.1], []), ([[0.1]], [1.0]), (0.1, [1.0])]
+)
+def test_what_is_no_filter_is_refused(a, b):
+    with pytest.raises(ModelError):
+        Dynamics(a, b)
+
+
+@pytest.mark.parametrize(('samples', 'fraction'), [(-1, 0), (1.5, 0), (1, 1.0), (1, -0.1)])
+def test_what_is_no_delay_is_refused(samples, fraction):
+    with pytest.raises(ModelError):
+        Delay(samples, fraction)
+
+
+@pytest.mark.parametrize('samples', [float('nan'), float('inf')])
+def test_endless_delay_is_refused(samples):
+    with pytest.raises(ModelError):
+        Delay(samples)

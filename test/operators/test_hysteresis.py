@@ -1,0 +1,123 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""H: eqs. (3) and (6), its slope, and what it refuses."""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from piezo_ident.common.errors import ModelError
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
+import pytest
+
+# Gu, Li, Zhu and Su (2016), Table of the identified parameters
+R = np.arange(10) / 10
+Q = [0.4777, 0.4473, 0.1113, 0.0671, 0.1411, 0.0104, 0.0001, 0.0354, 0.0961, 0.0084]
+P1, P2 = -0.2774, 0.6232
+PAPER = Hysteresis(R, Q, P1, P2)
+
+
+def test_weight_at_zero_is_folded_into_the_linear_term():
+    assert PAPER.thresholds[0] == 0.1
+    assert PAPER.thresholds.size == PAPER.weights.size == 9
+    assert PAPER.p2 == pytest.approx(P2 + 0.4777)
+    apart = Hysteresis(R[1:], Q[1:], P1, P2 + 0.4777)
+    v = np.random.default_rng(1).uniform(0, 1, 300)
+    assert_allclose(PAPER(v), apart(v), atol=1e-15)
+
+
+def test_full_stroke_is_that_of_the_papers_numbers():
+    # p1 + p2 + sum q (1 - r) = 1.483 at v = 1: 71 um of 75 um behind G(1) = 0.641
+    full = P1 + P2 + np.dot(Q, 1 - R)
+    assert full == pytest.approx(1.483, abs=5e-4)
+    assert PAPER(np.linspace(0, 1, 100))[-1] == pytest.approx(full)
+
+
+def test_without_thresholds_it_is_the_cubic():
+    H = Hysteresis([], [], 0.5, 2.0)
+    v = np.linspace(-1, 1, 11)
+    assert_allclose(H(v), 0.5 * v**3 + 2 * v, atol=1e-15)
+
+
+@pytest.mark.parametrize('bias', [0.25, 0.5, 0.8])
+@pytest.mark.parametrize('excursion', [0.05, 0.15, 0.4])
+def test_slope_is_that_of_a_settled_loop(bias, excursion):
+    # chord of the second small loop: up from the lower to the upper turning point
+    low, high = bias - excursion / 2, bias + excursion / 2
+    path = [0, bias, low, high, low, high]
+    v = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(path)])
+    w = PAPER(v)
+    chord = (w[-1] - w[-200]) / (high - low)
+    # the cubic's chord differs from its tangent by p1 (excursion/2)^2
+    assert PAPER.slope(bias, excursion) == pytest.approx(chord, abs=0.3 * excursion**2 / 4)
+
+
+def test_small_slope_is_the_derivative_after_a_reversal():
+    v = np.concatenate([np.linspace(0, 0.8, 50), [0.5, 0.5 + 1e-6]])
+    w = PAPER(np.concatenate([v[:-1], [0.5 + 1e-6]]))
+    assert PAPER.slope(0.5) == pytest.approx((w[-1] - w[-2]) / 1e-6, rel=1e-4)
+    # the slope depends on the bias: 1.10 at 0 V, 0.89 at 5 V of 10
+    assert PAPER.slope(0.0) == pytest.approx(1.101, abs=1e-3)
+    assert PAPER.slope(0.5) == pytest.approx(0.893, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('r', 'q', 'p1', 'p2', 'says'),
+    [
+        ([0.1, 0.2], [0.5], 0, 1, 'one weight each'),
+        ([0.1], [-0.5], 0, 1, 'must not be negative'),
+        ([-0.1], [0.5], 0, 1, 'not be negative'),
+        ([0.2, 0.1], [0.5, 0.5], 0, 1, 'must ascend'),
+        ([0.1, 0.1], [0.5, 0.5], 0, 1, 'must ascend'),
+        ([0.1], [np.nan], 0, 1, 'finite'),
+        ([np.inf], [0.1], 0, 1, 'finite'),
+        ([0.1], [0.1], np.nan, 1, 'finite'),
+        ([0.1], [0.1], 0, np.inf, 'finite'),
+        ([[0.1]], [[0.1]], 0, 1, 'one weight each'),
+        (0.1, 0.1, 0, 1, 'one weight each'),
+    ],
+)
+def test_what_is_no_hysteresis_is_refused(r, q, p1, p2, says):
+    with pytest.raises(ModelError, match=says):
+        Hysteresis(r, q, p1, p2)
+
+
+def test_parameters_cannot_be_changed_from_outside():
+    r, q = np.array([0.1, 0.2]), np.array([0.5, 0.5])
+    H = Hysteresis(r, q, 0, 1)
+    r[0], q[0] = 9, 9
+    assert_array_equal(H.thresholds, [0.1, 0.2])
+    assert_array_equal(H.weights, [0.5, 0.5])
+    with pytest.raises(ValueError, match='read-only'):
+        H.weights[0] = 1
+
+
+def through(operator, u, x0):
+    operator.reset(x0, x0)
+    return operator.process(Block(t=np.arange(u.size), v=u, x=u)).x
+
+
+def test_operator_is_the_function_and_reset_forgets():
+    u = np.random.default_rng(2).uniform(0, 1, 200)
+    operator = HysteresisOperator(PAPER)
+    assert_array_equal(through(operator, u, u[0]), PAPER(u))
+    assert_array_equal(through(operator, u, u[0]), PAPER(u))
+
+
+def test_operator_starts_from_the_memory_given_every_time():
+    u = np.random.default_rng(3).uniform(0.3, 0.6, 50)
+    memory = u[0] - PAPER.thresholds / 3
+    operator = HysteresisOperator(PAPER, memory)
+    memory_before = memory.copy()
+    for _ in range(2):
+        assert_array_equal(through(operator, u, u[0]), PAPER(u, memory_before))
+    assert_array_equal(memory, memory_before)
+
+
+def test_rest_value_is_what_a_constant_gives():
+    operator = HysteresisOperator(PAPER)
+    rest = operator.reset(0.4, 0.4)
+    x = operator.process(Block(t=np.zeros(5), v=np.full(5, 0.4), x=np.full(5, 0.4))).x
+    assert_array_equal(x, np.full(5, rest))

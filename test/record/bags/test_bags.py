@@ -1,0 +1,343 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bags as other tools read them, and bags as live recordings leave them."""
+
+from collections.abc import Iterable
+
+from bag_data import blocks, write
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag, SAMPLE_QOS, write_bag
+from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples
+from piezo_ident.record.capture import APPLIED, Capture
+from piezo_ident.record.join import join
+from piezo_ident.record.record import Piece, Record, Segment
+from piezo_ident.record.stream import Stream
+import pytest
+import yaml
+
+pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+RATE = 1000.0
+
+
+def record(n: int = 1050, start: float = 0.0) -> Record:
+    rng = np.random.default_rng(0)
+    segments = (Segment('noise', 130, 400), Segment('sine:50Hz', 400, n))
+    channels = {'temperature': rng.normal(size=n)}
+    piece = Piece(rng.normal(size=n), 1e-6 * rng.normal(size=n), RATE, start, segments, channels)
+    return Record((piece,), 'r')
+
+
+def interleave(pairs: Iterable[tuple[Samples, Samples]]) -> list[tuple[str, Samples]]:
+    return [(f'/{s.quantity}', s) for pair in pairs for s in pair]
+
+
+def faults(got: Record) -> dict[str, int]:
+    return {f.name: f.count for f in got.faults}
+
+
+def test_layout_of_a_block():
+    data, dims = encode(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0]), 'hold:4V', 'voltage'))
+    assert data.tolist() == [0.0, 5.0, 0.1, 6.0]
+    assert dims == (Dimension('sample:hold:4V', 2, 4), Dimension('t,voltage', 2, 2))
+    back = decode(data, dims)
+    assert (back.segment, back.quantity) == ('hold:4V', 'voltage')
+    assert back.t.tolist() == [0.0, 0.1]
+    assert decode(np.r_[9.0, data], dims, data_offset=1).values.tolist() == [5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ('dims', 'reason'),
+    [
+        ((), 'is not'),
+        ((Dimension('sample:', 2, 4),), 'is not'),
+        ((Dimension('sample:', 3, 6), Dimension('t,voltage', 2, 2)), 'announces 3 x 2'),
+        ((Dimension('sample:', 2, 4), Dimension('t,voltage', 3, 3)), 'layout 2 x 3'),
+        ((Dimension('sample:', 2, 2), Dimension('t,voltage', 2, 2)), 'strides 2, 2'),
+        ((Dimension('row', 2, 4), Dimension('t,voltage', 2, 2)), "first dimension is 'row'"),
+    ],
+)
+def test_layouts_that_do_not_fit(dims, reason):
+    with pytest.raises(DataError, match=reason):
+        decode(np.zeros(4), dims)
+
+
+def test_no_block_spans_two_segments():
+    got = list(cut_blocks(1050, record().pieces[0].segments))
+    assert got[:4] == [(0, 100, ''), (100, 130, ''), (130, 230, 'noise'), (230, 330, 'noise')]
+    assert got[-1] == (1000, 1050, 'sine:50Hz')
+    assert [b[0] for b in got[1:]] == [b[1] for b in got[:-1]]
+
+
+@pytest.mark.parametrize('start', [0.0, -2.5, 100.0])
+def test_other_readers_see_the_same(tmp_path, start):
+    want = record(start=start)
+    write_bag(want, tmp_path / 'bag', custom_data={'seed': '7'})
+    got: dict[str, list] = {}
+    with (tmp_path / 'bag' / 'bag.mcap').open('rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, ros in reader.iter_decoded_messages():
+            assert schema.name == MESSAGE_TYPE
+            assert 'history' in channel.metadata['offered_qos_profiles']
+            got.setdefault(channel.topic, []).append((message.log_time, ros))
+    assert set(got) == {'/voltage', '/displacement', '/x_temperature'}
+    p = want.pieces[0]
+    columns = {'voltage': p.v, 'displacement': p.y, 'x_temperature': p.channels['temperature']}
+    base = 3 if start < 0 else 0
+    for quantity, x in columns.items():
+        messages = got[f'/{quantity}']
+        rows = np.concatenate([np.array(m.data).reshape(-1, 2) for _, m in messages])
+        np.testing.assert_array_equal(rows, np.column_stack([p.t, x]))
+        for log_time, m in messages:
+            samples, names = m.layout.dim
+            assert (names.label, names.size, names.stride) == (f't,{quantity}', 2, 2)
+            assert samples.label in ('sample:', 'sample:noise', 'sample:sine:50Hz')
+            assert 0 < samples.size <= 100
+            assert samples.stride == len(m.data) == 2 * samples.size
+            assert m.layout.data_offset == 0
+            assert log_time == round((m.data[0] + base) * 1e9)
+        assert [m.layout.dim[0].label for _, m in messages[:3]] == ['sample:'] * 2 + [
+            'sample:noise'
+        ]
+    meta = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    info = meta['rosbag2_bagfile_information']
+    assert info['version'] == 9
+    assert info['storage_identifier'] == 'mcap'
+    assert info['relative_file_paths'] == ['bag.mcap']
+    assert info['custom_data'] == {'sample_rate': '1000.0', 'seed': '7'}
+    for topic in info['topics_with_message_count']:
+        (qos,) = topic['topic_metadata']['offered_qos_profiles']
+        assert (qos['history'], qos['depth']) == ('keep_last', 100)
+        assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
+    assert SAMPLE_QOS.depth == 100
+
+
+def test_lost_blocks_are_gaps(tmp_path):
+    messages = interleave(blocks())
+    del messages[8]  # the fifth of the voltage
+    got = read_bag(write(tmp_path / 'bag', messages))
+    assert [p.n for p in got] == [400, 500]
+    assert got.pieces[1].start_time == 0.5
+    assert faults(got) == {'unmatched': 100, 'gap': 1}
+
+
+def test_late_and_early_streams_meet(tmp_path):
+    pairs = blocks()
+    messages = [('/voltage', v) for v, _ in pairs[:3]] + interleave(pairs[3:])[:-1]
+    got = read_bag(write(tmp_path / 'bag', messages))
+    assert [(p.n, p.start_time) for p in got] == [(600, 0.3)]
+    assert faults(got) == {'unmatched': 400}
+
+
+@pytest.mark.parametrize('which', [[0], [1], [0, 1]])
+@pytest.mark.parametrize('later', [1, 5])
+def test_a_block_twice_is_dropped(tmp_path, which, later):
+    messages = interleave(blocks())
+    for i in which:
+        messages.insert(8 + 2 * later, messages[8 + i])
+    got = read_bag(write(tmp_path / 'bag', messages))
+    assert [p.n for p in got] == [1000]
+    assert faults(got) == {'repeated_rows': 100}
+
+
+def test_a_block_twice_with_other_values_is_refused(tmp_path):
+    pairs = blocks()
+    v, _ = pairs[4]
+    messages = interleave(pairs)
+    messages.insert(10, ('/voltage', Samples(v.t, v.values + 1, v.segment, v.quantity)))
+    with pytest.raises(DataError, match=r'two different samples of voltage at t = 0\.4 s'):
+        read_bag(write(tmp_path / 'bag', messages))
+
+
+def test_restart(tmp_path):
+    first, second = blocks(seed=1), blocks(1200, seed=2)
+    got = read_bag(write(tmp_path / 'bag', interleave([*first, *second])))
+    assert [(p.n, p.start_time) for p in got] == [(1000, 0.0), (1200, 0.0)]
+    assert faults(got) == {'restart': 1}
+    want = np.concatenate([v.values for v, _ in second])
+    np.testing.assert_array_equal(got.pieces[1].v, want)
+
+
+def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
+    first, second = blocks(seed=1), blocks(seed=2)
+    again = [(v, y) for (v, _), (_, y) in zip(first, second, strict=True)]
+    messages = interleave([*first, *again])
+    del messages[0]  # its twin in the second run must not stand in for it
+    got = read_bag(write(tmp_path / 'bag', messages))
+    assert [(p.n, p.start_time) for p in got] == [(900, 0.1), (1000, 0.0)]
+    np.testing.assert_array_equal(got.pieces[0].y[:100], first[1][1].values)
+    np.testing.assert_array_equal(got.pieces[1].y[:100], second[0][1].values)
+
+
+def test_streams_cut_into_other_blocks():
+    streams = {'voltage': Stream(), 'displacement': Stream()}
+    t = np.arange(700) / RATE
+    for i in range(0, 700, 100):
+        streams['voltage'].append(Samples(t[i : i + 100], t[i : i + 100]), i)
+    for i in range(0, 700, 70):
+        streams['displacement'].append(Samples(t[i : i + 70], -t[i : i + 70]), i + 1)
+    joined = join(streams)
+    np.testing.assert_array_equal(joined.t, t)
+    np.testing.assert_array_equal(joined.columns['displacement'], -t)
+    assert joined.segments == ([''], [0])
+    assert joined.faults == ()
+
+
+def test_streams_that_never_meet_are_refused(tmp_path):
+    pairs = [(v, Samples(y.t + 1e-4, y.values, '', y.quantity)) for v, y in blocks()]
+    with pytest.raises(DataError, match='share no time stamp'):
+        read_bag(write(tmp_path / 'bag', interleave(pairs)))
+
+
+def test_two_stages_need_a_namespace(tmp_path):
+    a, b = blocks(seed=1), blocks(seed=2)
+    messages = [
+        (f'/{name}{topic}', s)
+        for pair in zip(interleave(a), interleave(b), strict=True)
+        for name, (topic, s) in zip('ab', pair, strict=True)
+    ]
+    path = write(tmp_path / 'bag', messages)
+    with pytest.raises(DataError, match='/a/voltage, /b/voltage; name the stage'):
+        read_bag(path)
+    for options in (
+        {'namespace': '/b'},
+        {'namespace': 'b/'},
+        {'voltage_topic': 'b/voltage', 'displacement_topic': '/b/displacement'},
+    ):
+        got = read_bag(path, **options)
+        np.testing.assert_array_equal(got.pieces[0].v[:100], b[0][0].values)
+    with pytest.raises(DataError, match="no topic carries 't,voltage' below /c/"):
+        read_bag(path, namespace='c')
+    with pytest.raises(DataError, match='no samples on topic /c'):
+        read_bag(path, voltage_topic='c')
+
+
+def test_remapped_and_further_topics(tmp_path):
+    messages = []
+    for v, y in blocks():
+        messages += [
+            ('/stage/drive', v),
+            ('/stage/gauge', y),
+            ('/stage/residual', Samples(y.t, y.values, '', 'residual')),
+            ('/stage/x_temp', Samples(y.t, y.t, '', 'x_temp')),
+        ]
+    got = read_bag(write(tmp_path / 'bag', messages))
+    assert got.n == 1000
+    assert list(got.pieces[0].channels) == ['temp']
+    messages = [
+        m
+        for v, y in blocks()
+        for m in (
+            ('/applied_voltage', v),
+            ('/voltage', v),
+            ('/displacement', y),
+            ('/prediction', y),
+        )
+    ]
+    assert read_bag(write(tmp_path / 'bag2', messages)).n == 1000
+
+
+@pytest.mark.parametrize(('step', 'stop', 'n'), [(10, 1000, 100), (1, 600, 600)])
+def test_a_sparse_channel_costs_no_other_sample(tmp_path, step, stop, n):
+    messages = []
+    for v, y in blocks():
+        x = v.t[v.t < stop / RATE][::step]
+        messages += [('/voltage', v), ('/displacement', y)]
+        messages += [('/x_temp', Samples(x, x, '', 'x_temp'))] if x.size else []
+    got = read_bag(write(tmp_path / 'bag', messages))
+    (piece,) = got.pieces
+    assert (piece.n, list(piece.channels)) == (1000, [])
+    (fault,) = got.faults
+    assert (fault.name, fault.count) == ('sparse_channel', 1000 - n)
+    assert str(fault.where) == f'x_temp, {n} samples beside 1000'
+
+
+@pytest.mark.parametrize('name', ['prediction', 'residual'])
+def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
+    messages = [m for v, y in blocks() for m in (('/s/voltage', v), (f'/s/{name}', y))]
+    path = write(tmp_path / 'bag', messages)
+    with pytest.raises(DataError, match=f'/s/{name}: computed by a model, and no topic carries'):
+        read_bag(path)
+    # whoever asks for it gets it
+    assert read_bag(path, displacement_topic=f's/{name}').n == 1000
+    # beside what was measured under another name it is no second displacement
+    messages += [('/s/gauge', Samples(y.t, -y.values, '', y.quantity)) for _, y in blocks()]
+    got = read_bag(write(tmp_path / 'both', messages))
+    np.testing.assert_array_equal(got.pieces[0].y[:100], -blocks()[0][1].values)
+
+
+@pytest.mark.parametrize('voltage', ['voltage', 'drive'])
+def test_applied_voltage_is_met_as_in_a_live_capture(tmp_path, voltage):
+    messages, capture = [], Capture()
+    for k, (v, y) in enumerate(blocks()):
+        # the guard was at work in block 3, its word on block 6 was lost, the stage missed block 8
+        a = Samples(v.t, v.values - (k == 3) * np.linspace(0, 1, 100), v.segment, 'voltage')
+        for topic, key, samples in (
+            (voltage, 'voltage', v),
+            (APPLIED, APPLIED, a),
+            ('displacement', 'displacement', y),
+        ):
+            if (k, key) in ((6, APPLIED), (8, 'displacement')):
+                continue
+            capture.add(key, samples, 10**9 + len(messages) * 10**6)
+            messages.append((f'/left/{topic}', samples))
+    live = capture.record()
+    bag = read_bag(write(tmp_path / 'bag', messages))
+    assert [p.n for p in bag] == [301, 400, 100]
+    assert faults(bag) == {**faults(live), 'guarded_voltage': 99, 'applied_unknown': 100}
+    for one, other in zip(bag, live, strict=True):
+        assert one.segments == other.segments and one.sample_rate == other.sample_rate
+        for column in ('t', 'v', 'y'):
+            np.testing.assert_array_equal(getattr(one, column), getattr(other, column))
+    # whoever asks for it gets it as the voltage
+    asked = read_bag(tmp_path / 'bag', voltage_topic=f'left/{APPLIED}')
+    assert asked.n == 800 and asked.pieces[0].v[399] == messages[10][1].values[99]
+
+
+def test_corrupt_layout_names_topic_and_message(tmp_path):
+    def edit(i, data, dims):
+        return (data[:-1] if i == 7 else data), dims
+
+    with pytest.raises(DataError, match='topic /displacement, message 3: layout announces 100'):
+        read_bag(write(tmp_path / 'bag', interleave(blocks()), edit))
+    with pytest.raises(DataError, match='topic /voltage, message 0: layout'):
+        read_bag(
+            write(tmp_path / 'bag2', interleave(blocks()), lambda i, data, dims: (data, dims[:1]))
+        )
+
+
+def test_bag_without_samples(tmp_path):
+    foreign = Samples(np.zeros(2), np.zeros(2), '', '')
+    path = write(
+        tmp_path / 'bag', [('/scan', foreign)], lambda i, data, dims: (data, [Dimension('', 4, 4)])
+    )
+    with pytest.raises(DataError, match=r'no topic carries blocks .*topics: /scan'):
+        read_bag(path)
+
+
+def test_folder_without_a_bag(tmp_path):
+    write_bag(record(), tmp_path / 'bag')
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    (tmp_path / 'bag' / 'bag.mcap').unlink()
+    with pytest.raises(DataError, match='ros2 bag reindex'):
+        read_bag(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('text', ['', '{', 'a: 1', 'rosbag2_bagfile_information: 3'])
+def test_damaged_metadata(tmp_path, text):
+    write_bag(record(), tmp_path / 'bag')
+    (tmp_path / 'bag' / 'metadata.yaml').write_text(text)
+    with pytest.raises(DataError, match='damaged or unfinished bag'):
+        read_bag(tmp_path / 'bag')
+
+
+def test_storage_must_be_known_and_agree(tmp_path):
+    for name, storage in (('bag', 'rosbag1'), ('bag.mcap', 'sqlite3')):
+        with pytest.raises(DataError, match='use mcap or sqlite3'):
+            write_bag(record(), tmp_path / name, storage=storage)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,497 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bags written as a recorder does, killed at any moment, and what comes back of them."""
+
+import json
+import os
+from pathlib import Path
+import random
+import shutil
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+
+from bag_data import raw_blocks
+import numpy as np
+from piezo_ident.cli import main
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.bags.mcap_scan import MAGIC, McapScan, Message
+from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
+from piezo_ident.record.bags.recover import is_unfinished, opened_bag
+from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount
+from piezo_ident.record.io import read_record
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+import yaml
+
+pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from mcap_ros2.decoder import DecoderFactory
+
+TEST = Path(__file__).resolve().parents[2]
+RATE = 20000.0
+STORAGES = ('mcap', 'sqlite3')
+TYPES = typestore().types
+
+# writes blocks of both topics for ever, flushes every fifth pair, says how far it is
+ENDLESS = """
+import sys
+from bag_data import raw_blocks
+from piezo_ident.record.bags.write import BagWriter
+
+writer = BagWriter(sys.argv[1], sys.argv[2], {'sample_rate': '20000.0'})
+for topic in ('/voltage', '/displacement'):
+    writer.add_topic(topic, 'std_msgs/msg/Float64MultiArray')
+for k, (voltage, displacement) in enumerate(raw_blocks()):
+    writer.write('/voltage', 10**18 + k * 5_000_000, voltage)
+    writer.write('/displacement', 10**18 + k * 5_000_000 + 1, displacement)
+    if k % 1200 == 999:
+        writer.flush()
+        print(k, flush=True)
+"""
+
+
+def write(path: Path, storage: str = 'mcap', n: int = 40, **options) -> BagWriter:
+    """Write pairs of blocks 5 ms apart, and flush, but do not close."""
+    writer = BagWriter(path, storage, **options)
+    for topic in ('/voltage', '/displacement'):
+        writer.add_topic(topic, MESSAGE_TYPE)
+    for k, (voltage, displacement) in enumerate(raw_blocks(n)):
+        writer.write('/voltage', 10**18 + k * 5_000_000, voltage)
+        writer.write('/displacement', 10**18 + k * 5_000_000 + 100_000, displacement)
+    writer.flush()
+    return writer
+
+
+def killed(path: Path, **options) -> Path:
+    """Leave a bag as SIGKILL would after a flush."""
+    writer = write(path.with_name('alive'), **options)
+    shutil.copytree(writer.path, path)
+    (path / writer.file.name).rename(path / f'{path.name}{writer.file.suffix}')
+    writer.abort()
+    return path
+
+
+def truncation(record: Record) -> str:
+    (fault,) = (f for f in record.faults if f.name == 'truncated_bag')
+    return str(fault)
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_what_a_flush_uses_is_there(tmp_path, storage):
+    # internals of rosbags: should a new version lose them, this says so, and nothing is written
+    writer = write(tmp_path / 'bag', storage)
+    for name, parts in INTERNALS[storage].items():
+        for part in parts or ('__call__',):
+            assert hasattr(getattr(writer._inside, name), part)
+    size = writer.size
+    writer.write('/voltage', 2 * 10**18, b'\0' * 5000)
+    writer.flush()
+    assert writer.size > size
+    writer.abort()
+
+
+def test_a_rosbags_that_cannot_flush_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(INTERNALS, 'mcap', {'close_chunk': (), 'no_such_thing': ('flush',)})
+    with pytest.raises(DataError, match='version of rosbags'):
+        BagWriter(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_closed_bag(tmp_path, storage):
+    writer = write(tmp_path / 'bag', storage, custom_data={'sample_rate': '20000.0'})
+    writer.close()
+    assert not is_unfinished(tmp_path / 'bag')
+    record = read_bag(tmp_path / 'bag')
+    assert (record.n, record.pieces[0].sample_rate, record.faults) == (4000, RATE, ())
+    t = np.arange(4000) / RATE
+    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
+    assert writer.messages == 80
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_metadata_as_rosbag2_of_jazzy_reads_it(tmp_path, storage):
+    # The keys that rosbag2_storage of Jazzy (metadata_io, version 9) takes with as<...>(), which
+    # throws when one is missing.
+    latched = SAMPLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+    writer = BagWriter(tmp_path / 'bag', storage, {'sample_rate': '20000.0', 'namespace': '/a'})
+    writer.add_topic('/a/model', 'std_msgs/msg/String', [latched])
+    text = TYPES['std_msgs/msg/String']('model')
+    writer.write('/a/model', 5, bytes(typestore().serialize_cdr(text, 'std_msgs/msg/String')))
+    writer.close()
+    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    info = info['rosbag2_bagfile_information']
+    assert set(info) == {
+        'version',
+        'storage_identifier',
+        'duration',
+        'starting_time',
+        'message_count',
+        'topics_with_message_count',
+        'compression_format',
+        'compression_mode',
+        'relative_file_paths',
+        'files',
+        'custom_data',
+        'ros_distro',
+    }
+    assert (info['version'], info['storage_identifier'], info['message_count']) == (9, storage, 1)
+    assert info['starting_time'] == {'nanoseconds_since_epoch': 5}
+    assert info['duration'] == {'nanoseconds': 0}
+    assert info['custom_data'] == {'sample_rate': '20000.0', 'namespace': '/a'}
+    suffix = {'mcap': '.mcap', 'sqlite3': '.db3'}[storage]
+    assert info['relative_file_paths'] == [f'bag{suffix}']
+    assert set(info['files'][0]) == {'path', 'starting_time', 'duration', 'message_count'}
+    (topic,) = info['topics_with_message_count']
+    assert topic['message_count'] == 1
+    meta = topic['topic_metadata']
+    assert (meta['name'], meta['type']) == ('/a/model', 'std_msgs/msg/String')
+    assert meta['serialization_format'] == 'cdr'
+    # what rclpy 7.1 of Jazzy names std_msgs/msg/String
+    hash_ = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
+    assert meta['type_description_hash'] == hash_
+    forever = {'sec': 9223372036, 'nsec': 854775807}
+    assert meta['offered_qos_profiles'] == [
+        {
+            'history': 'keep_last',
+            'depth': 1,
+            'reliability': 'reliable',
+            'durability': 'transient_local',
+            'deadline': forever,
+            'lifespan': forever,
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': forever,
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]
+
+
+def test_another_reader_takes_a_flushed_bag(tmp_path):
+    writer = write(tmp_path / 'bag')
+    writer.write('/voltage', 2 * 10**18, next(raw_blocks(1))[0])
+    writer.close()
+    with (tmp_path / 'bag' / 'bag.mcap').open('rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_summary().statistics.chunk_count == 2
+        got = [(c.topic, m.log_time, ros) for _, c, m, ros in reader.iter_decoded_messages()]
+    assert len(got) == 81
+    assert got[0][:2] == ('/voltage', 10**18)
+    assert got[0][2].layout.dim[1].label == 't,voltage'
+
+
+def test_names_are_numbered(tmp_path):
+    for want in ('bag', 'bag_1', 'bag_2'):
+        writer = BagWriter(tmp_path / 'bag')
+        assert writer.path == tmp_path / want
+        assert writer.file.name == f'{want}.mcap'
+        writer.close()
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(DataError, match='cannot be written'):
+        BagWriter(tmp_path / 'file' / 'bag')
+
+
+def test_unknown_type_is_refused(tmp_path):
+    writer = BagWriter(tmp_path / 'bag')
+    with pytest.raises(DataError, match='type lab_msgs/msg/Odd is not known'):
+        writer.add_topic('/odd', 'lab_msgs/msg/Odd')
+    writer.abort()
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_sigkill(tmp_path, storage):
+    # in sqlite3 it comes with more than the page cache uncommitted: a hot journal is left
+    process = subprocess.Popen(
+        [sys.executable, '-c', ENDLESS, str(tmp_path / 'bag'), storage],
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(str, (TEST, TEST.parent)))},
+        stdout=subprocess.PIPE,
+    )
+    try:
+        for _ in range(2):
+            flushed = int(process.stdout.readline())
+        file = tmp_path / 'bag' / ('bag.mcap' if storage == 'mcap' else 'bag.db3')
+        journal = file.with_name('bag.db3-journal')
+        size = file.stat().st_size
+        while storage == 'sqlite3' and not (journal.is_file() and file.stat().st_size > size):
+            assert process.poll() is None
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+    before = {f.name: f.read_bytes() for f in (tmp_path / 'bag').iterdir()}
+    record = read_bag(tmp_path / 'bag', recover=True)
+    assert len(record.pieces) == 1
+    assert record.pieces[0].n >= 100 * (flushed + 1)
+    t = np.arange(record.n) / RATE
+    np.testing.assert_array_equal(record.pieces[0].t, t)
+    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
+    assert 'metadata.yaml is missing' in truncation(record)
+    with pytest.raises(DataError, match=r"'piezo_ident convert .* OUT' saves what is whole"):
+        read_bag(tmp_path / 'bag')
+    lacking = 'bag.mcap' if storage == 'mcap' else 'transaction that was never finished'
+    assert lacking in truncation(record)
+    # nothing of what was measured is touched
+    assert {f.name: f.read_bytes() for f in (tmp_path / 'bag').iterdir()} == before
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_convert_says_so_and_recovers(tmp_path, storage, capsys):
+    killed(tmp_path / 'bag', storage=storage)
+    assert main(['convert', str(tmp_path / 'bag'), str(tmp_path / 'whole')]) == 0
+    said = capsys.readouterr().out
+    assert 'met: truncated_bag' in said
+    assert 'recovered the 80 messages' in said
+    assert 'is unknown' in said
+    whole = read_record(tmp_path / 'whole', recover=True)
+    assert (whole.n, whole.faults) == (4000, ())
+    assert main(['convert', '--json', str(tmp_path / 'bag'), str(tmp_path / 'out.npz')]) == 0
+    story = json.loads(capsys.readouterr().out)
+    assert [f['name'] for f in story['faults']] == ['truncated_bag']
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_lone_file_and_a_bag_without_metadata(tmp_path, storage):
+    killed(tmp_path / 'bag', storage=storage)
+    (file,) = (tmp_path / 'bag').iterdir()
+    if storage == 'mcap':
+        assert 'the end of bag.mcap is missing' in truncation(read_record(file, recover=True))
+    else:
+        # all of it is committed: as a file of its own nothing is amiss
+        assert read_record(file, recover=True).faults == ()
+    write(tmp_path / 'good', storage).close()
+    (tmp_path / 'good' / 'metadata.yaml').unlink()
+    record = read_record(tmp_path / 'good', recover=True)
+    assert record.n == 4000
+    assert 'recovered the 80 messages' in truncation(record)
+    assert 'metadata.yaml is missing' in truncation(record)
+
+
+def test_several_files(tmp_path):
+    for i, part in enumerate(('bag_0', 'bag_1')):
+        write(tmp_path / part).close()
+        folder = tmp_path / 'bag'
+        folder.mkdir(exist_ok=True)
+        (tmp_path / part / f'{part}.mcap').rename(folder / f'bag_{i}.mcap')
+    with opened_bag(folder) as bag:
+        assert sum(c.msgcount for c in bag.connections) == 160
+        assert len(list(bag.messages(bag.connections))) == 160
+    (folder / 'bag_1.mcap').rename(folder / 'another.mcap')
+    with pytest.raises(DataError, match=r'name one of its files: another\.mcap, bag_0\.mcap'):
+        read_bag(folder, recover=True)
+
+
+def test_a_stray_file_is_no_part_of_a_bag(tmp_path):
+    write(tmp_path / 'bag').close()
+    (tmp_path / 'bag' / 'stray.mcap').write_bytes(b'')
+    assert read_bag(tmp_path / 'bag').faults == ()
+
+
+def test_cut_anywhere(tmp_path):
+    # each message that is whole comes back, and nothing else
+    path = killed(tmp_path / 'bag', n=12)
+    file = path / 'bag.mcap'
+    data = file.read_bytes()
+    all_of_it = [(e.stamp, e.data) for e in McapScan(file) if isinstance(e, Message)]
+    assert len(all_of_it) == 24
+    # where each message ends in the file
+    ends = [data.index(raw_) + len(raw_) for _, raw_ in all_of_it]
+    rng = random.Random(0)
+    for cut in sorted({*rng.sample(range(len(data)), 150), *ends, *(e - 1 for e in ends)}):
+        file.write_bytes(data[:cut])
+        want = all_of_it[: sum(e <= cut for e in ends)]
+        if not want:
+            with pytest.raises(DataError, match='damaged or unfinished'), opened_bag(path):
+                pass
+            continue
+        with opened_bag(path) as bag:
+            assert [(m.stamp, m.raw) for m in bag.messages(bag.connections)] == want
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('share', [0.0, 0.3, 0.9])
+@pytest.mark.parametrize('metadata', [True, False])
+def test_truncated_file(tmp_path, storage, share, metadata):
+    segments = (Segment('noise', 0, 20000),)
+    v = np.random.default_rng(0).normal(size=20000)
+    write_bag(Record((Piece(v, 1e-6 * v, RATE, 0.0, segments),)), tmp_path / 'b', storage=storage)
+    (file,) = (f for f in (tmp_path / 'b').iterdir() if f.suffix in ('.mcap', '.db3'))
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    if not metadata:
+        (tmp_path / 'b' / 'metadata.yaml').unlink()
+    try:
+        record = read_bag(tmp_path / 'b', recover=True)
+    except DataError as error:
+        assert 'damaged or unfinished bag' in str(error)
+        assert '\n' not in str(error)
+        assert share == 0.0 or storage == 'sqlite3'
+        return
+    assert 0 < record.n < 20000
+    assert truncation(record)
+    np.testing.assert_array_equal(record.pieces[0].v, v[: record.pieces[0].n])
+
+
+@pytest.mark.parametrize('compression', ['NONE', 'ZSTD', 'LZ4'])
+@pytest.mark.parametrize('crc', [True, False])
+def test_compressed_bags_of_other_writers(tmp_path, compression, crc):
+    (tmp_path / 'bag').mkdir()
+    file = tmp_path / 'bag' / 'bag.mcap'
+    with file.open('wb') as out:
+        writer = McapWriter(
+            out, chunk_size=20000, compression=CompressionType[compression], enable_crcs=crc
+        )
+        writer.start('ros2', 'test')
+        definition, _ = typestore().generate_msgdef(MESSAGE_TYPE, ros_version=2)
+        schema = writer.register_schema(MESSAGE_TYPE, 'ros2msg', definition.encode())
+        topics = ('/voltage', '/displacement')
+        ids = [writer.register_channel(topic, 'cdr', schema) for topic in topics]
+        for k, pair in enumerate(raw_blocks(50)):
+            for i, data in zip(ids, pair, strict=True):
+                writer.add_message(i, 10**18 + k, data, 10**18 + k)
+        writer.finish()
+    data = file.read_bytes()
+    assert read_record(tmp_path / 'bag', recover=True).n == 5000
+    file.write_bytes(data[: len(data) // 2])
+    record = read_record(tmp_path / 'bag', recover=True)
+    assert 1000 < record.n < 5000
+    # a byte within the first chunk
+    broken = bytearray(data[: len(data) // 2])
+    broken[2000] ^= 0xFF
+    file.write_bytes(broken)
+    if crc:
+        with pytest.raises(DataError, match='makes no sense'):
+            read_record(tmp_path / 'bag', recover=True)
+
+
+def chunk(raw_size: int, compression: bytes, packed: bytes, declared: int | None = None) -> bytes:
+    declared = len(packed) if declared is None else declared
+    body = struct.pack('<QQQI', 0, 0, raw_size, 0)
+    body += struct.pack('<I', len(compression)) + compression
+    body += struct.pack('<Q', declared) + packed
+    return struct.pack('<BQ', 6, len(body)) + body
+
+
+HEADER = struct.pack('<BQ', 1, 8) + bytes(8)
+
+
+@pytest.mark.parametrize(
+    'records',
+    [
+        chunk(2**62, b'', b''),
+        chunk(2**62, b'zstd', b''),
+        chunk(10, b'', b'', declared=2**62),
+        chunk(10, b'zstd', b'garbage garbage garbage'),
+        chunk(10, b'lz4', b'\x04\x22\x4d\x18\x6c\x40' + struct.pack('<Q', 2**40) + bytes(9)),
+        chunk(10, b'zip', bytes(10)),
+        chunk(30, b'', struct.pack('<BQ', 5, 2**62) + bytes(21)),
+        struct.pack('<BQ', 5, 2**62) + bytes(100),
+        struct.pack('<BQ', 5, 3) + bytes(3),
+        struct.pack('<BQ', 3, 10) + b'\xff' * 10,
+        struct.pack('<BQ', 4, 30) + b'\x01\x00\x01\x00\xff\xff\xff\x7f' + bytes(22),
+        bytes(1000),
+    ],
+)
+def test_garbage_takes_no_memory(tmp_path, records):
+    file = tmp_path / 'bag.mcap'
+    file.write_bytes(MAGIC + HEADER + records)
+    with pytest.raises(DataError, match='damaged or unfinished') as caught:
+        read_record(file, recover=True)
+    assert '\n' not in str(caught.value)
+
+
+def test_a_zstd_bomb_is_not_unpacked(tmp_path):
+    from piezo_ident.record.bags import mcap_scan
+
+    packed = mcap_scan._zstd.compress(bytes(50_000_000))
+    file = tmp_path / 'bag.mcap'
+    file.write_bytes(MAGIC + HEADER + chunk(1000, b'zstd', packed))
+    with pytest.raises(DataError, match='checksum or size is wrong'):
+        read_record(file, recover=True)
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_flipped_bytes_never_crash(tmp_path, storage):
+    path = killed(tmp_path / 'bag', storage=storage, n=6)
+    (file,) = path.iterdir()
+    data = file.read_bytes()
+    rng = random.Random(1)
+    for _ in range(150):
+        broken = bytearray(data)
+        for _ in range(rng.randint(1, 4)):
+            broken[rng.randrange(len(data))] = rng.randrange(256)
+        file.write_bytes(broken[: rng.randint(len(data) // 2, len(data))])
+        try:
+            record = read_record(path, recover=True)
+        except DataError:
+            continue
+        assert truncation(record)
+
+
+def test_a_database_that_is_no_bag(tmp_path):
+    with sqlite3.connect(tmp_path / 'bag.db3') as database:
+        database.execute('CREATE TABLE topics(id)')
+    database.close()
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag.db3').rename(tmp_path / 'bag' / 'bag.db3')
+    with pytest.raises(DataError, match='damaged or unfinished bag'):
+        read_bag(tmp_path / 'bag', recover=True)
+
+
+def test_write_ahead_log(tmp_path):
+    # rosbag2 can be told to write sqlite3 so; what is only in the log counts
+    write(tmp_path / 'bag', 'sqlite3').close()
+    file = tmp_path / 'bag' / 'bag.db3'
+    database = sqlite3.connect(file)
+    database.execute('PRAGMA journal_mode=WAL').fetchone()
+    (topic,) = database.execute("SELECT id FROM topics WTEST name = '/voltage'").fetchone()
+    database.execute('INSERT INTO messages VALUES(?, ?, ?, ?)', (999, topic, 2 * 10**18, b'new'))
+    database.commit()
+    shutil.copytree(tmp_path / 'bag', tmp_path / 'killed')
+    database.close()
+    assert (tmp_path / 'killed' / 'bag.db3-wal').stat().st_size
+    with opened_bag(tmp_path / 'killed') as bag:
+        assert [m.raw for m in bag.messages(bag.connections)][-1] == b'new'
+        assert bag.faults
+
+
+def test_both_ways_of_reading_agree(tmp_path):
+    for storage in STORAGES:
+        path = tmp_path / storage
+        write(path, storage).close()
+        with Reader(path) as reader:
+            want = [(c.topic, stamp, bytes(data)) for c, stamp, data in reader.messages()]
+            qos = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
+        (path / 'metadata.yaml').unlink()
+        with opened_bag(path) as bag:
+            got = [(m.connection.topic, m.stamp, m.raw) for m in bag.messages(bag.connections)]
+            assert got == want
+            assert {c.topic: c.ext.offered_qos_profiles for c in bag.connections} == qos
+            assert (bag.start, bag.end) == (10**18, 10**18 + 39 * 5_000_000 + 100_000)
+
+
+def test_a_name_that_no_disk_takes_is_refused(tmp_path):
+    with (
+        pytest.raises(DataError, match=r'cannot be read|does not exist'),
+        opened_bag(tmp_path / ('x' * 300)),
+    ):
+        pass
+
+
+def test_lost_messages_are_counted():
+    losses = LossCount()
+    for number in (1, 2, 3, 7, 8):
+        losses.note(number)
+    assert losses.lost == 3
+    # a publisher that starts over, and one far ahead that was there before
+    for number in (1, 2, 90000, 90001):
+        losses.note(number)
+    assert losses.lost == 3
+    # of one that is known to be the same a long silence is a loss
+    losses.note(95001, alone=True)
+    assert losses.lost == 3 + 4999

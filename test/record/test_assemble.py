@@ -1,0 +1,365 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Every fault of measured data, on data whose truth is known."""
+
+from collections.abc import Iterator
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.assemble import assemble, label_runs
+from piezo_ident.record.clock import fit_clock, Resolution, split_uniform
+from piezo_ident.record.record import Record, Segment
+import pytest
+
+RATE = 1000.0
+
+
+def columns(n: int = 200, rate: float = RATE, start: int = 0) -> list[np.ndarray]:
+    k = np.arange(start, start + n)
+    v = 5 + 5 * np.sin(0.1 * k)
+    return [k / rate, v, 7.5e-6 * v]
+
+
+def rows(*parts: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.concatenate(c) for c in zip(*parts, strict=True)]
+
+
+def read(c: list[np.ndarray], **options: object) -> Record:
+    return assemble(*c, name='data', **options)  # type: ignore[arg-type]
+
+
+def faults(record: Record) -> dict[str, int]:
+    return {f.name: f.count for f in record.faults}
+
+
+def sizes(record: Record) -> list[int]:
+    return [p.n for p in record]
+
+
+def test_clean_columns_come_back_as_they_are():
+    t, v, y = c = columns()
+    record = read(c)
+    assert sizes(record) == [200]
+    assert record.faults == ()
+    piece = record.pieces[0]
+    assert piece.sample_rate == RATE
+    np.testing.assert_array_equal(piece.t, t)
+    np.testing.assert_array_equal(piece.v, v)
+    np.testing.assert_array_equal(piece.y, y)
+
+
+def test_inputs_stay_as_they_are():
+    c = rows(columns(50), columns(50, start=60))
+    c[1][7] = np.nan
+    c = rows(c, *[[x[-1:] for x in c]] * 2)
+    before = [x.copy() for x in c]
+    read(rows(c, columns(300, start=200)), displacement_unit='m')
+    for x, y in zip(c, before, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_gap_splits():
+    record = read(rows(columns(100), columns(100, start=150)))
+    assert sizes(record) == [100, 100]
+    assert [p.start_time for p in record] == [0.0, 0.15]
+    assert faults(record) == {'gap': 1}
+    assert '0.099' in record.faults[0].where
+
+
+def test_single_lost_sample_splits():
+    record = read(rows(columns(100), columns(100, start=101)))
+    assert sizes(record) == [100, 100]
+
+
+def test_the_same_run_again_is_a_restart():
+    record = read(rows(columns(500), columns(600)))
+    assert sizes(record) == [500, 600]
+    assert faults(record) == {'restart': 1}
+
+
+def test_restart_splits():
+    again = columns(120)
+    again[2] = again[2] + 1e-7
+    record = read(rows(columns(100), again))
+    assert sizes(record) == [100, 120]
+    assert faults(record) == {'restart': 1}
+    assert [p.start_time for p in record] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize('other', [1100.0, 500.0, 8000.0])
+def test_rate_change_splits(other):
+    late = columns(300, rate=other)
+    late[0] = late[0] + 0.2
+    record = read(rows(columns(200), late))
+    assert sizes(record) == [200, 300]
+    assert [p.sample_rate for p in record] == [RATE, other]
+    assert 'rate_change' in faults(record)
+
+
+def test_rate_that_changes_a_little_and_back():
+    t = np.cumsum(np.repeat([1 / 1000, 1 / 1050, 1 / 1000], [500, 600, 700]))
+    v = np.arange(t.size) / 200
+    record = read([t, v, 1e-6 * v])
+    assert [round(p.sample_rate, 3) for p in record] == [1000, 1050, 1000]
+    np.testing.assert_allclose(sizes(record), [500, 600, 700], atol=1)
+
+
+@pytest.mark.parametrize('decimals', [4, 5, 6])
+@pytest.mark.parametrize('rate', [256.0, 1024.0, 2048.0, 1000 / 3])
+def test_rounded_stamps_are_no_jitter(decimals, rate):
+    t, v, y = columns(5000, rate=rate)
+    record = read([np.round(t, decimals), v, y])
+    assert sizes(record) == [5000]
+    assert record.faults == ()
+    assert record.pieces[0].sample_rate == pytest.approx(rate, rel=1e-12)
+    np.testing.assert_allclose(record.pieces[0].t, t, atol=1e-12)
+
+
+@pytest.mark.parametrize('digits', [7, 9])
+def test_stamps_rounded_to_significant_digits(digits):
+    t, v, y = columns(5000, rate=2048.0)
+    printed = np.array([float(f'{x:.{digits}g}') for x in t + 10])
+    record = read([printed, v, y])
+    assert sizes(record) == [5000]
+    assert record.pieces[0].sample_rate == 2048
+    np.testing.assert_array_equal(record.pieces[0].t, t + 10)
+
+
+def test_single_precision_stamps():
+    t, v, y = columns(5000, rate=20000.0)
+    record = read([(t + 3).astype(np.float32), v, y])
+    assert sizes(record) == [5000]
+    assert record.pieces[0].sample_rate == 20000
+    np.testing.assert_allclose(record.pieces[0].t, t + 3, atol=1e-12)
+
+
+def test_lost_samples_show_in_rounded_stamps():
+    c = [np.delete(x, [500, 700, 701, 900]) for x in columns(3000, rate=2048.0)]
+    c[0] = np.round(c[0], 4)
+    record = read(c)
+    assert sizes(record) == [500, 199, 198, 2099]
+    assert {p.sample_rate for p in record} == {2048.0}
+
+
+def test_a_step_as_fine_as_the_last_decimal():
+    c = [np.delete(x, 500) for x in columns(1000, rate=10000.0)]
+    c[0] = np.round(c[0], 4)
+    record = read(c)
+    assert sizes(record) == [500, 499]
+    assert [p.sample_rate for p in record] == [10000, 10000]
+
+
+def test_short_piece_takes_the_rate_of_a_long_one():
+    t, v, y = rows(columns(2000, rate=2048.0), columns(3, rate=2048.0, start=2100))
+    record = read([np.round(t, 4), v, y])
+    assert sizes(record) == [2000, 3]
+    assert [p.sample_rate for p in record] == [2048, 2048]
+
+
+def test_jitter_is_reported():
+    t, v, y = columns(2000)
+    t = t + np.random.default_rng(1).normal(scale=0.03 / RATE, size=t.size)
+    record = read([t, v, y])
+    assert sizes(record) == [2000]
+    assert faults(record) == {'timing_jitter': 1}
+    assert record.pieces[0].sample_rate == pytest.approx(RATE, rel=1e-4)
+
+
+def test_random_sampling_is_refused():
+    t, v, y = columns(2000)
+    t = np.sort(np.random.default_rng(1).uniform(size=t.size))
+    with pytest.raises(DataError, match=r'data: time is not uniformly sampled'):
+        read([t, v, y])
+
+
+def test_repeated_rows_are_dropped():
+    block = [x[40:60] for x in columns()]
+    tail = columns(100, start=60)
+    record = read(rows(columns(60), block, tail))
+    assert sizes(record) == [160]
+    assert faults(record) == {'repeated_rows': 20}
+
+
+def test_every_row_twice():
+    record = read([np.repeat(x, 2) for x in columns()])
+    assert sizes(record) == [200]
+    assert faults(record) == {'repeated_rows': 200}
+
+
+@pytest.mark.parametrize('column', [1, 2])
+def test_same_time_other_value_is_refused(column):
+    c = [np.insert(x, 50, x[49]) for x in columns()]
+    c[column][50] += 1e-6
+    with pytest.raises(DataError, match=r'data: two different samples at t = 0\.049 s'):
+        read(c)
+
+
+def test_block_again_with_other_values_is_refused():
+    block = [x[40:60] for x in columns()]
+    block[2] = block[2] + 1e-9
+    with pytest.raises(DataError, match='two different samples'):
+        read(rows(columns(60), block, columns(100, start=60)))
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('column', [0, 1, 2])
+def test_not_finite_splits_around(bad, column):
+    c = columns(500)
+    c[column][200] = bad
+    record = read(c)
+    assert sizes(record) == [200, 299]
+    assert record.pieces[1].start_time == 0.201
+    assert faults(record) == {'not_finite': 1}
+
+
+def test_not_finite_channel_splits():
+    x = np.ones(500)
+    x[0], x[499] = np.nan, np.nan
+    record = read(columns(500), channels={'temperature': x})
+    assert sizes(record) == [498]
+    assert np.isfinite(record.pieces[0].channels['temperature']).all()
+
+
+def test_more_than_one_percent_not_finite_is_refused():
+    c = columns(500)
+    c[2][100:106] = np.nan
+    with pytest.raises(DataError, match='6 of 500 samples are NaN or infinite, more than 1 %'):
+        read(c)
+
+
+def test_sample_between_two_bad_ones_is_dropped():
+    c = columns(500)
+    c[2][[200, 202]] = np.nan
+    record = read(c)
+    assert sizes(record) == [200, 297]
+    assert faults(record) == {'not_finite': 2, 'lone_sample': 1}
+
+
+def swapped() -> Iterator[list[np.ndarray]]:
+    order = np.arange(200)
+    yield order[::-1].copy()
+    yield np.random.default_rng(0).permutation(200)
+    order[[50, 51]] = order[[51, 50]]
+    yield order.copy()
+    # two blocks in the wrong order
+    yield np.concatenate([np.r_[0:50], np.r_[100:150], np.r_[50:100], np.r_[150:200]])
+
+
+@pytest.mark.parametrize('order', list(swapped()))
+def test_unsorted_time_is_refused(order):
+    with pytest.raises(DataError, match=r'data: time is unsorted, .* sort the rows by t'):
+        read([x[order] for x in columns()])
+
+
+@pytest.mark.parametrize('factor', [1e6, 1e-6])
+def test_stroke_of_no_piezo_stage_is_refused(factor):
+    t, v, y = columns()
+    with pytest.raises(DataError, match='--displacement-unit'):
+        read([t, v, y * factor])
+
+
+@pytest.mark.parametrize(('unit', 'factor'), [('mm', 1e3), ('um', 1e6), ('µm', 1e6), ('nm', 1e9)])
+def test_displacement_units(unit, factor):
+    t, v, y = columns()
+    record = read([t, v, y * factor], displacement_unit=unit)
+    np.testing.assert_allclose(record.pieces[0].y, y, rtol=1e-15)
+
+
+def test_unknown_unit_is_refused():
+    with pytest.raises(DataError, match='use m, mm, um or nm'):
+        read(columns(), displacement_unit='inch')
+
+
+def test_voltage_limits():
+    read(columns(), voltage_limits=(0.0, 10.0))
+    with pytest.raises(DataError, match=r'voltage limits 0\.\.9 V, worst (9\.9|10)'):
+        read(columns(), voltage_limits=(0.0, 9.0))
+
+
+@pytest.mark.parametrize('factor', [1e15, 1e-9])
+def test_time_in_another_unit_is_refused(factor):
+    t, v, y = columns()
+    with pytest.raises(DataError, match='write t in seconds'):
+        read([t * factor, v, y])
+
+
+def test_an_idle_record_is_a_record():
+    t, v, y = columns()
+    record = read([t, np.zeros_like(v), np.full_like(y, 3e-6)])
+    assert record.stroke == 0
+
+
+@pytest.mark.parametrize(('n', 'reason'), [(0, 'no samples'), (1, 'one sample only')])
+def test_too_few_samples_are_refused(n, reason):
+    with pytest.raises(DataError, match=f'data: {reason}'):
+        read([x[:n] for x in columns()])
+
+
+def test_columns_of_different_length_are_refused():
+    t, v, y = columns()
+    with pytest.raises(DataError, match='t 200, v 200, y 199'):
+        read([t, v, y[:-1]])
+
+
+def test_named_rate_is_checked_against_the_stamps():
+    assert faults(read(columns(), sample_rate=RATE)) == {}
+    record = read(columns(), sample_rate=2 * RATE)
+    assert record.pieces[0].sample_rate == RATE
+    assert faults(record) == {'sample_rate': 1}
+
+
+def test_segments_of_labels_follow_the_pieces():
+    labels = ['', *['noise'] * 99, *['sine:50Hz'] * 100]
+    c = columns(200)
+    c[2][150] = np.nan
+    record = assemble(*rows(c, columns(300, start=200)), label_runs(labels), name='data')
+    assert record.pieces[0].segments == (Segment('noise', 1, 100), Segment('sine:50Hz', 100, 150))
+    assert record.pieces[1].segments == (Segment('sine:50Hz', 0, 349),)
+
+
+@pytest.mark.parametrize(
+    'segments', [(['a'], [0, 5]), (['a', 'b'], [5, 0]), (['a'], [201]), (['a'], [0.5])]
+)
+def test_bad_segments_are_refused(segments):
+    with pytest.raises(DataError, match='segments need one start for each name'):
+        assemble(*columns(), segments, name='data')
+
+
+@pytest.mark.parametrize(
+    'clock', [np.arange(5000) * 5e-5, np.linspace(0, 1, 5001), 1.7e9 + np.arange(5000) / 20e3]
+)
+def test_other_ways_to_count_time(clock):
+    v = np.arange(clock.size) / 1e3
+    record = read([clock, v, 1e-6 * v])
+    assert sizes(record) == [clock.size]
+    assert record.pieces[0].sample_rate in (20000, 5000)
+    np.testing.assert_allclose(record.pieces[0].t, clock, rtol=1e-15)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(st.integers(1, 10**6).map(float), st.floats(0.1, 1e6)),
+    st.integers(2, 3000),
+    st.integers(0, 10**6),
+)
+@example(23.166468355528195, 17, 373)
+def test_stamps_of_a_sampling_clock_are_a_fixpoint(rate, n, first):
+    t = (first + np.arange(n)) / rate
+    assert split_uniform(t, Resolution.of(t)) == [(0, n)]
+    v = np.linspace(0, 10, n)
+    once = read([t, v, 1e-6 * v]).pieces[0]
+    twice = read([once.t, v, 1e-6 * v]).pieces[0]
+    np.testing.assert_array_equal(once.t, twice.t)
+    np.testing.assert_allclose(once.t, t, rtol=1e-11)
+    # at least what the stamps themselves can tell
+    assert once.sample_rate == pytest.approx(rate, rel=1e-11 + 4e-16 * (first + n) / (n - 1))
+
+
+def test_nicest_rate_wins():
+    t = np.round(np.arange(2000) / 5000, 4)
+    assert fit_clock(t, Resolution.of(t)).sample_rate == 5000
+    t = np.arange(2000) * 3e-4
+    assert fit_clock(t, Resolution.of(t)).sample_rate == 1 / 3e-4

@@ -1,0 +1,300 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Blocks as they come to a record: the same as by way of a bag, and every fault said."""
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.blocks import cut_blocks, Samples
+from piezo_ident.record.capture import APPLIED, Capture, refuse_incomplete
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+
+RATE = 20_000.0
+N = 20_000
+SEGMENTS = (
+    Segment('step', 0, 5000),
+    Segment('noise', 5000, 12_000),
+    Segment('triangle', 12_000, 20_000),
+)
+
+
+@pytest.fixture(scope='module')
+def record():
+    rng = np.random.default_rng(4)
+    v = 5.0 + np.cumsum(rng.normal(0.0, 0.01, N))
+    y = 7.5e-6 * np.concatenate([v[:3], v[:-3]]) + rng.normal(0.0, 1e-9, N)
+    return Record((Piece(v, y, RATE, segments=SEGMENTS, channels={'temperature': v / 3}),), 'r')
+
+
+def blocks_of(record, size=100):
+    """All blocks in the order of a running graph: voltage, applied voltage, displacement."""
+    (piece,) = record
+    t = piece.t
+    for start, stop, label in cut_blocks(piece.n, piece.segments, size):
+        cut = slice(start, stop)
+        yield 'voltage', Samples(t[cut], piece.v[cut], label, 'voltage')
+        yield APPLIED, Samples(t[cut], piece.v[cut], label, 'voltage')
+        for name, x in piece.channels.items():
+            yield f'x_{name}', Samples(t[cut], x[cut], label, f'x_{name}')
+        yield 'displacement', Samples(t[cut], piece.y[cut], label, 'displacement')
+
+
+def capture_of(blocks, **kwargs):
+    capture = Capture(**kwargs)
+    for arrival, (key, samples) in enumerate(blocks):
+        capture.add(key, samples, arrival * 1_000_000)
+    return capture
+
+
+def faults(record):
+    return {fault.name: fault for fault in record.faults}
+
+
+def assert_equal(one, other):
+    assert len(one.pieces) == len(other.pieces)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.v, b.v)
+        np.testing.assert_array_equal(a.y, b.y)
+        np.testing.assert_array_equal(a.t, b.t)
+        assert a.sample_rate == b.sample_rate and a.segments == b.segments
+        assert set(a.channels) == set(b.channels)
+        for name in a.channels:
+            np.testing.assert_array_equal(a.channels[name], b.channels[name])
+
+
+@pytest.mark.parametrize('size', [100, 37, 5000])
+def test_record_is_that_of_a_bag_bit_for_bit(record, tmp_path, size):
+    write_bag(record, tmp_path / 'bag', block_size=size)
+    captured = capture_of(blocks_of(record, size)).record()
+    assert_equal(captured, read_bag(tmp_path / 'bag'))
+    assert_equal(captured, record)
+    assert captured.faults == ()
+
+
+def without(blocks, *drop):
+    """Leave out the k-th block of a topic."""
+    seen = {}
+    for key, samples in blocks:
+        k = seen[key] = seen.get(key, -1) + 1
+        if (key, k) not in drop:
+            yield key, samples
+
+
+def test_lost_blocks_split_the_record_and_are_counted(record):
+    capture = capture_of(without(blocks_of(record), ('voltage', 20), ('displacement', 80)))
+    assert capture.lost == {'voltage': 100, 'displacement': 100, APPLIED: 0, 'x_temperature': 0}
+    assert capture.problems == (
+        '100 samples of voltage are missing',
+        '100 samples of displacement are missing',
+    )
+    made = capture.record()
+    assert [p.n for p in made] == [2000, 5900, 11_900]
+    assert faults(made)['gap'].count == 2
+    lost = [f for f in made.faults if f.name == 'unmatched' and 'in displacement' in f.where]
+    assert [f.count for f in lost] == [100]
+
+
+def test_a_lost_block_of_applied_voltage_costs_no_sample(record):
+    made = capture_of(without(blocks_of(record), (APPLIED, 5))).record()
+    assert made.n == N
+    assert faults(made)['applied_unknown'].count == 100
+
+
+def test_where_another_voltage_was_applied_the_record_is_split(record):
+    def guarded():
+        for key, s in blocks_of(record):
+            if key == APPLIED and 0.3 <= s.t[0] < 0.32:
+                s = Samples(s.t, s.values - 0.5, s.segment, s.quantity)
+            yield key, s
+
+    made = capture_of(guarded()).record()
+    assert [p.n for p in made] == [6000, N - 6400]
+    fault = faults(made)['guarded_voltage']
+    assert fault.count == 400 and 'at 0.3 s, by up to 0.5 V' in fault.where
+    assert capture_of(guarded(), tolerance=1.0).record().n == N
+
+
+def test_a_voltage_that_is_never_applied_is_refused(record):
+    blocks = (
+        (k, Samples(s.t, s.values + (k == APPLIED), s.segment, s.quantity))
+        for k, s in blocks_of(record)
+    )
+    with pytest.raises(DataError, match='nowhere the commanded one'):
+        capture_of(blocks).record()
+
+
+def test_repeated_blocks_are_dropped_and_said(record):
+    def twice():
+        for i, (key, s) in enumerate(blocks_of(record)):
+            yield key, s
+            if 100 <= i < 120:
+                yield key, s
+
+    capture = capture_of(twice())
+    assert capture.late['voltage'] == 500
+    made = capture.record()
+    assert_equal(made, record)
+    assert faults(made)['repeated_rows'].count > 0
+
+
+def test_swapped_blocks_are_refused(record):
+    blocks = list(blocks_of(record))
+    blocks[40:44], blocks[44:48] = blocks[44:48], blocks[40:44]
+    with pytest.raises(DataError, match='time is unsorted'):
+        capture_of(blocks).record()
+
+
+def test_a_block_of_nan_is_cut_out_and_too_many_are_refused(record):
+    def broken(blocks):
+        seen = 0
+        for key, s in blocks_of(record):
+            if key == 'displacement':
+                seen += 1
+                if 20 < seen <= 20 + blocks:
+                    s = Samples(s.t, s.values * np.nan, s.segment, s.quantity)
+            yield key, s
+
+    made = capture_of(broken(1)).record()
+    assert faults(made)['not_finite'].count == 100 and len(made.pieces) == 2
+    with pytest.raises(DataError, match='more than 1 %'):
+        capture_of(broken(10)).record()
+
+
+def test_a_restart_begins_another_piece(record):
+    capture = capture_of([*blocks_of(record), *blocks_of(record)])
+    made = capture.record()
+    assert [p.n for p in made] == [N, N]
+    assert faults(made)['restart'].count == 1
+    assert capture.segments == {'step': 10_000, 'noise': 14_000, 'triangle': 16_000}
+
+
+def test_beyond_the_limit_the_oldest_run_is_forgotten(record):
+    capture = capture_of([*blocks_of(record)] * 3, limit=2.5)
+    assert capture.seconds == pytest.approx(2.0)
+    made = capture.record()
+    assert [p.n for p in made] == [N, N]
+    fault = faults(made)['capture_limit']
+    assert fault.where == 'the oldest 1 s' and '2.5 s are kept' in fault.action
+    assert 'unmatched' not in faults(made)
+
+
+def test_a_run_without_end_keeps_its_newest_part(record):
+    capture = capture_of(blocks_of(record), limit=0.5)
+    assert 0.4 < capture.seconds <= 0.5
+    (piece,) = capture.record()
+    np.testing.assert_array_equal(piece.v, record.pieces[0].v[-piece.n :])
+    assert piece.segments[-1].label == 'triangle'
+
+
+def test_nothing_and_half_of_it_are_refused(record):
+    with pytest.raises(DataError, match='no voltage has been captured; start the excitation'):
+        Capture().record()
+    only = [b for b in blocks_of(record) if b[0] == 'voltage']
+    with pytest.raises(DataError, match='no displacement has been captured; is the stage'):
+        capture_of(only).record()
+
+
+def test_unreadable_messages_are_said(record):
+    capture = capture_of(blocks_of(record))
+    capture.unreadable('voltage', 'layout [] is not ours')
+    capture.unreadable('voltage', 'layout [] is not ours')
+    assert capture.problems == ('2 messages on voltage are no blocks (layout [] is not ours)',)
+    assert faults(capture.record())['unreadable_block'].count == 2
+
+
+def test_a_snapshot_does_not_see_what_comes_later(record):
+    blocks = list(blocks_of(record))
+    capture = capture_of(blocks[:400])
+    snapshot = capture.snapshot()
+    for i, (key, samples) in enumerate(blocks[400:]):
+        capture.add(key, samples, (400 + i) * 1_000_000)
+    assert snapshot.record().n == 10_000
+    assert_equal(capture.record(), record)
+    capture.clear()
+    assert capture.n == 0 and snapshot.record().n == 10_000
+
+
+def test_what_came_after_a_mark_can_be_had_alone(record):
+    blocks = list(blocks_of(record))
+    capture = capture_of(blocks)
+    mark = capture.mark()
+    assert capture.seconds_since(mark) == 0.0
+    for key, samples in blocks:
+        capture.add(key, samples, 10**12)
+    assert capture.seconds_since(mark) == pytest.approx(1.0)
+    assert_equal(capture.snapshot(mark).record(), record)
+    assert capture.snapshot().record().n == 2 * N
+    # a topic that was not there at the mark is new altogether
+    assert capture.seconds_since({}, 'displacement') == pytest.approx(2.0)
+
+
+def test_a_mark_holds_when_the_oldest_is_forgotten(record):
+    blocks = list(blocks_of(record))
+    capture = capture_of(blocks, limit=2.5)
+    mark = capture.mark()
+    for key, samples in [*blocks] * 2:
+        capture.add(key, samples, 10**12)
+    assert capture.seconds == pytest.approx(2.0)
+    assert capture.seconds_since(mark) == pytest.approx(2.0)
+    assert capture.snapshot(mark).record().n == 2 * N
+    for key, samples in blocks:
+        capture.add(key, samples, 2 * 10**12)
+    assert capture.seconds_since(mark) == pytest.approx(2.0)
+
+
+def test_too_much_missing_in_a_segment_is_refused(record):
+    few = without(blocks_of(record), ('voltage', 20))
+    refuse_incomplete(capture_of(few).record())
+    many = without(blocks_of(record), *(('displacement', k) for k in range(60, 90)))
+    with pytest.raises(DataError, match=r'0\.15 s of 0\.35 s of the noise segments are missing'):
+        refuse_incomplete(capture_of(many).record())
+    # between two segments nobody knows which of them it was
+    edge = without(blocks_of(record), *(('displacement', k) for k in range(45, 55)))
+    with pytest.raises(DataError, match='of the step segments'):
+        refuse_incomplete(capture_of(edge).record())
+
+
+def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
+    late = without(blocks_of(record), *(('displacement', k) for k in range(30)))
+    snapshot = capture_of(late).snapshot()
+    refuse_incomplete(snapshot.record())
+    assert snapshot.sent() == pytest.approx({'step': 0.25, 'noise': 0.35, 'triangle': 0.4})
+    with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step segments are missing'):
+        refuse_incomplete(snapshot.record(), snapshot.sent())
+
+
+def test_runs_that_follow_each_other_miss_nothing(record):
+    snapshot = capture_of([*blocks_of(record), *blocks_of(record)]).snapshot()
+    refuse_incomplete(snapshot.record(), snapshot.sent())
+
+
+def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
+    monkeypatch.setattr('piezo_ident.record.capture.MOST_BLOCKS', 100)
+    monkeypatch.setattr('piezo_ident.record.capture.MOST_SAMPLES', 1000)
+    monkeypatch.setattr('piezo_ident.record.capture.MOST_LABELS', 20)
+    lone, dense = Capture(), Capture()
+    for k in range(500):
+        # single samples have no period, so that no time adds up
+        lone.add('voltage', Samples(np.array([k / RATE]), np.zeros(1), f'sine:{k}'), k)
+        t = 1e-9 * np.arange(100 * k, 100 * (k + 1))
+        dense.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
+    assert 80 <= lone.n <= 101
+    assert 800 <= dense.n <= 1100
+    assert len(lone.segments) == 21 and 'others' in lone.segments
+    # the newest part is what is left
+    assert lone.last_time('voltage') == 499 / RATE
+    assert lone.snapshot().streams['voltage'].times[-1] == 499 / RATE
+
+
+@pytest.mark.parametrize('time', [np.inf, -np.inf, np.nan])
+def test_times_that_are_none_break_nothing(monkeypatch, time):
+    monkeypatch.setattr('piezo_ident.record.capture.MOST_BLOCKS', 100)
+    capture = Capture()
+    for k in range(300):
+        t = np.full(100, time) if k % 2 else np.arange(100 * k, 100 * (k + 1)) / RATE
+        capture.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
+    assert capture.n <= 101 * 100
+    assert capture.last_time('voltage') == (100 * 299 - 1) / RATE

@@ -1,0 +1,422 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Every format keeps every bit, and bad files end in one line that names the cure."""
+
+import itertools
+import os
+from pathlib import Path
+import zipfile
+
+from hypothesis import given, HealthCheck, Phase, settings
+from hypothesis import strategies as st
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.common.files import temporary_output
+from piezo_ident.record.io import read_record, write_record
+from piezo_ident.record.record import Piece, Record, Segment
+import pytest
+import scipy.io
+
+DATA = Path(
+    os.environ.get('PIEZO_IDENT_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')
+)
+FORMATS = ('r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3', 'r_mcap', 'r_sqlite3')
+LABELS = st.sampled_from(['noise', 'sine:50Hz', 'hold:4V', 'a, "quoted" label', 'größer'])
+FINITE = st.floats(-10, 10, allow_nan=False)
+
+
+def storage(name: str) -> str | None:
+    return 'sqlite3' if name == 'r_sqlite3' else None
+
+
+@st.composite
+def records(draw) -> Record:
+    pieces = []
+    rate = draw(st.sampled_from([1000.0, 20000.0, 2048.0, 1 / 3e-4]))
+    tick = draw(st.integers(-1000, 10**6))
+    channels = draw(st.sets(st.sampled_from(['temperature', 'v2', 'T_1']), max_size=2))
+    for i in range(draw(st.integers(1, 3))):
+        n = draw(st.integers(10, 250))
+        # equal pieces would be taken for repeated rows
+        seed = np.random.default_rng([i, draw(st.integers(0, 2**32))])
+        cuts = sorted(draw(st.sets(st.integers(0, n), max_size=4)))
+        segments: list[Segment] = []
+        for start, stop in itertools.pairwise(cuts):
+            label = draw(LABELS)
+            if not (segments and segments[-1].stop == start and segments[-1].label == label):
+                segments.append(Segment(label, start, stop))
+        v = seed.uniform(-10, 10, n)
+        v[0] = draw(FINITE)
+        pieces.append(
+            Piece(
+                v=v,
+                y=seed.normal(scale=1e-5, size=n),
+                sample_rate=rate,
+                start_time=tick / rate,
+                segments=tuple(segments),
+                channels={c: seed.normal(size=n) for c in sorted(channels)},
+            )
+        )
+        tick += n + draw(st.integers(1, 1000))
+        if draw(st.booleans()):
+            tick = draw(st.integers(-1000, round(pieces[0].start_time * rate)))
+    if any(b.start_time < a.start_time for a, b in itertools.pairwise(pieces)):
+        # a jump back is a restart only where it returns to the beginning
+        pieces = pieces[:2] if pieces[1].start_time <= pieces[0].start_time else pieces[:1]
+    return Record(tuple(pieces), 'r')
+
+
+def assert_equal(a: Record, b: Record) -> None:
+    assert len(a.pieces) == len(b.pieces)
+    for p, q in zip(a, b, strict=True):
+        assert p.sample_rate == pytest.approx(q.sample_rate, rel=1e-9)
+        # a rate such as 10 kHz over 3 has no exact decimals: the last digit of the clock may go
+        np.testing.assert_allclose(p.t, q.t, rtol=1e-11, atol=1e-12)
+        np.testing.assert_array_equal(p.v, q.v)
+        np.testing.assert_array_equal(p.y, q.y)
+        assert p.segments == q.segments
+        assert set(p.channels) == set(q.channels)
+        for name, x in p.channels.items():
+            np.testing.assert_array_equal(x, q.channels[name])
+
+
+@settings(
+    max_examples=15,
+    deadline=None,
+    # shrinking files takes minutes and finds nothing that the message does not say
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(record=records())
+@pytest.mark.parametrize('name', FORMATS)
+def test_round_trip_is_exact(tmp_path_factory, name, record):
+    path = tmp_path_factory.mktemp('r') / name
+    assert write_record(record, path, storage=storage(name)) == ()
+    back = read_record(path)
+    assert_equal(back, record)
+    assert back.name == name
+    assert {f.name for f in back.faults} <= {'gap', 'restart'}
+    assert [p.name for p in path.parent.iterdir()] == [name]
+
+
+def table(n: int = 300) -> dict[str, np.ndarray]:
+    v = 5 + 5 * np.sin(np.arange(n) / 10)
+    return {'t': np.arange(n) / 1000, 'v': v, 'y': 7.5e-6 * v}
+
+
+def record() -> Record:
+    c = table()
+    return Record((Piece(c['v'], c['y'], 1000.0, segments=(Segment('noise', 5, 300),)),))
+
+
+def csv_text(**columns: object) -> str:
+    c = {**table(), **columns}
+    lines = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
+    return '\n'.join([','.join(c), *lines]) + '\n'
+
+
+def refuse(path: Path, *words: str) -> str:
+    with pytest.raises(DataError) as caught:
+        read_record(path)
+    message = str(caught.value)
+    assert '\n' not in message
+    for word in (str(path), *words):
+        assert word in message
+    assert caught.value.__cause__ is None
+    return message
+
+
+def test_losses_are_said(tmp_path):
+    c = table()
+    first = Piece(c['v'], c['y'], 1000.0)
+    lone = Piece([1.0], [0.0], 1000.0, start_time=9.0)
+    joint = Record((first, Piece(c['v'], c['y'], 1000.0, start_time=0.3), lone))
+    (note,) = write_record(joint, tmp_path / 'r.csv')
+    assert note == '3 pieces with 601 samples read back as 1 with 600'
+    bad = Record((first, Piece(c['v'], c['y'], 1000.0, start_time=0.2)))
+    (note,) = write_record(bad, tmp_path / 'bad.csv')
+    assert 'reading refuses it' in note
+
+
+def test_what_cannot_be_written_is_refused(tmp_path):
+    c = table()
+    piece = Piece(c['v'], c['y'], 1000.0, segments=(Segment('a\nb', 0, 9),))
+    with pytest.raises(DataError, match='segment label'):
+        write_record(Record((piece,)), tmp_path / 'r.csv')
+    piece = Piece(c['v'], c['y'], 1000.0, channels={'a b': c['v']})
+    with pytest.raises(DataError, match='channel name'):
+        write_record(Record((piece,)), tmp_path / 'r.csv')
+    with pytest.raises(DataError, match='unknown format'):
+        write_record(record(), tmp_path / 'r.xls')
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_existing_output_is_kept_unless_asked(tmp_path, name):
+    path = tmp_path / name
+    write_record(record(), path, storage=storage(name))
+    with pytest.raises(DataError, match='exists already'):
+        write_record(record(), path, storage=storage(name))
+    write_record(record(), path, storage=storage(name), overwrite=True)
+    assert_equal(read_record(path), record())
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_a_folder_that_is_no_bag_is_never_replaced(tmp_path):
+    (tmp_path / 'home').mkdir()
+    (tmp_path / 'home' / 'thesis.tex').touch()
+    with pytest.raises(DataError, match='no bag'):
+        write_record(record(), tmp_path / 'home', overwrite=True)
+    assert (tmp_path / 'home' / 'thesis.tex').exists()
+    # others call their files metadata.yaml, too
+    for text in ('author: me', '[', ''):
+        (tmp_path / 'home' / 'metadata.yaml').write_text(text)
+        with pytest.raises(DataError, match='no bag'):
+            write_record(record(), tmp_path / 'home', overwrite=True)
+    assert (tmp_path / 'home' / 'thesis.tex').exists()
+
+
+@pytest.mark.parametrize('name', ['notes.txt', 'model.yaml', 'pictures'])
+def test_a_bag_with_something_beside_it_is_never_replaced(tmp_path, name):
+    bag = tmp_path / 'bag'
+    write_record(record(), bag)
+    for part in ('bag.db3-wal', 'bag_1.mcap.zstd'):
+        (bag / part).touch()
+    write_record(record(), bag, overwrite=True)
+    if name == 'pictures':
+        (bag / name).mkdir()
+    else:
+        (bag / name).touch()
+    with pytest.raises(DataError, match=f'holds {name}, which is no part of a bag'):
+        write_record(record(), bag, overwrite=True)
+    assert (bag / name).exists()
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_unwritable_place(tmp_path, name):
+    path = tmp_path / 'missing' / name
+    with pytest.raises(DataError, match='cannot be written') as caught:
+        write_record(record(), path, storage=storage(name))
+    assert str(path) in str(caught.value)
+
+
+def test_interrupted_output_leaves_nothing(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text('old')
+    with pytest.raises(KeyboardInterrupt), temporary_output(path, overwrite=True) as target:
+        target.write_text('half')
+        raise KeyboardInterrupt
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# --- CSV
+
+
+def test_csv_as_spreadsheets_write_it(tmp_path):
+    path = tmp_path / 'r.CSV'
+    text = csv_text(segment=[' noise '] * 300, x_temp=[21.5] * 300, comment=['-'] * 300)
+    text = text.replace('t,v,y', ' t, "v" ,y', 1).replace(' "v" ', 'v ')
+    path.write_bytes(b'\xef\xbb\xbf' + text.replace('\n', '\r\n').encode() + b'\r\n')
+    got = read_record(path)
+    assert got.pieces[0].segments == (Segment('noise', 0, 300),)
+    assert list(got.pieces[0].channels) == ['temp']
+    assert [(f.name, f.where) for f in got.faults] == [('ignored_column', "'comment'")]
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('', ['empty file']),
+        ('t,v,y\n', ['no rows']),
+        ('0,1,2\n1,2,3\n', ['no header line']),
+        ('0,1,2,noise\n1,2,3,noise\n', ["no header line; put 't,v,y,segment' on top"]),
+        ('0,1,2,3\n1,2,3,4\n', ["no header line; put 't,v,y', with a name for each further"]),
+        ('# by hand\n0,1,2\n1,2,3\n', ['no header line']),
+        ('# t,v,y\n', ['empty file']),
+        ('t;v;y\n0;1;2\n', ['semicolons']),
+        ('t\tv\ty\n0\t1\t2\n', ['tabs']),
+        ('t,v\n0,1\n', ['y missing', 't [s], v [V] and y']),
+        ('t,v,y,v\n0,1,2,3\n', ['column v stands there twice']),
+        ('t,v,y\n0,1,2\n\n1,oops,3\n', ['line 4, column v', "'oops'"]),
+        ('t,v,y\n0,1,2\n1,,3\n', ['line 3, column v', "''"]),
+        ('t,v,y\n0,1,2\n1,2\n', ['line 3 has 2 columns, the header has 3; mend']),
+        ('t,v,y\n0,0,1,5,2,25e-6\n', ['line 2 has 6 columns', 'decimal commas', 'points']),
+        ('t,v,y\n0,0,0\n0,1,1,5,-2,2\n', ['line 3 has 6 columns', 'decimal commas']),
+        ('t,v,y,segment\n0,0,1,5,2,2,noise\n', ['line 2 has 7 columns', 'decimal commas']),
+        ('t,v,y\n0.0,1.5,2.5,2.0\n', ['line 2 has 4 columns', 'mend or delete']),
+        ('t,v,y\n"0,5","1,5","2,5e-6"\n', ["line 2, column t: '0,5'", 'decimal commas']),
+        ('# one\n\n# two\nt,v,y\n0,1,2\n1,oops,3\n', ['line 6, column v', "'oops'"]),
+        ('# one\n# t,v,y\n0,1,2\n1,oops,3\n', ['line 4, column v', "'oops'"]),
+        ('t,v,y\n0,1,2\n1,"2,3\n', ['no CSV file']),
+        ('t,v,y\n0,1,2\n1,\0,3\n', ['r.csv']),
+    ],
+)
+def test_bad_csv(tmp_path, text, words):
+    path = tmp_path / 'r.csv'
+    path.write_text(text)
+    refuse(path, *words)
+
+
+@pytest.mark.parametrize(
+    'above',
+    [
+        '# the "first", of "two"\n# again\n\nt,v,y\n',
+        '#made by hand\n# t, v,y\n',
+        '\ufeff# x\nt,v,y\n',
+    ],
+)
+def test_comments_above_the_header(tmp_path, above):
+    path = tmp_path / 'r.csv'
+    path.write_text(csv_text().replace('t,v,y\n', above, 1), encoding='utf-8')
+    got = read_record(path)
+    np.testing.assert_array_equal(got.pieces[0].y, table()['y'])
+    assert got.faults == ()
+
+
+def test_error_beyond_the_first_rows(tmp_path):
+    path = tmp_path / 'r.csv'
+    lines = [f'{k / 1000},{k % 10},{k % 10}e-6' for k in range(70000)]
+    lines[69000] = '69,nothing,1e-6'
+    path.write_text('\n'.join(['t,v,y', *lines]))
+    refuse(path, 'line 69002, column v', 'nothing')
+
+
+def test_csv_in_another_encoding(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_bytes('t,v,y,segment\n0,1,2,größe\n'.encode('latin-1'))
+    refuse(path, 'UTF-8')
+
+
+# --- npz and mat
+
+
+def save(path: Path, arrays: dict) -> None:
+    if path.suffix == '.npz':
+        np.savez(path, **arrays)
+    else:
+        scipy.io.savemat(path, arrays)
+
+
+@pytest.mark.parametrize('name', ['r.npz', 'r.mat'])
+@pytest.mark.parametrize('shape', [(-1,), (-1, 1), (1, -1)])
+def test_columns_of_any_orientation(tmp_path, name, shape):
+    save(tmp_path / name, {k: x.reshape(shape) for k, x in table().items()})
+    c = table()
+    assert_equal(read_record(tmp_path / name), Record((Piece(c['v'], c['y'], 1000.0),)))
+
+
+@pytest.mark.parametrize('name', ['r.npz', 'r.mat'])
+def test_segments_by_start(tmp_path, name):
+    names = np.array(['noise', 'sine:50Hz'])
+    save(tmp_path / name, {**table(), 'segment_name': names, 'segment_start': [10, 200]})
+    want = (Segment('noise', 10, 200), Segment('sine:50Hz', 200, 300))
+    assert read_record(tmp_path / name).pieces[0].segments == want
+
+
+@pytest.mark.parametrize('name', ['r.npz', 'r.mat'])
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'v': None}, ['v missing']),
+        ({'v': np.ones((150, 2))}, ['v is 150 x 2', 'one column']),
+        ({'v': np.ones(299)}, ['differ in length', 'v 299']),
+        ({'v': np.array(['a'] * 300)}, ['v holds']),
+        ({'v': np.ones(300) * 1j}, ['v holds complex128']),
+        ({'segment_name': np.array(['a'])}, ['need each other']),
+        ({'segment_name': np.array([1.0]), 'segment_start': [0]}, ['segment_name holds no text']),
+        ({'segment_name': np.array(['a']), 'segment_start': [-1]}, ['segments need']),
+    ],
+)
+def test_bad_arrays(tmp_path, name, change, words):
+    arrays = {k: x for k, x in {**table(), **change}.items() if x is not None}
+    save(tmp_path / name, arrays)
+    refuse(tmp_path / name, *words)
+
+
+def test_pickled_objects_are_refused(tmp_path):
+    path = tmp_path / 'r.npz'
+    np.savez(path, **{**table(), 'v': np.array([{}] * 300)})
+    refuse(path, 'Python objects')
+
+
+def test_array_that_announces_too_much(tmp_path):
+    path = tmp_path / 'r.npz'
+    np.savez(path, **table())
+    with zipfile.ZipFile(path) as archive:
+        members = {n: archive.read(n) for n in archive.namelist()}
+    members['v.npy'] = members['v.npy'].replace(b'(300,), }         ', b'(300000000000,), }', 1)
+    assert b'300000000000' in members['v.npy']
+    with zipfile.ZipFile(path, 'w') as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    refuse(path, 'does not hold the size that it announces')
+
+
+@pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3'])
+def test_damaged_files(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b'')
+    refuse(path)
+    path.write_bytes(np.random.default_rng(0).bytes(5000))
+    refuse(path)
+    path.unlink()
+    write_record(record(), path)
+    whole = path.read_bytes()
+    if name != 'r.csv':
+        for share in (0.1, 0.5, 0.9, 0.99):
+            path.write_bytes(whole[: int(share * len(whole))])
+            refuse(path)
+
+
+def test_matlab_73(tmp_path):
+    path = tmp_path / 'r.mat'
+    path.write_bytes(b'MATLAB 7.3 MAT-file'.ljust(512) + b'\x89HDF\r\n\x1a\n' + bytes(600))
+    refuse(path, 'save -v7')
+
+
+def test_what_is_not_there_or_unknown(tmp_path):
+    refuse(tmp_path / 'r.csv', 'does not exist')
+    refuse(tmp_path / 'r_bag', 'does not exist')
+    refuse(tmp_path, 'metadata.yaml')
+    (tmp_path / 'r.xls').touch()
+    refuse(tmp_path / 'r.xls', 'unknown format .xls')
+
+
+@pytest.mark.parametrize('name', ['r.csv', 'r.mcap', 'bag'])
+def test_links_that_lead_nowhere(tmp_path, name):
+    path = tmp_path / name
+    path.symlink_to('gone')
+    refuse(path, 'is a link to gone, which does not exist', 'mend')
+    path.unlink()
+    path.symlink_to(name)
+    refuse(path, 'leads back to itself', 'mend')
+    (tmp_path / 'there.csv').write_text(csv_text())
+    path = tmp_path / 'link.csv'
+    path.symlink_to('there.csv')
+    assert read_record(path).n == 300
+
+
+# --- measured files
+
+
+@pytest.mark.parametrize(
+    ('name', 'rates', 'sizes'),
+    [
+        ('piezo_1hz.csv', [5000.0], [35000]),
+        ('afm_hold.csv', [256.0, 2048.0, 256.0, 2048.0], [256, 2048, 7680, 1951]),
+        ('afm_open_loop.csv', [2048.0], [8192]),
+    ],
+)
+def test_measured_files(tmp_path, name, rates, sizes):
+    path = DATA / name
+    if not path.is_file():
+        pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA')
+    measured = read_record(path)
+    assert [p.sample_rate for p in measured] == rates
+    assert [p.n for p in measured] == sizes
+    assert {f.name for f in measured.faults} <= {'rate_change'}
+    for out in FORMATS:
+        assert write_record(measured, tmp_path / out, storage=storage(out)) == ()
+        assert_equal(read_record(tmp_path / out), measured)

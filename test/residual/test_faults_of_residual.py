@@ -1,0 +1,149 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Faults of the data: each is named where it is, and none where it is not."""
+
+from pathlib import Path
+
+import numpy as np
+from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
+from piezo_ident.record.record import Piece
+from piezo_ident.residual import find_faults, ResidualPart
+from piezo_ident.residual.scatter import quantum_of
+import pytest
+from scipy.signal import lfilter
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
+RATE = 20_000.0
+PROGRAM = """
+limits: [0, 10]
+sample_rate: 20000
+segments:
+  - {signal: idle, duration: 0.5}
+  - {signal: sine, bias: 5, amplitude: 5, frequency: 1, periods: 2}
+  - {signal: sine, bias: 5, amplitude: 4.5, frequency: 80, duration: 1}
+  - {signal: staircase, levels: [0, 5, 10, 3], hold: [0.3, 0.3, 0.3, 0.3]}
+  - {signal: triangle, slope: 20}
+"""
+
+
+@pytest.fixture(scope='module')
+def stage():
+    return load_stage(CONFIG / 'stage_paper.yaml')
+
+
+@pytest.fixture(scope='module')
+def truth(stage):
+    """Voltage, displacement without and with the stage's noise and 16-bit converters."""
+    sequence = parse_program(PROGRAM).build()
+    ideal = simulate_truth(stage, sequence).pieces[0]
+    read = simulate(stage, sequence, np.random.default_rng(1)).pieces[0]
+    return ideal.v, ideal.y, read.y
+
+
+def faults(v, y, y_hat):
+    found = find_faults([ResidualPart('r', Piece(v, y, RATE), y - y_hat)])
+    return {fault.name: fault for fault in found.faults}, found
+
+
+def test_clean_readings_of_16_bits_have_no_fault(truth):
+    v, y, read = truth
+    assert faults(v, read, y)[0] == {}
+    # nor with a model that is wrong, late or slow
+    for y_hat in (
+        0.99 * y,
+        np.roll(y, 2),
+        0.7 * y + 0.3 * lfilter([0.02], [1, -0.98], y),
+        7e-6 * v,
+    ):
+        assert faults(v, read, y_hat)[0] == {}
+
+
+def test_readings_without_any_noise_have_no_fault(truth):
+    v, y, _ = truth
+    assert faults(v, y, y)[0] == {}
+    assert faults(v, y, 1.01 * y + 40 * y**2)[0] == {}
+
+
+@pytest.mark.parametrize('name', ['identification', 'validation', 'minor_loops'])
+def test_shipped_programmes_have_no_fault(stage, name):
+    sequence = load_program(CONFIG / f'program_{name}.yaml').build()
+    read = simulate(stage, sequence, np.random.default_rng(2)).pieces[0]
+    y = simulate_truth(stage, sequence).pieces[0].y
+    assert faults(read.v, read.y, y)[0] == {}
+    assert faults(read.v, read.y, 0.7 * y + 0.3 * lfilter([0.02], [1, -0.98], y))[0] == {}
+
+
+@pytest.mark.parametrize('share', [0.002, 0.02])
+def test_missed_samples(truth, share):
+    v, y, read = truth
+    rng = np.random.default_rng(3)
+    missed = rng.random(y.size) < share
+    k = np.arange(y.size)
+    k[missed] = 0
+    z = read[np.maximum.accumulate(k)]
+    named, found = faults(v, z, y)
+    assert 'missed_samples' in named
+    assert 'timing_jitter' not in named
+    # a sample is only known to be missed where the position moves fast; those named are right
+    (bad,) = found.bad
+    assert np.mean(missed[bad]) > 0.95
+
+
+@pytest.mark.parametrize('jitter', [1e-6, 5e-6])
+def test_timing_jitter(truth, jitter):
+    v, y, read = truth
+    rng = np.random.default_rng(4)
+    z = read + np.gradient(y) * RATE * jitter * rng.standard_normal(y.size)
+    named, found = faults(v, z, y)
+    assert set(named) == {'timing_jitter'}
+    assert found.jitter == pytest.approx(jitter, rel=0.1)
+
+
+@pytest.mark.parametrize('bits', [8, 10, 12])
+def test_quantisation(truth, bits):
+    v, y, _ = truth
+    noise = 1.5e-9 * np.random.default_rng(5).standard_normal(y.size)
+    step = 150e-6 / 2**bits
+    named, found = faults(v, step * np.rint((y + noise) / step), y)
+    assert set(named) == {'quantisation'}
+    assert found.quantum == pytest.approx(step, rel=1e-3)
+
+
+def test_outliers(truth):
+    v, y, read = truth
+    rng = np.random.default_rng(6)
+    places = rng.choice(y.size - 40, 25, replace=False) + 20
+    z = read.copy()
+    z[places] += rng.choice([-1, 1], 25) * rng.uniform(5e-8, 1e-6, 25)
+    named, found = faults(v, z, y)
+    assert set(named) == {'outliers'}
+    assert named['outliers'].count >= 23
+    assert set(np.flatnonzero(found.bad[0])) <= set(places)
+
+
+def test_ringing_and_steps_are_no_outliers():
+    t = np.arange(20_000) / RATE
+    rng = np.random.default_rng(7)
+    ringing = 1e-7 * np.exp(-(t % 0.1) / 2e-3) * np.sin(2 * np.pi * 4000 * t)
+    e = ringing + 5e-8 * (t > 0.5) + 1e-9 * rng.standard_normal(t.size)
+    v = np.floor(t / 0.1) % 2
+    assert faults(v, 1e-5 * v + e, 1e-5 * v)[0] == {}
+
+
+def test_clipping(truth):
+    v, y, read = truth
+    end = read.max() - 2e-6
+    named, found = faults(v, np.minimum(read, end), y)
+    assert set(named) == {'clipping'}
+    # no model can fill in what was not read
+    np.testing.assert_array_equal(found.out[0], found.bad[0])
+    assert found.bad[0].sum() > 0.5 * np.sum(read > end)
+
+
+def test_quantum_of_plain_numbers_and_of_nothing():
+    rng = np.random.default_rng(8)
+    assert quantum_of(rng.standard_normal(10_000)) == 0.0
+    assert quantum_of(np.zeros(100)) == 0.0
+    assert quantum_of(0.25 * rng.integers(0, 9, 1000)) == pytest.approx(0.25)

@@ -1,0 +1,132 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The noise floor: rest and repeats are found, and noise is told from creep and misfit."""
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.record import Piece
+from piezo_ident.residual import noise_floor, NoiseFloor, ResidualPart, stretches_of
+from piezo_ident.residual.stretches import block_means, find_repeats
+import pytest
+from residual_data import creep, misfit, part_of, pink, RATE, V
+
+
+def test_stretches_of_a_programme():
+    found = [(s.label, s.kind, s.period) for s in stretches_of(part_of(np.zeros(V.size)))]
+    # 50 Hz at 2 kHz: 40 samples; the holds start with their first sample
+    assert found[:4] == [
+        ('idle', 'rest', 0),
+        ('sine:1Hz', 'repeat', 2000),
+        ('sine:50Hz', 'repeat', 40),
+        ('noise', 'motion', 0),
+    ]
+    assert [kind for label, kind, _ in found if label == 'staircase'] == ['rest'] * 4
+
+
+def test_repeats_are_found_without_labels():
+    kinds = {s.period for s in stretches_of(part_of(np.zeros(V.size), labelled=False))}
+    assert {2000, 40} <= kinds
+
+
+def test_a_measured_voltage_still_rests_and_repeats():
+    rng = np.random.default_rng(0)
+    part = part_of(np.zeros(V.size))
+    piece = Piece(
+        V + 1e-3 * rng.standard_normal(V.size), part.piece.y, RATE, 0, part.piece.segments
+    )
+    found = stretches_of(ResidualPart('r', piece, part.e))
+    assert {s.period for s in found if s.kind == 'repeat'} == {2000, 40}
+    assert sum(s.kind == 'rest' for s in found) == 5
+
+
+def test_a_period_that_is_no_whole_number_repeats_after_several():
+    # 120 Hz at 20 kHz: 166.7 samples, exactly 500 for three periods
+    v = np.sin(2 * np.pi * 120 * np.arange(6000) / 20_000)
+    ((start, stop, period),) = find_repeats(v)
+    assert (start, period) == (0, 500)
+    assert stop == 6000
+
+
+@pytest.mark.parametrize('v', [np.linspace(0, 1, 5000), np.zeros(100), np.ones(5)])
+def test_nothing_repeats_where_nothing_comes_back(v):
+    assert find_repeats(v) == []
+
+
+def test_chirps_and_noise_do_not_repeat():
+    t = np.arange(20_000) / 2000
+    assert find_repeats(np.sin(2 * np.pi * (1 + t) * t)) == []
+    assert find_repeats(np.random.default_rng(1).standard_normal(20_000)) == []
+
+
+@pytest.mark.parametrize('with_misfit', [False, True])
+def test_white_noise_is_measured_through_misfit_and_creep(with_misfit):
+    rng = np.random.default_rng(2)
+    noise = 2e-9 * rng.standard_normal(V.size)
+    part = part_of(noise + with_misfit * (misfit(V) + creep(V, RATE)))
+    floor = noise_floor([part], stretches_of(part))
+    assert 'repeated periods' in floor.source
+    assert floor.rms == pytest.approx(2e-9, rel=0.05)
+    # of 64 samples there are 31 means in the one period that is not dropped
+    for m, rel in ((4, 0.1), (16, 0.2), (64, 0.35)):
+        assert floor.at(m) == pytest.approx(2e-9 / np.sqrt(m), rel=rel)
+
+
+def test_coloured_noise_after_averaging():
+    rng = np.random.default_rng(3)
+    noise = 2e-9 * pink(V.size, rng)
+    part = part_of(noise + misfit(V))
+    floor = noise_floor([part], stretches_of(part))
+    # what is slower than a period looks like drift: the floor may be lower, not higher
+    for m in (1, 16, 64):
+        truth = np.std(block_means(noise, m))
+        assert 0.5 * truth < floor.at(m) < 1.1 * truth
+
+
+def test_rests_serve_where_nothing_repeats():
+    rng = np.random.default_rng(4)
+    v = np.repeat(rng.uniform(0, 10, 8), 4000)
+    e = creep(v, RATE) + 2e-9 * rng.standard_normal(v.size)
+    part = ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)
+    floor = noise_floor([part], stretches_of(part))
+    assert 'rests' in floor.source
+    assert floor.rms == pytest.approx(2e-9, rel=0.1)
+    assert floor.at(16) == pytest.approx(0.5e-9, rel=0.35)
+
+
+def test_floor_is_unknown_without_either():
+    rng = np.random.default_rng(5)
+    v = np.cumsum(rng.standard_normal(5000))
+    part = ResidualPart('r', Piece(v, v, RATE), rng.standard_normal(5000))
+    floor = noise_floor([part], stretches_of(part))
+    assert floor.rms is None
+    assert floor.at(4) is None
+    assert floor.share(1.0) is None
+    assert floor.source.startswith('floor unknown')
+
+
+def test_explainable_share():
+    floor = NoiseFloor(1e-9, 'given')
+    assert floor.share(4e-18) == pytest.approx(0.75)
+    assert floor.share(0.5e-18) == 0.0
+    assert floor.share(0.0) == 0.0
+    # means over four samples of white noise have a quarter of its variance
+    assert floor.share(1e-18, 4) == pytest.approx(0.75)
+
+
+def test_bridged_samples_are_cut_out():
+    e = np.zeros(V.size)
+    sound = np.ones(V.size, bool)
+    e[3000:3100], sound[3000:3100] = 1e-3, False
+    part = ResidualPart('r', part_of(np.zeros(V.size)).piece, e, sound)
+    assert all(not (s.start < 3100 and s.stop > 3000) for s in stretches_of(part))
+
+
+def test_wrong_lengths_and_divergence_are_refused():
+    piece = part_of(np.zeros(V.size)).piece
+    with pytest.raises(DataError, match='one value'):
+        ResidualPart('r', piece, np.zeros(3))
+    e = np.zeros(V.size)
+    e[5] = np.nan
+    with pytest.raises(DataError, match='diverge'):
+        ResidualPart('r', piece, e)
