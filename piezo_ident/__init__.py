@@ -1,6 +1,117 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identification of piezo-actuated nanopositioning stages."""
+"""
+Identification of piezo-actuated nanopositioning stages.
+
+    import piezo_ident as pi
+
+    record = pi.read('record.csv', displacement_unit='um')
+    result = pi.identify(record)
+    y_hat = result.model.simulate(v)
+
+Everything public is a name of this module; the names of its submodules may change.  Each name is
+imported when it is first used, so that ``import piezo_ident`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from piezo_ident import effects
+    from piezo_ident.common.errors import (
+        Cancelled,
+        ConfigError,
+        DataError,
+        IdentificationError,
+        ModelError,
+        PiezoIdentError,
+    )
+    from piezo_ident.diagnosis.procedure import diagnose
+    from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
+    from piezo_ident.excitation.program import Program
+    from piezo_ident.identification.identify import identify
+    from piezo_ident.identification.results import Identification, Settings
+    from piezo_ident.live.guard import Guard, GuardSettings
+    from piezo_ident.model.files import load_model as load
+    from piezo_ident.model.free_run import predict_record as free_run
+    from piezo_ident.model.simulated_stage import SimulatedStage
+    from piezo_ident.model.stage_model import StageModel
+    from piezo_ident.record.io import read_record as read
+    from piezo_ident.record.io import write_record as write
+    from piezo_ident.record.record import Record
+    from piezo_ident.report.folder import write_report
 
 __version__ = '0.1.0'
+
+# public name: where it is defined, and its name there where that differs
+_HOMES = {
+    'Cancelled': 'common.errors',
+    'ConfigError': 'common.errors',
+    'DataError': 'common.errors',
+    'Diagnosis': 'diagnosis.results',
+    'DiagnosisSettings': 'diagnosis.results',
+    'Guard': 'live.guard',
+    'GuardSettings': 'live.guard',
+    'Identification': 'identification.results',
+    'IdentificationError': 'common.errors',
+    'ModelError': 'common.errors',
+    'PiezoIdentError': 'common.errors',
+    'Program': 'excitation.program',
+    'Record': 'record.record',
+    'Settings': 'identification.results',
+    'SimulatedStage': 'model.simulated_stage',
+    'StageModel': 'model.stage_model',
+    'diagnose': 'diagnosis.procedure',
+    'effects': 'effects',
+    'free_run': 'model.free_run:predict_record',
+    'identify': 'identification.identify',
+    'load': 'model.files:load_model',
+    'read': 'record.io:read_record',
+    'write': 'record.io:write_record',
+    'write_report': 'report.folder',
+}
+
+__all__ = [
+    'Cancelled',
+    'ConfigError',
+    'DataError',
+    'Diagnosis',
+    'DiagnosisSettings',
+    'Guard',
+    'GuardSettings',
+    'Identification',
+    'IdentificationError',
+    'ModelError',
+    'PiezoIdentError',
+    'Program',
+    'Record',
+    'Settings',
+    'SimulatedStage',
+    'StageModel',
+    '__version__',
+    'diagnose',
+    'effects',
+    'free_run',
+    'identify',
+    'load',
+    'read',
+    'write',
+    'write_report',
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    home, _, other = _HOMES[name].partition(':')
+    module = importlib.import_module(f'{__name__}.{home}')
+    value = module if name == home else getattr(module, other or name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

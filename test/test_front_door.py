@@ -1,0 +1,41 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The front door: every public name is there."""
+
+import ast
+from pathlib import Path
+import subprocess
+import sys
+
+import piezo_ident as pi
+import pytest
+
+NAMES = [name for name in pi.__all__ if name != '__version__']
+SOURCE = Path(pi.__file__).read_text(encoding='utf-8')
+
+
+def test_every_name_has_a_home_and_a_type():
+    (block,) = (
+        node
+        for node in ast.parse(SOURCE).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING'
+    )
+    typed = {
+        alias.asname or alias.name
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert typed == set(NAMES) == set(pi._HOMES)
+    assert set(NAMES) <= set(dir(pi))
+
+
+def test_a_name_that_is_not_there():
+    with pytest.raises(AttributeError, match='no attribute'):
+        _ = pi.identifi  # type: ignore[attr-defined]
+
+
+def test_the_door_itself_imports_nothing_heavy():
+    code = 'import sys, piezo_ident; sys.exit("numpy" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', code]).returncode == 0
