@@ -42,9 +42,9 @@ from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.model.files import load_model, save_model
 from piezo_ident.model.simulated_stage import load_stage
-from piezo_ident.plots import draw  # noqa: F401 - loaded once, not in every copy
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.figures import draw  # noqa: F401 - loaded once, not in every copy
 from piezo_ident.report.folder import put_in_place
 from reliability.rows import write_rows
 

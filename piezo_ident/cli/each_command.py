@@ -249,7 +249,7 @@ def _each(args: argparse.Namespace, jobs: Sequence[Job], done: str, console: Con
         raise
     found = [rows[i] for i in range(len(jobs))]
     with interrupts.quitting():
-        from piezo_ident.plots.spread import write_spread
+        from piezo_ident.many.figures import write_spread
     with interrupts.waiting():
         files = [*write_tables(found, folder.path), *write_spread(found, folder.path)]
     good = [row for row in found if row.good]

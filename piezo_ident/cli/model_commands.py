@@ -169,7 +169,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
         except NeedsWhole:
             record, free_run = _predicted_whole(model, args)
     if args.plot is not None and isinstance(record, Record):
-        from piezo_ident.plots import write_prediction_plot
+        from piezo_ident.report.figures import write_prediction_plot
 
         with interrupts.waiting():
             write_prediction_plot(record, free_run.prediction, args.plot)

@@ -56,7 +56,7 @@ def write_diagnosis_report(
         When the folder cannot be written.
     """
     # matplotlib takes half a second to import, and most commands draw nothing
-    from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES, draw_diagnosis
+    from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES, draw_diagnosis
 
     drawn = draw_diagnosis(diagnosis, lambda share: progress('drawing', 0.5 * share))
     shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.5 + 0.4 * share))
@@ -76,6 +76,6 @@ def check_diagnosis_folder(folder: str | os.PathLike[str]) -> None:
     ------
     DataError
     """
-    from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES
+    from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES
 
     check_own(folder, (NUMBERS, PAGE), DIAGNOSIS_NAMES)

@@ -25,7 +25,7 @@ from piezo_ident.report.numbers import to_json
 from piezo_ident.report.page import page
 
 if TYPE_CHECKING:
-    from piezo_ident.plots import Picture
+    from piezo_ident.report.figures import Picture
 
 __all__ = [
     'PAGE',
@@ -74,7 +74,7 @@ def write_report(
         When the folder cannot be written.
     """
     # matplotlib takes half a second to import, and most commands draw nothing
-    from piezo_ident.plots import draw, NAMES
+    from piezo_ident.report.figures import draw, NAMES
 
     records = [records] if isinstance(records, Record) else list(records)
     runs = free_runs(identification.model, records, identification.memories)
@@ -97,7 +97,7 @@ def check_report_folder(folder: str | os.PathLike[str]) -> None:
     ------
     DataError
     """
-    from piezo_ident.plots import NAMES
+    from piezo_ident.report.figures import NAMES
 
     check_own(folder, (NUMBERS, PAGE), NAMES)
 
@@ -112,7 +112,7 @@ def rendered(pictures: Sequence[Picture], tick: Callable[[float], None]) -> list
     tick : callable
         Called with the share done; may raise to stop it.
     """
-    from piezo_ident.plots import DPI
+    from piezo_ident.report.figures import DPI
 
     shown = []
     for i, picture in enumerate(pictures):

@@ -27,12 +27,12 @@ from piezo_ident.common.errors import ConfigError, DataError, ModelError, PiezoI
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
 from piezo_ident.model.simulated_stage import stage_from_dict
-from piezo_ident.plots import NAMES
-from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES
 from piezo_ident.record.bags.check import check_journal
 from piezo_ident.record.blocks import decode, Dimension
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.mat_read import read_variables
+from piezo_ident.report.figures import NAMES
+from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES
 import pytest
 import scipy.io
 import yaml

@@ -25,6 +25,7 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.many import executors
 from piezo_ident.many.executors import cores, run_all
+from piezo_ident.many.figures import PICTURES, write_spread
 from piezo_ident.many.figures_of_merit import character
 from piezo_ident.many.ledger import LEDGER, Ledger
 from piezo_ident.many.run import Diagnose, fingerprint, Identify, Outcome, Row
@@ -35,7 +36,6 @@ from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.plots.spread import PICTURES, write_spread
 from piezo_ident.record.io import write_record
 import pytest
 

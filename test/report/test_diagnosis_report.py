@@ -18,13 +18,13 @@ from piezo_ident.diagnosis.results import Errors, FORMULA, FoundParameter
 from piezo_ident.model.files import load_model
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.plots.diagnosis import DIAGNOSIS_NAMES, draw_diagnosis
-from piezo_ident.plots.refinement_bars import ranking_figure
-from piezo_ident.plots.residual_traces import residual_figure
-from piezo_ident.plots.style import NothingToDraw
 from piezo_ident.report import changes, diagnosis_summary, Unseen, write_diagnosis_report
 from piezo_ident.report.diagnosis_page import diagnosis_page
 from piezo_ident.report.diagnosis_tables import error_rows, value_text
+from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES, draw_diagnosis
+from piezo_ident.report.figures.refinement_bars import ranking_figure
+from piezo_ident.report.figures.residual_traces import residual_figure
+from piezo_ident.report.figures.style import NothingToDraw
 from piezo_ident.report.numbers import number
 import pytest
 
@@ -47,7 +47,7 @@ def html(folder):
 @pytest.fixture
 def coarse(monkeypatch):
     """Have pictures drawn with few pixels, where nobody looks at them."""
-    monkeypatch.setattr('piezo_ident.plots.DPI', 30)
+    monkeypatch.setattr('piezo_ident.report.figures.DPI', 30)
 
 
 class Outline(HTMLParser):

@@ -20,8 +20,6 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import load_model
 from piezo_ident.model.simulated_stage import load_stage, simulate
 from piezo_ident.model.validation import SineError
-from piezo_ident.plots import NAMES, write_prediction_plot
-from piezo_ident.plots.style import envelope, safe
 from piezo_ident.record.record import Fault, Record, Segment
 from piezo_ident.report import (
     error_table_for_sines,
@@ -31,6 +29,8 @@ from piezo_ident.report import (
     verdict,
     write_report,
 )
+from piezo_ident.report.figures import NAMES, write_prediction_plot
+from piezo_ident.report.figures.style import envelope, safe
 from piezo_ident.report.numbers import modes, number
 import pytest
 
@@ -342,7 +342,7 @@ def test_prediction_picture(found, records, tmp_path):
 def test_pictures_leave_global_settings_alone():
     code = (
         'import sys; import piezo_ident.report; print("matplotlib" in sys.modules); '
-        'import piezo_ident.plots; print("matplotlib.pyplot" in sys.modules)'
+        'import piezo_ident.report.figures; print("matplotlib.pyplot" in sys.modules)'
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ['False', 'False']

@@ -10,17 +10,17 @@ import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.excitation.program import load_program
 from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
-from piezo_ident.plots.residual import (
+from piezo_ident.record.record import Piece
+from piezo_ident.report.figures.residual import (
     residual_errors_figure,
     residual_spectrum_figure,
     residual_time_figure,
 )
-from piezo_ident.plots.residual_signature import (
+from piezo_ident.report.figures.residual_signature import (
     residual_correlation_figure,
     residual_dependence_figure,
 )
-from piezo_ident.plots.style import NothingToDraw
-from piezo_ident.record.record import Piece
+from piezo_ident.report.figures.style import NothingToDraw
 from piezo_ident.residual import analyse, ResidualPart
 import pytest
 from residual_data import creep, misfit, part_of, RATE, T, V

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.plots.style import (
+from piezo_ident.report.figures.style import (
     BLUE,
     COLOURS,
     envelope,

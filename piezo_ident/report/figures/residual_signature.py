@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
-from piezo_ident.plots.style import (
+from piezo_ident.report.figures.style import (
     BLUE,
     figure,
     legend,

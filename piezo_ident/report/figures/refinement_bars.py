@@ -12,8 +12,8 @@ from typing import Any
 from matplotlib.figure import Figure
 import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.plots.residual_traces import differ, STATES
-from piezo_ident.plots.style import (
+from piezo_ident.report.figures.residual_traces import differ, STATES
+from piezo_ident.report.figures.style import (
     COLOURS,
     figure,
     GREY,

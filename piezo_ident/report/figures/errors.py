@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.validation import FreeRun, sine_frequency, SineError
-from piezo_ident.plots.style import (
+from piezo_ident.record.record import Segment
+from piezo_ident.report.figures.style import (
     COLOURS,
     envelope,
     figure,
@@ -28,7 +29,6 @@ from piezo_ident.plots.style import (
     SMALL,
     tidy,
 )
-from piezo_ident.record.record import Segment
 
 __all__ = ['loops_figure', 'overview_figure', 'segments_figure', 'sines_figure']
 

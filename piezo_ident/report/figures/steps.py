@@ -19,7 +19,7 @@ from piezo_ident.identification.frequency_response import FrequencyResponse
 from piezo_ident.identification.results import Identification
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
 from piezo_ident.model.validation import FreeRun
-from piezo_ident.plots.style import (
+from piezo_ident.report.figures.style import (
     COLOURS,
     figure,
     GREY,

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.results import Residual
-from piezo_ident.plots.style import (
+from piezo_ident.record.record import Piece
+from piezo_ident.report.figures.style import (
     COLOURS,
     envelope,
     figure,
@@ -26,7 +27,6 @@ from piezo_ident.plots.style import (
     SMALL,
     tidy,
 )
-from piezo_ident.record.record import Piece
 
 __all__ = ['STATES', 'differ', 'residual_figure']
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.files import temporary_output
 from piezo_ident.many.run import Row
 from piezo_ident.many.spread import dates, in_order, QUANTITIES, Quantity, standing_out, values_of
-from piezo_ident.plots.style import (
+from piezo_ident.report.figures.style import (
     BLUE,
     COLOURS,
     figure,

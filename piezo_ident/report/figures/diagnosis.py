@@ -12,15 +12,19 @@ from matplotlib.figure import Figure
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.plots import Drawn
-from piezo_ident.plots.refinement_bars import errors_figure, frequencies_figure, ranking_figure
-from piezo_ident.plots.residual import residual_spectrum_figure
-from piezo_ident.plots.residual_signature import (
+from piezo_ident.report.figures import Drawn
+from piezo_ident.report.figures.refinement_bars import (
+    errors_figure,
+    frequencies_figure,
+    ranking_figure,
+)
+from piezo_ident.report.figures.residual import residual_spectrum_figure
+from piezo_ident.report.figures.residual_signature import (
     residual_correlation_figure,
     residual_dependence_figure,
 )
-from piezo_ident.plots.residual_traces import differ, residual_figure
-from piezo_ident.plots.style import NothingToDraw, Picture
+from piezo_ident.report.figures.residual_traces import differ, residual_figure
+from piezo_ident.report.figures.style import NothingToDraw, Picture
 from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
 
 __all__ = ['DIAGNOSIS_NAMES', 'draw_diagnosis']

@@ -17,20 +17,20 @@ from piezo_ident.common.files import temporary_output
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.stage_model import Prediction
 from piezo_ident.model.validation import FreeRun, sine_frequency, sines_of
-from piezo_ident.plots.errors import (
+from piezo_ident.record.record import Record
+from piezo_ident.report.figures.errors import (
     loops_figure,
     overview_figure,
     segments_figure,
     sines_figure,
 )
-from piezo_ident.plots.steps import (
+from piezo_ident.report.figures.steps import (
     delay_figure,
     orders_figure,
     response_figure,
     weights_figure,
 )
-from piezo_ident.plots.style import NothingToDraw, Picture
-from piezo_ident.record.record import Record
+from piezo_ident.report.figures.style import NothingToDraw, Picture
 
 __all__ = [
     'NAMES',
