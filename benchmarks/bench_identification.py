@@ -64,9 +64,11 @@ def record_of_17_s() -> Record:
 def whole(record: Record, runs: int) -> tuple[str, str]:
     """Return the table of all three steps."""
     ways = {
-        f'ten operators, orders up to ({MAX_ORDER}, {MAX_ORDER}), swarm': Settings(),
-        'the same, least squares in place of the swarm': Settings(solver='least_squares'),
-        'number and places of the thresholds chosen too': Settings(refine=True),
+        f'ten operators, orders up to ({MAX_ORDER}, {MAX_ORDER}), swarm': Settings(
+            thresholds=10, solver='swarm'
+        ),
+        'the same, least squares in place of the swarm': Settings(thresholds=10),
+        'number and places of the thresholds chosen too': Settings(),
     }
 
     def timed(settings: Settings) -> tuple[float, float]:

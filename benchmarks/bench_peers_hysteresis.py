@@ -386,8 +386,10 @@ def our_rows(
 ) -> list[list[str]]:
     """Return the rows of ten and of refined thresholds."""
     rows = []
-    for name, refine in (('ten thresholds', False), ('refined thresholds', True)):
-        asked = Settings(refine=refine, hold_out=settings.hold_out, max_order=settings.max_order)
+    for name, count in (('ten thresholds', 10), ('chosen thresholds', None)):
+        asked = Settings(
+            thresholds=count, hold_out=settings.hold_out, max_order=settings.max_order
+        )
         turn: Turn = take_turns(
             {'fit': lambda k, s=asked: identify(record, s)}, runs, warm=['fit']
         )['fit']

@@ -34,6 +34,7 @@ from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.excitation.program import load_program
 from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
 from piezo_ident.model.free_run import predict_record
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
@@ -156,7 +157,8 @@ def measured(
     y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
     start = time.perf_counter()
-    model = identify(record_of(sequence.v, y, labels, 'identification', None)).model
+    record = record_of(sequence.v, y, labels, 'identification', None)
+    model = identify(record, Settings(thresholds=10)).model
     took = time.perf_counter() - start
     records = []
     for number, kind in enumerate(('diagnosis', 'unseen')):

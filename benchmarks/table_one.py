@@ -27,6 +27,7 @@ from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose
 from piezo_ident.excitation.program import load_program, parse_program
 from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
 from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
@@ -107,7 +108,8 @@ def main() -> None:
         sample_rate=RATE
     )
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    model = identify(record_of(sequence.v, labels, 'identification', 1)).model
+    record = record_of(sequence.v, labels, 'identification', 1)
+    model = identify(record, Settings(thresholds=10)).model
     drive = parse_program(DIAGNOSIS).build(sample_rate=RATE)
     labels = [(s.label, s.start, s.stop) for s in drive.segments]
     result = diagnose(model, record_of(drive.v, labels, 'diagnosis', 2))

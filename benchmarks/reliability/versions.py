@@ -77,7 +77,7 @@ def measure(path: Path) -> None:
     check = read_record(path / 'validation.npz')
     found = {}
     for solver in SOLVERS:
-        model = identify(record, Settings(solver=solver)).model
+        model = identify(record, Settings(thresholds=10, solver=solver)).model
         data = model_to_dict(model)
         found[solver] = {
             'delay': [data['delay']['samples'] + data['delay']['fraction']],

@@ -56,14 +56,14 @@ def _order(text: str) -> tuple[int, int]:
 
 
 def _thresholds(text: str) -> int | None:
-    if text == 'refined':
+    if text == 'auto':
         return None
     try:
         number = int(text)
     except ValueError:
         number = -1
     if not 2 <= number <= 400:
-        raise argparse.ArgumentTypeError(f'{text!r}: give 2 to 400, or refined')
+        raise argparse.ArgumentTypeError(f'{text!r}: give 2 to 400, or auto')
     return number
 
 
@@ -206,11 +206,13 @@ def _build_parser() -> _Parser:
     p.add_argument(
         '--thresholds',
         type=_thresholds,
-        default=10,
-        metavar='N|refined',
-        help='number of plays, or chosen by held-out error (default: 10)',
+        metavar='N|auto',
+        help='number of plays; auto, the default, chooses it by held-out error',
     )
-    p.add_argument('--solver', choices=('swarm', 'least_squares'), default='swarm')
+    p.add_argument('--solver', choices=('least_squares', 'swarm'), default='least_squares')
+    p.add_argument(
+        '--polish', action='store_true', help='let least squares finish what the swarm found'
+    )
     p.add_argument('--order', type=_order, metavar='NA,NB', help='of G; searched when absent')
     p.add_argument(
         '--max-order', type=_whole, default=15, metavar='N', help='of the search (default: 15)'

@@ -149,7 +149,7 @@ def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineErr
     console.say('   the same, without nodes')
     stage = load_stage(find_config('stage_paper', 'stage'))
     record = _play(stage, 'identification', 1)
-    found = _identify('ten thresholds', record, Settings(), console)
+    found = _identify('ten thresholds', record, Settings(thresholds=10), console)
     played = _play(stage, 'validation', 2)
     _keep(found, out / 'stage_paper', console, record, played)
     return found, sine_errors(found.model, played)
@@ -160,14 +160,14 @@ def _dense_stage(out: Path, console: Console) -> None:
     console.say('2. A harder stage: forty thresholds, none of them where the fit puts its own')
     record = _play(stage, 'identification', 3)
     sines, loops = _play(stage, 'validation', 4), _play(stage, 'minor_loops', 5)
-    ten = _identify('ten thresholds', record, Settings(), console)
+    ten = _identify('ten thresholds', record, Settings(thresholds=10), console)
     # delay and order are those just found; only the hysteresis is fitted in another way
-    same = Settings(refine=True, order=ten.dynamics.order, delay=ten.delay.samples)
-    refined = _identify('refined thresholds', record, same, console)
-    _keep(refined, out / 'stage_dense', console, record, sines, loops)
+    same = Settings(order=ten.dynamics.order, delay=ten.delay.samples)
+    chosen = _identify('chosen thresholds', record, same, console)
+    _keep(chosen, out / 'stage_dense', console, record, sines, loops)
     console.say(f'Not fitted: {FORMULA}, in %')
     console.say(_heads(FREQUENCIES, 'minor loops'))
-    for name, found in (('ten', ten), ('refined', refined)):
+    for name, found in (('ten', ten), ('chosen', chosen)):
         count = found.hysteresis.hysteresis.thresholds.size
         errors = _percents(sine_errors(found.model, sines))
         loop = predict_record(found.model, loops).whole.percent
@@ -184,7 +184,7 @@ def _measured(out: Path, path: Path | None, console: Console) -> None:
         )
         return
     record = read_record(path)
-    found = _identify('ten thresholds', record, Settings(), console)
+    found = _identify('ten thresholds', record, Settings(thresholds=10), console)
     _keep(found, out / 'measured', console, record)
     console.say(text_summary(found))
     console.say()

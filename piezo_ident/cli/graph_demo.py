@@ -188,7 +188,7 @@ def _session(nodes: Nodes, client: Client, folder: Path, console: Console) -> Gr
 
     record = read_record(bag)
     with console.progress() as progress:
-        found = identify(record, Settings(), progress=progress)
+        found = identify(record, Settings(thresholds=10), progress=progress)
     lost |= {'in the replay': record.n - again, 'of the live prediction': missed}
     return GraphRun(
         found,

@@ -52,9 +52,9 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident identify``."""
     check_each(args)
     settings = Settings(
-        thresholds=10 if args.thresholds is None else args.thresholds,
-        refine=args.thresholds is None,
+        thresholds=args.thresholds,
         solver=args.solver,
+        polish=args.polish,
         max_order=args.max_order,
         order=args.order,
         delay=args.delay,

@@ -54,6 +54,9 @@ from scipy.optimize import OptimizeResult
 
 __all__ = ['identify']
 
+#: plays of the paper, where the data cannot choose their number
+PAPER_COUNT = 10
+
 
 def identify(
     records: Sequence[Record] | Record,
@@ -157,19 +160,21 @@ def _third_step(
     delay: Delay,
     settings: Settings,
     progress: Progress,
+    whole: list[Excerpt] | None = None,
 ) -> HysteresisFit:
     progress('hysteresis', 0.0)
-    swing = max(float(np.ptp(e.u[e.use])) for e in fit)
-    n, rows = int(sum(e.use.sum() for e in fit)), sum(e.rows for e in fit)
-    if settings.refine and any(e.use.any() for e in held):
-        # thresholds and weights are found together, by least squares alone
+    fitted = whole or fit
+    swing = max(float(np.ptp(e.u[e.use])) for e in fitted)
+    n, rows = int(sum(e.use.sum() for e in fitted)), sum(e.rows for e in fitted)
+    if settings.thresholds is not None:
+        r = even_thresholds(swing, settings.thresholds)
+    elif any(e.use.any() for e in held):
         r = choose_thresholds(
-            fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.9 * share)
+            fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.3 * share)
         )
-        progress('hysteresis', 1.0)
-        return fit_hysteresis(factorise(fit, r, G, delay), r, n, rows=rows)
-    r = even_thresholds(swing, settings.thresholds)
-    R = factorise(fit, r, G, delay)
+    else:
+        r = even_thresholds(swing, PAPER_COUNT)
+    R = factorise(fitted, r, G, delay)
     progress('hysteresis', 0.3)
     callback, request = _stop_on_request(progress, settings.swarm_iterations)
     result = fit_hysteresis(
@@ -178,6 +183,7 @@ def _third_step(
         n,
         rows=rows,
         solver=settings.solver,
+        polish=settings.polish,
         rng=np.random.default_rng(settings.seed),
         swarm_size=settings.swarm_size,
         maxiter=settings.swarm_iterations,
@@ -213,10 +219,10 @@ def _labelled(
     result = _third_step(fit, held, G, delay, settings, progress)
     model = _model(rate, scaling, result, G, delay)
     said = []
-    if settings.refine and not any(e.use.any() for e in held):
+    if settings.thresholds is None and not any(e.use.any() for e in held):
         said.append(
-            'the triangle turns too often to hold a part of it out; the thresholds were not '
-            'refined, use a slower triangle'
+            'the triangle turns too often to hold a part of it out: the number of thresholds '
+            f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
         )
     if delay_result.source == 'scan' and delay_result.agree is None:
         said.append('no step rises above the noise; the delay was read from the ARX loss alone')
@@ -280,20 +286,7 @@ def _unlabelled(
     fit_part = [Excerpt(u, x, use & ~late, joint.memory)]
     late_part = [Excerpt(u, x, use & late, joint.memory)]
     whole = [Excerpt(u, x, use, joint.memory)]
-    if settings.refine:
-        r = choose_thresholds(
-            fit_part,
-            late_part,
-            float(np.ptp(u[use])),
-            joint.G,
-            delay,
-            lambda share: progress('hysteresis', 0.9 * share),
-        )
-        result = fit_hysteresis(
-            factorise(whole, r, joint.G, delay), r, int(use.sum()), rows=whole[0].rows
-        )
-    else:
-        result = _third_step(whole, [], joint.G, delay, settings, progress)
+    result = _third_step(fit_part, late_part, joint.G, delay, settings, progress, whole)
     model = _model(rate, scaling, result, joint.G, delay)
     low, high = float(u.min()), float(u.max())
     span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
@@ -352,6 +345,8 @@ def _story(result: Identification, names: list[str]) -> dict[str, Any]:
         'method': 'three steps' if dynamics.table is not None else 'joint free-run fit',
         'reference': 'doi:10.1109/TMECH.2015.2465868',
         'solver': fit.solver,
+        'polished': fit.polished,
+        'losses': {'model': fit.loss, 'swarm': fit.swarm_loss, 'optimum': fit.optimum_loss},
         'seed': result.settings.seed,
         'records': names,
         'versions': {

@@ -46,12 +46,14 @@ class Settings:
 
     Attributes
     ----------
-    thresholds : int
-        Number of plays of H, that at r = 0 included, evenly spaced over the excited range.
-    refine : bool
-        Choose number and places of the thresholds by held-out error instead.
-    solver : {'swarm', 'least_squares'}
-        How the weights are found.
+    thresholds : int, optional
+        Number of plays of H, that at r = 0 included, evenly spaced over the excited range; the
+        paper takes ten.  Number and places are chosen by held-out error when absent.
+    solver : {'least_squares', 'swarm'}
+        How the weights are found.  Least squares finds the optimum of this convex problem; the
+        swarm is the paper's solver, and the model holds what the swarm found.
+    polish : bool
+        Let bounded least squares finish what the swarm found.
     max_order : int
         Largest na and nb that are tried.
     order : tuple of int, optional
@@ -72,9 +74,9 @@ class Settings:
         When a value is out of range.
     """
 
-    thresholds: int = 10
-    refine: bool = False
-    solver: Solver = 'swarm'
+    thresholds: int | None = None
+    solver: Solver = 'least_squares'
+    polish: bool = False
     max_order: int = 15
     order: tuple[int, int] | None = None
     delay: int | None = None
@@ -84,10 +86,12 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 2 <= self.thresholds <= 400:
+        if self.thresholds is not None and not 2 <= self.thresholds <= 400:
             raise ConfigError(f'thresholds must be 2 to 400, got {self.thresholds}')
-        if self.solver not in ('swarm', 'least_squares'):
-            raise ConfigError(f'solver must be swarm or least_squares, got {self.solver!r}')
+        if self.solver not in ('least_squares', 'swarm'):
+            raise ConfigError(f'solver must be least_squares or swarm, got {self.solver!r}')
+        if self.polish and self.solver != 'swarm':
+            raise ConfigError('polish applies to the swarm alone; set the solver to swarm')
         if not 1 <= self.max_order <= 50:
             raise ConfigError(f'max_order must be 1 to 50, got {self.max_order}')
         sizes = list(self.order or (1, 1))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 3: the weights of H, by particle swarm as in the paper, or by bounded least squares.
+Step 3: the weights of H, by bounded least squares, or by particle swarm as in the paper.
 
 With thresholds and dynamics fixed, the output is linear in what is sought,
 
@@ -46,7 +46,7 @@ __all__ = [
     'merged',
 ]
 
-Solver = Literal['swarm', 'least_squares']
+Solver = Literal['least_squares', 'swarm']
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
@@ -239,11 +239,13 @@ class HysteresisFit:
     hysteresis : Hysteresis
     offsets : ndarray
         Displacement at u = 0 of each excerpt, normalised.
-    solver : str
+    solver : {'least_squares', 'swarm'}
+    polished : bool
+        Whether bounded least squares finished what the swarm found.
     loss : float
         Sum of squares of the returned weights, over `n` samples.
     swarm_loss : float or None
-        Sum of squares that the swarm reached before polishing.
+        Sum of squares that the swarm reached.
     optimum_loss : float
         Sum of squares of bounded least squares.
     n : int
@@ -256,7 +258,8 @@ class HysteresisFit:
 
     hysteresis: Hysteresis
     offsets: NDArray[np.float64]
-    solver: str
+    solver: Solver
+    polished: bool
     loss: float
     swarm_loss: float | None
     optimum_loss: float
@@ -276,6 +279,7 @@ def fit_hysteresis(
     n: int,
     *,
     solver: Solver = 'least_squares',
+    polish: bool = False,
     rows: int | None = None,
     rng: np.random.Generator | None = None,
     swarm_size: int = 40,
@@ -293,7 +297,9 @@ def fit_hysteresis(
     n : int
         Number of samples behind R.
     solver : {'least_squares', 'swarm'}
-        The swarm is polished by bounded least squares; both losses are kept.
+        Whose weights are returned; both losses are kept.
+    polish : bool, optional
+        Let bounded least squares finish what the swarm found.
     rows : int, optional
         Number of rows that the samples were averaged to (`Excerpt.rows`); `n` when absent.
     rng : numpy.random.Generator
@@ -336,11 +342,14 @@ def fit_hysteresis(
         )
         # from the factor, not from the Gram matrix: the difference of large squares loses digits
         swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
+        if not polish:
+            x = np.where(A.any(axis=0), swarm.x, 0.0)
     offsets = np.linalg.solve(R[:k, :k], R[:k, -1] - R[:k, k:-1] @ x)
     free = (x > lower) & inner[:, :-1].any(axis=0)
     std = np.zeros(m + 2)
     gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
-    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * optimum
+    loss = optimum if swarm_loss is None or polish else swarm_loss
+    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * loss
     variance /= max((n if rows is None else rows) - m - 2, 1)
     std[free] = np.sqrt(np.maximum(variance, 0.0))
     h = Hysteresis(thresholds, x[:m], float(x[m]), float(x[m + 1]))
@@ -348,7 +357,8 @@ def fit_hysteresis(
         hysteresis=h,
         offsets=np.asarray(offsets),
         solver=solver,
-        loss=optimum,
+        polished=solver == 'swarm' and polish,
+        loss=loss,
         swarm_loss=swarm_loss,
         optimum_loss=optimum,
         n=n,

@@ -59,8 +59,9 @@ def remarks_on_fit(
         excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0 else 0.0
         if excess > 0.01:
             said.append(
-                f'before polishing the swarm was {excess:.2g} of the loss above the optimum; '
-                'more iterations would bring it closer'
+                f'the swarm ended {100.0 * excess:.2g} % of the loss above the least-squares '
+                f'optimum{", before polishing" if fit.polished else ""}; more iterations bring it '
+                'closer'
             )
     return [*said, *_unseen(dynamics, model)]
 

@@ -208,7 +208,7 @@ class IdentifierNode(LabNode):
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse what the settings would refuse later."""
         if name == 'thresholds':
-            defaults = {'solver': 'swarm', 'max_order': 15, 'seed': 0}
+            defaults = {'solver': 'least_squares', 'max_order': 15, 'seed': 0}
             swarm = {'swarm_size': 40, 'swarm_iterations': 1000}
             try:
                 settings_of({**defaults, **swarm, 'thresholds': value})

@@ -11,7 +11,7 @@ Jobs go to another process, so that each is a partial of a function of this modu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 import json
 
@@ -96,13 +96,13 @@ def settings_of(values: dict[str, object]) -> Settings:
         When a value is out of range.
     """
     text = str(values['thresholds']).strip()
-    refine = text == 'refined'
-    if not refine and not text.isdecimal():
-        raise ConfigError(f"thresholds must be a number of 2 to 400, or 'refined', got {text!r}")
+    if text != 'auto' and not text.isdecimal():
+        raise ConfigError(f"thresholds must be a number of 2 to 400, or 'auto', got {text!r}")
+    swarm = values['solver'] == 'swarm'
     return Settings(
-        thresholds=10 if refine else int(text),
-        refine=refine,
+        thresholds=None if text == 'auto' else int(text),
         solver=str(values['solver']),  # type: ignore[arg-type]
+        polish=swarm and bool(values.get('polish')),
         max_order=int(str(values['max_order'])),
         swarm_size=int(str(values['swarm_size'])),
         swarm_iterations=int(str(values['swarm_iterations'])),
@@ -189,4 +189,5 @@ def warm_up() -> None:
     stage = load_stage(find_config('paper', 'stage'))
     sequence = parse_program(_SMALL).build(stage.model.sample_rate)
     record = simulate(stage, sequence, np.random.default_rng(0))
-    identify(record, Settings(thresholds=3, max_order=2, swarm_size=4, swarm_iterations=100))
+    settings = Settings(thresholds=3, max_order=2, solver='swarm', swarm_size=4)
+    identify(record, replace(settings, swarm_iterations=100))

@@ -121,10 +121,14 @@ STAGE = (
 
 IDENTIFIER = (
     Declaration('program', 'identification', 'programme that ~/run asks the excitation for'),
-    Declaration('thresholds', '10', 'number of plays of H, or: refined'),
+    Declaration('thresholds', 'auto', 'number of plays of H, or auto: by held-out error'),
     Declaration(
-        'solver', 'swarm', 'how the weights of H are found', choices=('swarm', 'least_squares')
+        'solver',
+        'least_squares',
+        'how the weights of H are found',
+        choices=('least_squares', 'swarm'),
     ),
+    Declaration('polish', False, 'whether least squares finish what the swarm found'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
     Declaration('seed', 0, 'of everything that is drawn by chance', '1', 0, 2**31 - 1),
     Declaration('swarm_size', 40, 'particles', '1', 2, 10_000),

@@ -234,6 +234,7 @@ def to_json(
             'p2': h.p2,
             'p2_std': fit.std[m + 1] if fit.std.size == m + 2 else None,
             'solver': fit.solver,
+            'polished': fit.polished,
             'loss': fit.loss,
             'swarm_loss': fit.swarm_loss,
             'optimum_loss': fit.optimum_loss,

@@ -254,7 +254,7 @@ def hysteresis_tables(identification: Identification) -> list[Table]:
         solved.insert(
             0,
             (
-                'particle swarm, before polishing',
+                'particle swarm, then polished' if fit.polished else 'particle swarm',
                 number(fit.swarm_loss, 5),
                 f'{number(100.0 * excess, 2)} %',
                 f'{swarm.nit} iterations, {swarm.nfev} evaluations',

@@ -617,9 +617,9 @@ def test_misspelt_names(capsys, tmp_path, made):
     ('options', 'word'),
     [
         (['--thresholds', 'many'], '--thresholds'),
-        (['--thresholds', 1], "'1': give 2 to 400, or refined"),
-        (['--thresholds', -3], "'-3': give 2 to 400, or refined"),
-        (['--thresholds', 401], "'401': give 2 to 400, or refined"),
+        (['--thresholds', 1], "'1': give 2 to 400, or auto"),
+        (['--thresholds', -3], "'-3': give 2 to 400, or auto"),
+        (['--thresholds', 401], "'401': give 2 to 400, or auto"),
         (['--order', '3'], '--order'),
         (['--order', '3,0'], 'order'),
         (['--solver', 'magic'], '--solver'),
@@ -732,14 +732,14 @@ def test_demo_finds_what_it_claims(tmp_path):
     rows = {
         line[:38].strip(): [float(x) for x in line[38:].split()]
         for line in done.stdout.splitlines()
-        if line.startswith(('  paper, ', '  here, ', '  ten ', '  refined '))
+        if line.startswith(('  paper, ', '  here, ', '  ten ', '  chosen '))
     }
     assert rows['paper, real stage: hysteresis alone'][-1] == 10.06  # Table I at 120 Hz
     # 20 times the sensor noise, 0.002 %, is still far below what any real stage would give
     assert max(rows['here, simulated: model']) < 0.04
     (ten,) = (row for name, row in rows.items() if name.startswith('ten'))
-    (refined,) = (row for name, row in rows.items() if name.startswith('refined'))
-    assert all(b < a for a, b in zip(ten, refined, strict=True))
+    (chosen,) = (row for name, row in rows.items() if name.startswith('chosen'))
+    assert all(b < a for a, b in zip(ten, chosen, strict=True))
     assert 'piezo_1hz.csv is not there' in done.stdout
     assert (tmp_path / 'out' / 'stage_dense' / 'report.html').is_file()
 
@@ -778,7 +778,7 @@ def test_interrupt_leaves_nothing(capsys, tmp_path):
     record = tmp_path / 'r.npz'
     succeed(capsys, 'simulate', record)
     outputs = ['--model', tmp_path / 'm.yaml', '--report', tmp_path / 'report']
-    argv = ['identify', record, *outputs, '--thresholds', 'refined']
+    argv = ['identify', record, *outputs, '--thresholds', 'auto']
     with on_a_terminal(argv) as (process, terminal):
         seen = b''
         # the bar of the second step: the work is under way

@@ -49,7 +49,7 @@ segments:
   - {signal: idle, duration: 0.1}
 """
 #: the search over orders has tests of its own
-QUICK = Settings(order=(10, 10))
+QUICK = Settings(order=(10, 10), thresholds=10)
 FREQUENCIES = (1, 10, 50, 80, 100, 120)
 
 
@@ -128,13 +128,31 @@ def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
     assert max(sine_errors(PAPER.model, result.model)) < 0.1
 
 
-def test_swarm_and_optimum_are_both_told(paper):
-    _, result = paper
-    fit = result.hysteresis
-    assert fit.solver == 'swarm'
-    assert fit.optimum_loss <= fit.swarm_loss <= 1.01 * fit.optimum_loss
-    assert result.swarm.nfev > 0
-    assert fit.hysteresis.thresholds.size == 9
+def test_the_swarm_gives_what_it_found_and_polishing_is_stated():
+    swarm = replace(QUICK, solver='swarm', swarm_iterations=300)
+    optimum, found, polished = (
+        identify(short(), s) for s in (QUICK, swarm, replace(swarm, polish=True))
+    )
+    fit = found.hysteresis
+    assert (fit.solver, fit.polished) == ('swarm', False)
+    assert fit.loss == fit.swarm_loss > fit.optimum_loss == optimum.hysteresis.loss
+    assert found.swarm.nfev > 0
+    h = found.model.hysteresis
+    assert_array_equal([*h.weights, h.p1, h.p2], found.swarm.x)
+    assert found.model.identification['losses']['swarm'] == fit.swarm_loss
+    assert polished.hysteresis.polished
+    assert polished.hysteresis.swarm_loss == fit.swarm_loss
+    assert polished.hysteresis.loss == fit.optimum_loss
+    assert_array_equal(polished.model.hysteresis.weights, optimum.model.hysteresis.weights)
+
+
+def test_least_squares_and_chosen_thresholds_are_the_default():
+    settings = Settings()
+    assert (settings.solver, settings.polish, settings.thresholds) == (
+        'least_squares',
+        False,
+        None,
+    )
 
 
 def test_small_signal_gain_is_the_slope_of_h(paper):
@@ -147,13 +165,14 @@ def test_inputs_stay_and_the_seed_repeats_bit_for_bit():
     record = short()
     piece = record.pieces[0]
     v, y = piece.v.copy(), piece.y.copy()
-    one, two = identify(record, QUICK), identify([short()], QUICK)
+    swarm = replace(QUICK, solver='swarm', swarm_iterations=300)
+    one, two = identify(record, swarm), identify([short()], swarm)
     assert_array_equal(piece.v, v)
     assert_array_equal(piece.y, y)
     assert model_to_dict(one.model) == model_to_dict(two.model)
     assert one.hysteresis.swarm_loss == two.hysteresis.swarm_loss
     assert one.errors == two.errors
-    other = identify(record, replace(QUICK, seed=1))
+    other = identify(record, replace(swarm, seed=1))
     assert other.hysteresis.swarm_loss != one.hysteresis.swarm_loss
 
 
@@ -173,7 +192,7 @@ def test_model_keeps_its_story_in_the_file(paper, tmp_path):
 @pytest.mark.parametrize('noise', [1e-5, 1e-4, 5e-4])
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_seeds_and_noise(seed, noise):
-    result = identify(short(noise=noise, seed=seed), Settings(seed=seed))
+    result = identify(short(noise=noise, seed=seed), Settings(thresholds=10, seed=seed))
     assert result.delay.samples == 3
     assert result.model.dynamics.is_stable
     errors = sine_errors(PAPER.model, result.model)
@@ -182,15 +201,15 @@ def test_seeds_and_noise(seed, noise):
 
 def test_dense_truth_that_no_ten_thresholds_can_hit():
     record = simulate(DENSE, FULL.build(), np.random.default_rng(1), 'dense')
-    for refine, limit in ((False, 0.25), (True, 0.05)):
-        model = identify(record, Settings(refine=refine)).model
+    for count, limit in ((10, 0.25), (None, 0.05)):
+        model = identify(record, Settings(thresholds=count)).model
         sines, loops = sine_errors(DENSE.model, model), loop_error(DENSE.model, model)
         assert max(*sines, loops) <= limit
 
 
 def test_dense_truth_from_a_short_programme():
     # 1.5 s of noise leave 0.09 % above 10 Hz, whatever the thresholds
-    model = identify(short(DENSE), replace(QUICK, refine=True)).model
+    model = identify(short(DENSE), replace(QUICK, thresholds=None)).model
     assert max(sine_errors(DENSE.model, model)) <= 0.12
     assert loop_error(DENSE.model, model) <= 0.05
 
@@ -206,7 +225,7 @@ def test_retracting_stage():
 
 
 def test_delay_and_orders_may_be_given():
-    result = identify(short(), Settings(delay=3, order=(7, 6), solver='least_squares'))
+    result = identify(short(), Settings(delay=3, order=(7, 6)))
     assert result.delay.source == 'given'
     assert result.dynamics.order == (7, 6)
     assert result.model.dynamics.a.size == 7
@@ -217,9 +236,9 @@ def test_delay_and_orders_may_be_given():
 
 
 @pytest.mark.parametrize('step', ['delay', 'dynamics', 'hysteresis'])
-@pytest.mark.parametrize('refine', [False, True])
+@pytest.mark.parametrize('count', [10, None])
 @pytest.mark.parametrize('labelled', [False, True])
-def test_every_step_can_be_cancelled(step, refine, labelled):
+def test_every_step_can_be_cancelled(step, count, labelled):
     record = short()
     if not labelled:
         p = record.pieces[0]
@@ -232,7 +251,7 @@ def test_every_step_can_be_cancelled(step, refine, labelled):
             raise Cancelled('on request')
 
     with pytest.raises(Cancelled, match='on request'):
-        identify(record, replace(QUICK, refine=refine), progress=progress)
+        identify(record, replace(QUICK, thresholds=count), progress=progress)
     assert seen[-1][0] == step
 
 
@@ -242,15 +261,15 @@ def test_swarm_can_be_cancelled_while_it_flies():
             raise Cancelled('in flight')
 
     with pytest.raises(Cancelled, match='in flight'):
-        identify(short(), QUICK, progress=progress)
+        identify(short(), replace(QUICK, solver='swarm'), progress=progress)
 
 
 def test_progress_rises_to_one_in_every_step():
-    for refine in (False, True):
+    for count in (10, None):
         seen: dict[str, list[float]] = {}
         identify(
             short(),
-            replace(QUICK, refine=refine),
+            replace(QUICK, thresholds=count),
             progress=lambda name, share, seen=seen: seen.setdefault(name, []).append(share),
         )
         assert list(seen) == ['delay', 'dynamics', 'hysteresis']
@@ -270,9 +289,9 @@ def measured(name: str) -> Record:
     return read_record(path)
 
 
-@pytest.mark.parametrize(('refine', 'limit'), [(False, 0.30), (True, 0.20)])
-def test_measured_one_hertz_record(refine, limit):
-    result = identify(measured('piezo_1hz.csv'), Settings(refine=refine, hold_out=1.5))
+@pytest.mark.parametrize(('settings', 'limit'), [({'thresholds': 10}, 0.30), ({}, 0.17)])
+def test_measured_one_hertz_record(settings, limit):
+    result = identify(measured('piezo_1hz.csv'), Settings(hold_out=1.5, **settings))
     (held,) = [row for row in result.errors if row.data == 'held out']
     modes = result.model.dynamics.modes(result.model.sample_rate)
     assert held.n == 7500
@@ -414,12 +433,12 @@ AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
 }
 
 
-@pytest.mark.parametrize('refine', [False, True])
+@pytest.mark.parametrize('count', [10, None])
 @pytest.mark.parametrize('case', AWKWARD)
-def test_awkward_records_give_a_result_or_a_reason(case, refine):
+def test_awkward_records_give_a_result_or_a_reason(case, count):
     records = AWKWARD[case]()
     try:
-        result = identify(records, Settings(refine=refine, max_order=4, solver='least_squares'))
+        result = identify(records, Settings(thresholds=count, max_order=4))
     except PiezoIdentError as error:
         assert isinstance(error, IdentificationError)
         assert len(str(error)) > 20

@@ -44,7 +44,7 @@ def test_what_cannot_be_followed_is_refused(wrong, says):
 
 
 def test_what_can_be_followed_is_taken():
-    assert Settings(order=(3, 2), delay=0, hold_out=0.5, refine=True).order == (3, 2)
+    assert Settings(order=(3, 2), delay=0, hold_out=0.5, thresholds=10).order == (3, 2)
     silent('delay', 0.5)
 
 

@@ -66,15 +66,19 @@ def test_what_the_mask_leaves_out_is_not_looked_at():
     assert_allclose(fit.hysteresis.weights, Q[1:], atol=1e-6)
 
 
-def test_swarm_is_polished_and_both_losses_are_kept():
+def test_swarm_returns_what_it_found_and_both_losses_are_kept():
     e = excerpt(noise=1e-3)
     plain = fitted(e)
-    fit = fitted(e, solver='swarm', rng=np.random.default_rng(0), maxiter=3000)
-    assert_array_equal(fit.hysteresis.weights, plain.hysteresis.weights)
-    assert fit.loss == fit.optimum_loss == plain.loss
-    assert fit.swarm_loss >= fit.optimum_loss * (1 - 1e-9)
-    assert fit.swarm.nit <= 3000
     assert plain.swarm is None
+    for polish in (False, True):
+        rng = np.random.default_rng(0)
+        fit = fitted(e, solver='swarm', polish=polish, rng=rng, maxiter=3000)
+        h, better = fit.hysteresis, plain.hysteresis
+        weights = better.weights if polish else fit.swarm.x[: h.weights.size]
+        assert_array_equal(h.weights, weights)
+        assert fit.loss == (fit.optimum_loss if polish else fit.swarm_loss)
+        assert fit.swarm_loss > fit.optimum_loss == plain.loss
+        assert fit.polished == polish
     with pytest.raises(IdentificationError, match='random generator'):
         fitted(e, solver='swarm')
 

@@ -136,6 +136,7 @@ COVERED = {
     'parameter identifier.program': RUN,
     'parameter identifier.thresholds': SETTINGS,
     'parameter identifier.solver': SETTINGS,
+    'parameter identifier.polish': SETTINGS,
     'parameter identifier.max_order': SETTINGS,
     'parameter identifier.seed': SETTINGS,
     'parameter identifier.swarm_size': SETTINGS,

@@ -80,7 +80,7 @@ def empty(lab):
     lab.call('identifier/cancel')
     lab.wait(lambda: state(lab) not in ('identifying', 'saving', 'exciting'), 'rest')
     assert lab.call('identifier/clear')[0]
-    for name, value in {**SETTINGS, 'solver': 'swarm', 'seed': 0, 'capture_limit': 600.0}.items():
+    for name, value in {**SETTINGS, 'seed': 0, 'capture_limit': 600.0}.items():
         assert lab.set('identifier', name, value) == (True, '')
     return lab
 
@@ -129,9 +129,9 @@ def test_what_cannot_be_done_is_refused_with_the_reason(empty):
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('thresholds', 'many', "'refined'"),
+        ('thresholds', 'many', "'auto'"),
         ('thresholds', '1', '2 to 400'),
-        ('solver', 'magic', 'swarm or least_squares'),
+        ('solver', 'magic', 'least_squares or swarm'),
         ('max_order', 51, 'max_order'),
         ('program', ' ', 'must not be empty'),
         ('capture_limit', -1.0, 'capture_limit'),
@@ -152,7 +152,9 @@ def test_live_is_offline_and_what_comes_late_still_hears_the_model(fed, record, 
     assert end['progress'] == '100', end
     live = model_of(fed.texts('model')[-1])
     write_bag(record, tmp_path / 'bag')
-    offline = identify(read_bag(tmp_path / 'bag'), Settings(max_order=6)).model
+    offline = identify(
+        read_bag(tmp_path / 'bag'), Settings(max_order=6, thresholds=10, solver='swarm')
+    ).model
     np.testing.assert_allclose(numbers(live), numbers(offline), rtol=1e-12, atol=0)
     report = json.loads(fed.texts('report')[-1])
     assert report['delay']['samples'] == 3 and report['data_faults'] == []
@@ -376,7 +378,8 @@ def test_settings_reach_the_work(fed):
     fed.wait(lambda: fed.texts('model')[-1] != first, 'another model')
     model = model_of(fed.texts('model')[-1])
     assert model.identification['solver'] == 'swarm' and model.hysteresis.weights.size == 5
-    assert any('the swarm was' in w for w in model.identification['warnings'])
+    losses = model.identification['losses']
+    assert losses['model'] == losses['swarm'] > losses['optimum']
 
 
 @pytest.mark.skipif(not Path('/proc/self/stat').exists(), reason='no /proc here')

@@ -86,7 +86,7 @@ def records():
 
 @pytest.fixture(scope='module')
 def found(records):
-    return identify(records, Settings(max_order=8, swarm_iterations=2000))
+    return identify(records, Settings(max_order=8, thresholds=10, solver='swarm'))
 
 
 @pytest.fixture(scope='module')
@@ -107,7 +107,7 @@ def unlabelled():
     (piece,) = record.pieces
     slow = replace(piece.cut(0, 24_000), segments=())
     record = replace(record, pieces=(slow,))
-    found = identify(record, Settings(solver='least_squares', delay=3, order=(1, 1)))
+    found = identify(record, Settings(thresholds=10, delay=3, order=(1, 1)))
     return found, record
 
 
@@ -154,7 +154,7 @@ def test_page_says_what_was_found(html, found):
         'NRMSE fit',
         'Poles of G as modes',
         'instrumental variables',
-        'particle swarm, before polishing',
+        'particle swarm',
         'evaluations',
         '0.6411',
         'Faults in the data',
