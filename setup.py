@@ -14,8 +14,6 @@ cluster = [
     'dask>=2024.5',
     'distributed>=2024.5',
 ]
-# their table for other programs
-parquet = ['pyarrow>=15']
 
 lint = [
     'mypy>=2.4,<3',
@@ -55,11 +53,9 @@ setup(
             'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
         ],
         'cluster': cluster,
-        'parquet': parquet,
         'test': [
             *cluster,
             *lint,
-            *parquet,
             'hypothesis>=6,<7',
             'jsonschema>=4,<5',
             'mcap>=1.1,<2',
@@ -71,7 +67,6 @@ setup(
         # what the benchmarks set beside the package; all live with one numpy, 2.0 to 2.3
         'bench': [
             *cluster,
-            *parquet,
             'control>=0.10,<0.11',
             'pyswarms>=1.3,<2',
             'pysindy>=2.1,<3',

@@ -9,32 +9,29 @@ A folder of records identified on one process, on all cores, and on two workers 
 
 The whole command is timed, start-up and pictures included, since that is what one waits for.  The
 records are short, so that 200 of them fit into a benchmark; one of them is damaged.  The scheduler
-and the workers of dask.distributed are processes of their own and are there before the clock
-starts.  With --picture nothing is timed; the picture of the parameters is kept.
+and the workers of dask.distributed run before the clock starts.  With --picture nothing is timed;
+the picture is kept.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
-import json
 import os
 from pathlib import Path
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 
 # before NumPy is loaded here, and in all that is started from here
 for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
     os.environ.setdefault(name, '1')
 
+from distributed import LocalCluster
 import numpy as np
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.many.ledger import LEDGER
 from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -60,8 +57,6 @@ segments:
   - {signal: sine, bias: 5, amplitude: 4, frequency: 20, duration: 1.5}
 """
 OPTIONS = ('--max-order', '4', '--thresholds', '6', '--solver', 'least_squares')
-#: longest wait for a process of the cluster [s]
-PATIENCE = 120.0
 
 
 def stages(n: int) -> Iterator[SimulatedStage]:
@@ -120,70 +115,10 @@ def _environment() -> dict[str, str]:
     return {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
 
 
-#: runs a module as a program that ends with the process that started it, whatever ends that
-TIED = """
-import os, runpy, sys, threading
-threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(0)), daemon=True).start()
-sys.argv = sys.argv[1:]
-runpy.run_module(sys.argv[0], run_name='__main__')
-"""
-
-
-@contextmanager
-def cluster(folder: Path, workers: int) -> Iterator[str]:
-    """Yield the address of a scheduler with so many workers, each a process of its own."""
-    file, processes = folder / 'scheduler.json', list[subprocess.Popen[bytes]]()
-
-    def start(what: str, *options: str) -> None:
-        command = [sys.executable, '-c', TIED, f'distributed.cli.dask_{what}', *options]
-        command += ['--scheduler-file', str(file), '--no-dashboard']
-        with (folder / f'{what}_{len(processes)}.log').open('wb') as log:
-            processes.append(
-                subprocess.Popen(
-                    command,
-                    cwd=folder,
-                    env=_environment(),
-                    stdin=subprocess.PIPE,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                )
-            )
-
-    try:
-        start('scheduler', '--host', '127.0.0.1', '--port', '0')
-        end = time.monotonic() + PATIENCE
-        while not (file.exists() and file.read_text(encoding='utf-8').endswith('}')):
-            if time.monotonic() > end or processes[0].poll() is not None:
-                raise RuntimeError('the dask scheduler did not start')
-            time.sleep(0.05)
-        for _ in range(workers):
-            start('worker', '--nthreads', '1', '--no-nanny')
-        address = json.loads(file.read_text(encoding='utf-8'))['address']
-        _wait_for_workers(address, workers)
-        yield address
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
-
-
-def _wait_for_workers(address: str, workers: int) -> None:
-    import distributed
-
-    with distributed.Client(address, timeout=PATIENCE, set_as_default=False) as client:
-        client.wait_for_workers(workers, timeout=PATIENCE)
-
-
 def contents(out: Path) -> dict[str, bytes]:
     """Return what must not depend on where the work was done: the table and all models."""
     files = [out / 'records.csv', *sorted((out / 'models').iterdir())]
     return {str(path.relative_to(out)): path.read_bytes() for path in files}
-
-
-def work_in(out: Path) -> float:
-    """Return the time spent in the records, all of them together [s]."""
-    lines = (out / LEDGER).read_text(encoding='utf-8').splitlines()
-    return float(sum(json.loads(line)['seconds'] for line in lines))
 
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
@@ -208,7 +143,10 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         records = folder / 'records'
         make_records(records, n)
         outs = {place: folder / place for place in ('one', 'cores', 'dask')}
-        with cluster(folder, WORKERS) as address:
+        with LocalCluster(
+            n_workers=WORKERS, threads_per_worker=1, dashboard_address=None
+        ) as cluster:
+            address = cluster.scheduler_address
             options = {
                 'one': ('--jobs', '1'),
                 'cores': ('--jobs', str(many)),
@@ -231,7 +169,6 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         found = {place: contents(out) for place, out in outs.items()}
         if not found['one'] == found['cores'] == found['dask']:
             raise RuntimeError('the tables of the three places differ')
-        spent = work_in(outs['one'])
         rows = (outs['one'] / 'records.csv').read_text(encoding='utf-8').splitlines()[1:]
     failed = [row for row in rows if ',failed,' in row]
     heads = ('where', 'whole command', 'records a second', 'speed-up')
@@ -260,8 +197,6 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         f'The three tables ({len(rows)} rows) and the {len(found["one"]) - 1} models are the same '
         'byte for byte.',
         f'{len(failed)} of {len(rows)} rows failed: `{_short(failed)}`.',
-        f'On one process {100 * spent / turns["one"].times[-1]:.0f} % of the time was spent in '
-        'the records; the rest is start-up, table and pictures.',
     ]
     return [('Many records', '\n'.join(text))]
 
@@ -276,7 +211,7 @@ def make_picture(path: Path) -> None:
         records, out = Path(name, 'records'), Path(name, 'out')
         make_records(records, RECORDS)
         identify(records, out)
-        shutil.copyfile(out / 'parameters.png', path)
+        shutil.copyfile(out / 'records.png', path)
 
 
 def main() -> None:

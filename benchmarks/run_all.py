@@ -60,7 +60,6 @@ LIBRARIES = (
     'control',
     'dask',
     'distributed',
-    'pyarrow',
 )
 #: longest that one benchmark may take [s]
 LIMIT = 7200.0

@@ -54,7 +54,7 @@ ROSDEP_KEYS = {
 }
 
 # Of the extras: imported only where somebody asks for what they do.
-OPTIONAL = {'distributed', 'pyarrow'}
+OPTIONAL = {'distributed'}
 
 # Runs in an interpreter of its own: imports the modules named as arguments with ROS out of reach,
 # prints which of them asked for it all the same.

@@ -16,7 +16,7 @@ from typing import Any
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
-from piezo_ident.many.ledger import LEDGER
+from piezo_ident.many.run import MARK
 from piezo_ident.record import io as record_io
 from piezo_ident.record.io import read_record
 from piezo_ident.record.long_record import LongRecord, Progress
@@ -111,7 +111,7 @@ def _records_of(path: Path) -> list[Path]:
 def _is_left_out(path: Path) -> bool:
     """Tell whether one of the places in a folder of records is a folder of further ones."""
     # the table of many records is none itself
-    if path.name.startswith('.') or _is_record(path) or (path / LEDGER).is_file():
+    if path.name.startswith('.') or _is_record(path) or (path / MARK).is_file():
         return False
     return any(_is_record(p) and p.suffix.lower() not in BAG_FILES for p in path.glob('[!.]*'))
 

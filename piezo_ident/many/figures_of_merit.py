@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What one stage is like in a few numbers that can be compared from stage to stage.
+Figures of merit of a stage: a few numbers that can be compared between stages.
 
-The coefficients of G cannot: two identifications of one stage may choose different orders.  What
-the coefficients do to a signal can, so the numbers are read from the answer of H and of G.
+The coefficients of G cannot be compared, since two identifications of one stage may choose
+different orders.  These numbers are read from the response of H and of G.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['Character', 'character']
+__all__ = ['FiguresOfMerit', 'figures_of_merit']
 
-#: samples of one branch of the loop, and frequencies at which G is looked at
+#: samples of one branch of the loop, and frequencies at which G is evaluated
 BRANCH, FREQUENCIES = 400, 4000
 #: lowest of them, as a share of the highest
 LOWEST = 1e-4
-#: |G| from which a maximum is called a resonance
-RISES = 1.05
+#: |G| from which a maximum counts as a resonance
+PEAK = 1.05
 
 
 @dataclass(frozen=True)
-class Character:
+class FiguresOfMerit:
     """
-    Numbers of a stage.
+    Figures of merit of a stage.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class Character:
     peak: float | None
 
 
-def character(model: StageModel) -> Character:
+def figures_of_merit(model: StageModel) -> FiguresOfMerit:
     """
-    Return the numbers of a stage, from H and G of its model alone.
+    Return the figures of merit of a stage from H and G of its model.
 
     Parameters
     ----------
@@ -66,19 +66,19 @@ def character(model: StageModel) -> Character:
     >>> from piezo_ident.model.stage_model import Scaling
     >>> scaling = Scaling(0.0, 10.0, 0.0, 70e-6, (0.0, 10.0))
     >>> line = Hysteresis([], [], 0.0, 1.0)
-    >>> stage = character(StageModel(1e4, scaling, line, Dynamics.unit(), Delay(3)))
+    >>> stage = figures_of_merit(StageModel(1e4, scaling, line, Dynamics.unit(), Delay(3)))
     >>> print(f'{stage.gain:.1e} {stage.loop_width:g} {stage.resonance}')
     7.0e-06 0 None
     """
     gain, width = _loop(model)
-    return Character(gain, width, *_answer(model))
+    return FiguresOfMerit(gain, width, *_frequency_response(model))
 
 
 def _loop(model: StageModel) -> tuple[float, float]:
     low, high = model.scaling.range
     first, last = model.scaling.u(np.array([low, high]))
     up = np.linspace(first, last, BRANCH)
-    # the first way up is the virgin one; from there on the loop repeats
+    # the first rise is the virgin curve; from there on the loop repeats
     w = model.hysteresis(np.concatenate([up, up[-2::-1], up[1:]]))
     down, again = w[BRANCH - 1 : 2 * BRANCH - 1][::-1], w[2 * BRANCH - 2 :]
     span = float(again[-1] - again[0])
@@ -90,7 +90,7 @@ def _loop(model: StageModel) -> tuple[float, float]:
     )
 
 
-def _answer(model: StageModel) -> tuple[float | None, float | None, float | None]:
+def _frequency_response(model: StageModel) -> tuple[float | None, float | None, float | None]:
     if model.is_static:
         return None, None, None
     top = 0.5 * model.sample_rate
@@ -103,7 +103,7 @@ def _answer(model: StageModel) -> tuple[float | None, float | None, float | None
         # between two neighbours |G| is as good as a straight line
         bandwidth = float(np.interp(-np.sqrt(0.5), -size[[k - 1, k]], f[[k - 1, k]]))
     k = int(np.argmax(size))
-    if size[k] < RISES or k in (0, f.size - 1):
+    if size[k] < PEAK or k in (0, f.size - 1):
         return bandwidth, None, None
     curve = np.polyfit(np.log(f[k - 1 : k + 2] / f[k]), size[k - 1 : k + 2], 2)
     at = -curve[1] / (2.0 * curve[0])

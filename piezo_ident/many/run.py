@@ -2,379 +2,280 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One record of many: identified or diagnosed on its own, and never raising.
+Many records: each is identified or diagnosed on its own, in a process of its own.
 
-What comes back is plain data and text, so that it can come from another process or machine; the
-record itself is read where the work is done.
+The worker that reads a record also writes its results, so that workers on other machines need
+nothing but the same folders.  A record that fails is a row with a reason; it stops no other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
-import hashlib
 import json
-import math
 import os
 from pathlib import Path
-import time
+from typing import Any
 
 from piezo_ident import __version__
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.diagnosis.procedure import diagnose
-from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Identification, Settings
-from piezo_ident.many.figures_of_merit import character
-from piezo_ident.model.files import model_from_dict, model_to_yaml, parse_yaml
+from piezo_ident.identification.results import Settings
+from piezo_ident.many.table import diagnosed, identified, natural, Row
+from piezo_ident.many.workers import completed, dask, processes
+from piezo_ident.model.files import load_model, save_model, write_text
 from piezo_ident.record.io import read_record
-from piezo_ident.record.record import Record
 
-__all__ = [
-    'Diagnose',
-    'Identify',
-    'Outcome',
-    'Reading',
-    'Row',
-    'Value',
-    'failed',
-    'fingerprint',
-]
+__all__ = ['Diagnose', 'Identify', 'Task', 'run_many']
 
-#: what stands in a cell of the table
-Value = str | float | int | None
-
-
-@dataclass(frozen=True)
-class Reading:
-    """
-    How to read a record; see `piezo_ident.record.io.read_record`.
-
-    Attributes
-    ----------
-    displacement_unit : {'m', 'mm', 'um', 'nm'}
-    voltage_limits : tuple of float, optional
-        [V]
-    namespace, voltage_topic, displacement_topic : str, optional
-    """
-
-    displacement_unit: str = 'm'
-    voltage_limits: tuple[float, float] | None = None
-    namespace: str | None = None
-    voltage_topic: str | None = None
-    displacement_topic: str | None = None
-
-    def read(self, path: str) -> Record:
-        """
-        Read a record.
-
-        Raises
-        ------
-        DataError
-            When it cannot be used.
-        """
-        return read_record(
-            path,
-            displacement_unit=self.displacement_unit,
-            voltage_limits=self.voltage_limits,
-            namespace=self.namespace,
-            voltage_topic=self.voltage_topic,
-            displacement_topic=self.displacement_topic,
-        )
-
-
-@dataclass(frozen=True)
-class Row:
-    """
-    A line of the table.
-
-    Attributes
-    ----------
-    record : str
-    values : mapping of str to Value
-        By column; empty where it failed.
-    reason : str
-        Why it failed, in one line; empty where it did not.
-    """
-
-    record: str
-    values: Mapping[str, Value] = field(default_factory=dict)
-    reason: str = ''
-
-    @property
-    def good(self) -> bool:
-        """Whether the record carried a result."""
-        return not self.reason
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """
-    What became of a record.
-
-    Attributes
-    ----------
-    row : Row
-    model : str
-        Text of the model file; empty where it failed.
-    files : mapping of str to bytes
-        The report, by file name, where one was asked for.
-    seconds : float
-        That it took [s]; no part of the row, which is to be the same wherever it is made.
-    """
-
-    row: Row
-    model: str = ''
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    seconds: float = 0.0
+MARK = 'many.json'
 
 
 @dataclass(frozen=True)
 class Identify:
     """
-    The identification of one record; called without arguments, it returns an `Outcome`.
+    Identification of one record.
 
     Attributes
     ----------
-    name : str
-        Of its row.
-    path : str
-        Where it is read, by whoever does the work.
-    reading : Reading
     settings : Settings
-    report : callable, optional
-        Makes the files of a report; a function of a module, so that it can be sent.
+    reading : mapping
+        Options of `piezo_ident.read`.
     """
 
-    name: str
-    path: str
-    reading: Reading = Reading()
     settings: Settings = field(default_factory=Settings)
-    report: Callable[[Identification, Record], Mapping[str, bytes]] | None = None
+    reading: Mapping[str, Any] = field(default_factory=dict)
+    verb = 'identify'
 
-    def __call__(self) -> Outcome:
-        """Do it; whatever goes wrong is the reason of a failed row."""
-        return _attempt(self.name, self.path, self._work)
+    def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
+        """Identify a record, write its model and its report, and return its row."""
+        record = read_record(path, **self.reading)
+        result = identify(record, self.settings)
+        save_model(result.model, model_file)
+        if report is not None:
+            from piezo_ident.report import write_report
 
-    def settled(self) -> str:
-        """Return a digest of all that the result depends on, but for the record itself."""
-        return _digest(self)
-
-    def _work(self) -> Outcome:
-        record = self.reading.read(self.path)
-        found = identify(record, self.settings)
-        files = {} if self.report is None else self.report(found, record)
-        values = identified(found, record)
-        return Outcome(Row(self.name, values), model_to_yaml(found.model), files)
+            write_report(result, record, report)
+        return Row(name, identified(result, record))
 
 
 @dataclass(frozen=True)
 class Diagnose:
     """
-    The diagnosis of one record; called without arguments, it returns an `Outcome`.
+    Diagnosis of one record.
 
     Attributes
     ----------
-    name, path, reading
-        As of `Identify`.
+    models : Path
+        A model file for all records, or a folder with ``NAME.yaml`` for each, such as the folder
+        that an identification of many records wrote.
     settings : DiagnosisSettings
-    model : str
-        Text of the model file.
-    model_name : str
-        What to call it.
-    report : callable, optional
-        As of `Identify`.
+    reading : mapping
+        Options of `piezo_ident.read`.
     """
 
-    name: str
-    path: str
-    model: str
-    model_name: str
-    reading: Reading = Reading()
+    models: Path
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
-    report: Callable[[Diagnosis], Mapping[str, bytes]] | None = None
+    reading: Mapping[str, Any] = field(default_factory=dict)
+    verb = 'diagnose'
 
-    def __call__(self) -> Outcome:
-        """Do it; whatever goes wrong is the reason of a failed row."""
-        return _attempt(self.name, self.path, self._work)
+    def model_of(self, name: str) -> Path:
+        """Return the model file of a record."""
+        if not self.models.is_dir():
+            return self.models
+        inside = self.models / 'models'
+        return (inside if inside.is_dir() else self.models) / f'{name}.yaml'
 
-    def settled(self) -> str:
-        """Return a digest of all that the result depends on, but for the record itself."""
-        return _digest(self)
+    def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
+        """Diagnose a record, write the refined model and the report, and return its row."""
+        given = self.model_of(name)
+        record = read_record(path, **self.reading)
+        result = diagnose(load_model(given), record, self.settings)
+        save_model(result.model, model_file)
+        if report is not None:
+            from piezo_ident.report import write_diagnosis_report
 
-    def _work(self) -> Outcome:
-        if not self.model:
-            raise ConfigError(f'there is no model {self.model_name} for it')
-        given = model_from_dict(parse_yaml(self.model, self.model_name), self.model_name)
-        record = self.reading.read(self.path)
-        found = diagnose(given, record, self.settings)
-        files = {} if self.report is None else self.report(found)
-        values = {'model': self.model_name, **diagnosed(found, record)}
-        return Outcome(Row(self.name, values), model_to_yaml(found.model), files)
-
-
-def failed(name: str, path: str, error: BaseException) -> Outcome:
-    """Return the row of a record over which something went wrong."""
-    if isinstance(error, PiezoIdentError):
-        text = str(error)
-    elif isinstance(error, MemoryError):
-        text = 'out of memory; give fewer --jobs or shorter records'
-    elif isinstance(error, OSError):
-        text = f'cannot be read ({error.strerror or error}); check the file'
-    else:
-        text = f'{type(error).__name__}: {error}'
-    # the place is that of whoever read it; the record is named in its own column
-    for known in (f'{path}: ', f'{Path(path).name}: '):
-        text = text.removeprefix(known)
-    return Outcome(Row(name, reason=' '.join(text.split()) or type(error).__name__))
+            write_diagnosis_report(result, report)
+        return Row(name, {'model': given.name, **diagnosed(result, record)})
 
 
-def _attempt(name: str, path: str, work: Callable[[], Outcome]) -> Outcome:
-    began = time.perf_counter()
-    try:
-        done = work()
-    # one record among many must not end the run, whatever it dies of
-    except Exception as error:  # noqa: BLE001
-        done = failed(name, path, error)
-    return Outcome(done.row, done.model, done.files, time.perf_counter() - began)
+Task = Identify | Diagnose
 
 
-def _digest(job: Identify | Diagnose) -> str:
-    kept = {
-        'verb': type(job).__name__,
-        'version': __version__,
-        'reading': asdict(job.reading),
-        'settings': asdict(job.settings),
-        'model': getattr(job, 'model', ''),
-        'report': job.report is not None,
-    }
-    text = json.dumps(kept, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+@dataclass(frozen=True)
+class _Job:
+    """One record: called in the worker, it returns a row and never raises."""
+
+    task: Task
+    path: Path
+    name: str
+    folder: Path
+    report: bool
+
+    @property
+    def row_file(self) -> Path:
+        return self.folder / 'rows' / f'{self.name}.json'
+
+    @property
+    def model_file(self) -> Path:
+        return self.folder / 'models' / f'{self.name}.yaml'
+
+    @property
+    def report_folder(self) -> Path | None:
+        return self.folder / 'reports' / self.name if self.report else None
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the result depends on, apart from the record itself."""
+        task = json.loads(json.dumps(asdict(self.task), default=str))
+        return {'version': __version__, 'path': str(self.path), 'report': self.report, **task}
+
+    def earlier(self) -> Row | None:
+        """Return the row of an earlier run, None where the record has to be done again."""
+        try:
+            kept = json.loads(self.row_file.read_text(encoding='utf-8'))
+            made = self.row_file.stat().st_mtime_ns
+            inputs = [self.path, *(self.path.iterdir() if self.path.is_dir() else ())]
+            if isinstance(self.task, Diagnose):
+                inputs.append(self.task.model_of(self.name))
+            fresh = all(file.stat().st_mtime_ns < made for file in inputs)
+            whole = self.model_file.is_file() and (
+                self.report_folder is None or self.report_folder.is_dir()
+            )
+            if fresh and whole and kept['settings'] == self.settings():
+                return Row(self.name, kept['values'])
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+        return None
+
+    def __call__(self) -> Row:
+        self.row_file.unlink(missing_ok=True)
+        try:
+            row = self.task(self.path, self.name, self.model_file, self.report_folder)
+            kept = {'settings': self.settings(), 'values': row.values}
+            write_text(self.row_file, json.dumps(kept))
+        # one record must not end the run, whatever goes wrong with it
+        except Exception as error:  # noqa: BLE001
+            self.model_file.unlink(missing_ok=True)
+            return self.failed(error)
+        return row
+
+    def failed(self, error: BaseException) -> Row:
+        if isinstance(error, PiezoIdentError):
+            reason = str(error)
+        elif isinstance(error, MemoryError):
+            reason = 'out of memory; give fewer jobs or shorter records'
+        else:
+            reason = f'{type(error).__name__}: {error}'
+        for known in (f'{self.path}: ', f'{self.path.name}: '):
+            reason = reason.removeprefix(known)
+        return Row(self.name, reason=' '.join(reason.split()))
 
 
-def fingerprint(path: str) -> str:
+def run_many(
+    records: Sequence[Path],
+    folder: Path,
+    task: Task,
+    *,
+    reports: bool = False,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Row]:
     """
-    Return what changes when a record is written anew: number of files, sizes, latest change.
+    Identify or diagnose every record on its own.
+
+    A record whose results are in `folder` already, newer than the record and made with the same
+    settings, is not done again: a run that was stopped goes on with the same call.
 
     Parameters
     ----------
-    path : str
-        A file, or the folder of a bag.
+    records : sequence of path
+        Files and bags with different names.
+    folder : path
+        Gets ``models/NAME.yaml``, ``rows/NAME.json`` and, with `reports`, ``reports/NAME/``.
+    task : Identify or Diagnose
+    reports : bool, optional
+        Write a report of every record.
+    jobs : int, optional
+        Number of processes; one a core when absent.
+    scheduler : str, optional
+        Address of a dask scheduler whose workers see the same paths; `jobs` is then not used.
+    progress : callable, optional
+        Called with the number of records done and of all, some times a second; may raise to stop.
+
+    Returns
+    -------
+    list of Row
+        In the order of the names, numbers by value.
 
     Raises
     ------
-    OSError
-        When it cannot be looked at.
+    ConfigError
+        When two records have one name, `folder` holds something else, an input lies in `folder`,
+        or no scheduler answers.
+    DataError
+        When `folder` cannot be written.
     """
-    names = [entry.path for entry in os.scandir(path)] if os.path.isdir(path) else [path]
-    files = [os.stat(name) for name in names]
-    size, last = sum(f.st_size for f in files), max((f.st_mtime_ns for f in files), default=0)
-    return f'{len(files)}-{size}-{last}'
+    work = _prepare(records, folder, task, reports)
+    rows = {job.name: row for job in work if (row := job.earlier()) is not None}
+    todo = [job for job in work if job.name not in rows]
+    progress(len(rows), len(work))
+    if todo:
+        count = min(jobs or _cores(), len(todo))
+        with dask(scheduler) if scheduler else processes(count) as executor:
+            futures: dict[Future[Row], _Job] = {executor.submit(job): job for job in todo}
+            try:
+                for future in completed(futures, lambda: progress(len(rows), len(work))):
+                    job = futures[future]
+                    error = future.exception()
+                    rows[job.name] = future.result() if error is None else job.failed(error)
+            finally:
+                for future in futures:
+                    future.cancel()
+        progress(len(rows), len(work))
+    return sorted(rows.values(), key=lambda row: natural(row.record))
 
 
-def _head(record: Record) -> dict[str, Value]:
-    low, high = record.voltage_range
-    return {
-        'sample_rate': record.pieces[0].sample_rate,
-        'samples': record.n,
-        'duration': record.duration,
-        'voltage_low': low,
-        'voltage_high': high,
-        'stroke': record.stroke,
-    }
+def _prepare(records: Sequence[Path], folder: Path, task: Task, reports: bool) -> list[_Job]:
+    target = folder.resolve()
+    places: dict[str, Path] = {}
+    for record in records:
+        # the workers may have another working directory
+        path = Path(os.path.abspath(record))
+        name = path.name if path.is_dir() else path.stem
+        if name in places:
+            raise ConfigError(f'{places[name]} and {path}: both are called {name}; rename one')
+        places[name] = path
+    given = [task.model_of(name) for name in places] if isinstance(task, Diagnose) else []
+    for path in (*places.values(), *given):
+        if path.resolve().is_relative_to(target):
+            raise ConfigError(f'{folder}: holds the input {path}; choose another folder')
+    mark = folder / MARK
+    try:
+        if folder.is_dir() and any(folder.iterdir()) and _mark(mark) != task.verb:
+            raise ConfigError(f'{folder}: holds no results of {task.verb}; choose another folder')
+        for part in ('models', 'rows'):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        write_text(mark, json.dumps({'verb': task.verb}))
+    except OSError as error:
+        raise DataError(
+            f'{folder}: cannot be written ({error.strerror or error}); choose another folder'
+        ) from None
+    return [_Job(task, path, name, target, reports) for name, path in places.items()]
 
 
-def _number(value: float | None) -> float | None:
-    return float(value) if value is not None and math.isfinite(value) else None
+def _mark(path: Path) -> object:
+    try:
+        return json.loads(path.read_text(encoding='utf-8'))['verb']
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
-def identified(found: Identification, record: Record) -> dict[str, Value]:
-    """
-    Return the cells of an identification.
-
-    Parameters
-    ----------
-    found : Identification
-    record : Record
-
-    Returns
-    -------
-    dict of str to Value
-        By the columns of `piezo_ident.many.table.COLUMNS`; SI units, errors in % of stroke.
-    """
-    model = found.model
-    h, stage = model.hysteresis, character(model)
-    values: dict[str, Value] = {
-        **_head(record),
-        'method': str(model.identification['method']),
-        'error_held_out': _number(found.error('held out')),
-        'error_selection': _number(found.error('selection')),
-        'error_fitted': _number(found.error('fitted')),
-        'noise_floor': _number(found.noise_floor),
-        'gain': stage.gain,
-        'loop_width': stage.loop_width,
-        'delay': model.delay.total / model.sample_rate,
-        'delay_samples': model.delay.total,
-        'delay_std': _number(found.delay.std),
-        'bandwidth': stage.bandwidth,
-        'resonance': stage.resonance,
-        'resonance_peak': stage.peak,
-        'order_a': model.dynamics.a.size,
-        'order_b': model.dynamics.b.size,
-        'p1': h.p1,
-        'p2': h.p2,
-    }
-    for i, (r, q) in enumerate(zip(h.thresholds, h.weights, strict=True), 1):
-        values[f'r{i}'], values[f'q{i}'] = float(r), float(q)
-    values['warnings'] = _joined(found.warnings)
-    return values
-
-
-def diagnosed(found: Diagnosis, record: Record) -> dict[str, Value]:
-    """
-    Return the cells of a diagnosis.
-
-    Parameters
-    ----------
-    found : Diagnosis
-    record : Record
-
-    Returns
-    -------
-    dict of str to Value
-        By the columns of `piezo_ident.many.table.COLUMNS`, and for every effect that was added
-        ``<effect>.share``, ``<effect>.rms`` and its parameters, in the units of the catalogue.
-    """
-    values: dict[str, Value] = {
-        **_head(record),
-        'verdict': found.verdict,
-        'effects': ' '.join(effect.name for effect in found.effects),
-        'alike': '' if found.group is None else ' '.join(found.group.names),
-        'error_before': _number(found.before.overall),
-        'error_refit': _number(found.refit.overall),
-        'error_after': _number(found.after.overall),
-        'unexplained': _number(found.unexplained.rms_percent),
-        'noise_floor': _number(found.noise_floor),
-        'smallest_detectable': _number(found.smallest_detectable),
-    }
-    for effect in found.effects:
-        values[f'{effect.name}.share'] = _number(effect.share)
-        values[f'{effect.name}.rms'] = _number(effect.rms_percent)
-        for name, parameter in effect.parameters.items():
-            values.update(_cells(f'{effect.name}.{name}', parameter.value))
-    values['faults'] = _joined(found.faults)
-    values['warnings'] = _joined(found.warnings)
-    return values
-
-
-def _cells(column: str, value: float | str | tuple[float, ...]) -> dict[str, Value]:
-    if isinstance(value, str):
-        return {column: value}
-    if isinstance(value, tuple):
-        return {f'{column}.{i}': _number(x) for i, x in enumerate(value, 1)}
-    return {column: _number(value)}
-
-
-def _joined(items: Iterable[object]) -> str:
-    # lines would make a table hard to read elsewhere
-    return ' | '.join(' '.join(str(x).split()) for x in items)
+def _cores() -> int:
+    # what a container or a batch system leaves us, where that can be known
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

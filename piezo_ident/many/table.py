@@ -1,32 +1,69 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The table of many records: one row each, CSV for everybody, Parquet where pyarrow is installed.
-
-The same rows give the same bytes of CSV, in whatever order they were made.
-"""
+"""The table of many records: one row a record, written as CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import csv
-from dataclasses import dataclass
-import importlib.util
+from dataclasses import dataclass, field
 import io
+import math
 from pathlib import Path
 import re
 from typing import Any
 
-from piezo_ident.common.files import temporary_output
-from piezo_ident.many.run import Row, Value
+from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.identification.results import Identification
+from piezo_ident.many.figures_of_merit import figures_of_merit
+from piezo_ident.model.files import write_text
+from piezo_ident.record.record import Record
 
-__all__ = ['COLUMNS', 'Column', 'columns_of', 'csv_text', 'natural', 'unit_of', 'write_tables']
+__all__ = [
+    'COLUMNS',
+    'Row',
+    'Value',
+    'columns_of',
+    'csv_text',
+    'diagnosed',
+    'identified',
+    'natural',
+    'unit_of',
+    'write_table',
+]
+
+#: content of a cell
+Value = str | float | int | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    A line of the table.
+
+    Attributes
+    ----------
+    record : str
+    values : mapping of str to Value
+        By column; empty where the record failed.
+    reason : str
+        Why it failed, in one line; empty where it did not.
+    """
+
+    record: str
+    values: Mapping[str, Value] = field(default_factory=dict)
+    reason: str = ''
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the record carried a result."""
+        return not self.reason
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: unit ('' for text and plain numbers), and what it holds."""
+    """A column: unit ('' for text and plain numbers) and content."""
 
     unit: str
     about: str
@@ -105,9 +142,9 @@ def unit_of(column: str) -> str:
 
 def columns_of(rows: Iterable[Row]) -> list[str]:
     """Return the columns that these rows need, in the order of the table."""
-    found = {name for row in rows for name in row.values}
-    known = [name for name in COLUMNS if name in ('record', 'status', 'reason') or name in found]
-    others = sorted(found - set(COLUMNS), key=_place)
+    present = {name for row in rows for name in row.values}
+    known = [name for name in COLUMNS if name in ('record', 'status', 'reason') or name in present]
+    others = sorted(present - set(COLUMNS), key=_place)
     first = [name for name in known if name not in _LAST]
     return [*first, *others, *(name for name in known if name in _LAST)]
 
@@ -121,99 +158,153 @@ def _place(column: str) -> tuple[Any, ...]:
     return 1, effect, name not in FOUND, natural(name)
 
 
-def _cells(row: Row) -> dict[str, Value]:
-    status = 'ok' if row.good else 'failed'
-    return {**row.values, 'record': row.record, 'status': status, 'reason': row.reason}
-
-
-def _text(value: Value) -> str:
-    if isinstance(value, float):
-        # as short as it can be for the same number to be read back
-        return repr(value)
-    return '' if value is None else str(value)
-
-
-def _sorted(rows: Iterable[Row]) -> list[Row]:
-    return sorted(rows, key=lambda row: natural(row.record))
-
-
-def csv_text(rows: Iterable[Row]) -> str:
+def csv_text(rows: Sequence[Row]) -> str:
     """
-    Return the table as CSV, a row a record in the order of their names.
+    Return the table as CSV; a cell without a value is empty.
 
-    Parameters
-    ----------
-    rows : iterable of Row
+    Text that a spreadsheet would run as a formula gets an apostrophe in front.
 
-    Returns
-    -------
-    str
-        An empty cell where there is no value.
+    Examples
+    --------
+    >>> print(csv_text([Row('=1+1', {'delay': 0.25}), Row('b', reason='empty file')]), end='')
+    record,status,reason,delay
+    '=1+1,ok,,0.25
+    b,failed,empty file,
     """
-    ordered = _sorted(rows)
-    columns = columns_of(ordered)
+    columns = columns_of(rows)
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator='\n')
-    writer.writerow(columns)
-    for row in ordered:
-        cells = _cells(row)
+    writer.writerow(map(_text, columns))
+    for row in rows:
+        status = 'ok' if row.is_good else 'failed'
+        cells = {**row.values, 'record': row.record, 'status': status, 'reason': row.reason}
         writer.writerow([_text(cells.get(name)) for name in columns])
     return buffer.getvalue()
 
 
-def write_tables(rows: Sequence[Row], folder: Path) -> list[Path]:
+def _text(value: Value) -> str:
+    if isinstance(value, str):
+        return f"'{value}" if value.startswith(('=', '+', '-', '@', '\t', '\r')) else value
+    # the shortest text from which the same number is read
+    return '' if value is None else repr(value)
+
+
+def write_table(rows: Sequence[Row], path: Path) -> None:
     """
-    Write ``records.csv``, and ``records.parquet`` where pyarrow is installed.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-    folder : path
-        Is there.
-
-    Returns
-    -------
-    list of Path
-        What was written.
+    Write the table as a CSV file.
 
     Raises
     ------
     DataError
-        When the folder cannot be written.
+        When the file cannot be written.
     """
-    written = [folder / 'records.csv']
-    with temporary_output(written[0], overwrite=True) as target:
-        target.write_text(csv_text(rows), encoding='utf-8', errors='replace')
-    other = folder / 'records.parquet'
-    if importlib.util.find_spec('pyarrow') is not None:
-        with temporary_output(other, overwrite=True) as target:
-            _write_parquet(_sorted(rows), target)
-        written.append(other)
-    elif other.exists():
-        # one of another run would contradict the CSV
-        other.unlink()
-    return written
+    # file names need not be Unicode
+    write_text(path, csv_text(rows).encode('utf-8', 'replace').decode('utf-8'))
 
 
-def _write_parquet(rows: Sequence[Row], path: Path) -> None:
-    import pyarrow
-    import pyarrow.parquet
+def _head(record: Record) -> dict[str, Value]:
+    low, high = record.voltage_range
+    return {
+        'sample_rate': record.pieces[0].sample_rate,
+        'samples': record.n,
+        'duration': record.duration,
+        'voltage_low': low,
+        'voltage_high': high,
+        'stroke': record.stroke,
+    }
 
-    cells = [_cells(row) for row in rows]
-    arrays, fields = [], []
-    for name in columns_of(rows):
-        values = [cell.get(name) for cell in cells]
-        kinds = {type(value) for value in values if value is not None}
-        if str in kinds:
-            kind = pyarrow.string()
-            # file names need not be Unicode
-            values = [
-                None if v is None else _text(v).encode('utf-8', 'replace').decode() for v in values
-            ]
-        else:
-            kind = pyarrow.int64() if kinds == {int} else pyarrow.float64()
-        arrays.append(pyarrow.array(values, kind))
-        unit = unit_of(name)
-        fields.append(pyarrow.field(name, kind, metadata={'unit': unit} if unit else None))
-    table = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields))
-    pyarrow.parquet.write_table(table, path)
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def identified(result: Identification, record: Record) -> dict[str, Value]:
+    """
+    Return the cells of an identification.
+
+    Parameters
+    ----------
+    result : Identification
+    record : Record
+
+    Returns
+    -------
+    dict of str to Value
+        By the columns of `COLUMNS`; SI units, errors in % of stroke.
+    """
+    model = result.model
+    h, stage = model.hysteresis, figures_of_merit(model)
+    values: dict[str, Value] = {
+        **_head(record),
+        'method': str(model.identification['method']),
+        'error_held_out': _number(result.error('held out')),
+        'error_selection': _number(result.error('selection')),
+        'error_fitted': _number(result.error('fitted')),
+        'noise_floor': _number(result.noise_floor),
+        'gain': stage.gain,
+        'loop_width': stage.loop_width,
+        'delay': model.delay.total / model.sample_rate,
+        'delay_samples': model.delay.total,
+        'delay_std': _number(result.delay.std),
+        'bandwidth': stage.bandwidth,
+        'resonance': stage.resonance,
+        'resonance_peak': stage.peak,
+        'order_a': model.dynamics.a.size,
+        'order_b': model.dynamics.b.size,
+        'p1': h.p1,
+        'p2': h.p2,
+    }
+    for i, (r, q) in enumerate(zip(h.thresholds, h.weights, strict=True), 1):
+        values[f'r{i}'], values[f'q{i}'] = float(r), float(q)
+    values['warnings'] = _joined(result.warnings)
+    return values
+
+
+def diagnosed(result: Diagnosis, record: Record) -> dict[str, Value]:
+    """
+    Return the cells of a diagnosis.
+
+    Parameters
+    ----------
+    result : Diagnosis
+    record : Record
+
+    Returns
+    -------
+    dict of str to Value
+        By the columns of `COLUMNS`, and for every effect that was added
+        ``<effect>.share``, ``<effect>.rms`` and its parameters, in the units of the catalogue.
+    """
+    values: dict[str, Value] = {
+        **_head(record),
+        'verdict': result.verdict,
+        'effects': ' '.join(effect.name for effect in result.effects),
+        'alike': '' if result.group is None else ' '.join(result.group.names),
+        'error_before': _number(result.before.overall),
+        'error_refit': _number(result.refit.overall),
+        'error_after': _number(result.after.overall),
+        'unexplained': _number(result.unexplained.rms_percent),
+        'noise_floor': _number(result.noise_floor),
+        'smallest_detectable': _number(result.smallest_detectable),
+    }
+    for effect in result.effects:
+        values[f'{effect.name}.share'] = _number(effect.share)
+        values[f'{effect.name}.rms'] = _number(effect.rms_percent)
+        for name, parameter in effect.parameters.items():
+            values.update(_cells(f'{effect.name}.{name}', parameter.value))
+    values['faults'] = _joined(result.faults)
+    values['warnings'] = _joined(result.warnings)
+    return values
+
+
+def _cells(column: str, value: float | str | tuple[float, ...]) -> dict[str, Value]:
+    if isinstance(value, str):
+        return {column: value}
+    if isinstance(value, tuple):
+        return {f'{column}.{i}': _number(x) for i, x in enumerate(value, 1)}
+    return {column: _number(value)}
+
+
+def _joined(items: Iterable[object]) -> str:
+    # lines would make a table hard to read elsewhere
+    return ' | '.join(' '.join(str(x).split()) for x in items)

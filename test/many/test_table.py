@@ -1,0 +1,52 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The table and the picture of many records."""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+from piezo_ident.many.figures import QUANTITIES, spread_figure, values_of
+from piezo_ident.many.table import COLUMNS, columns_of, csv_text, Row
+import pytest
+
+ROWS = [
+    Row('a', {'stroke': 7e-5, 'q1': 0.5, 'r1': 0.1, 'creep.share': 0.9, 'warnings': ''}),
+    Row('b', {'stroke': 7.5e-5, 'q2': 0.25, 'r2': 0.2}),
+    Row('c', reason='no displacement'),
+]
+
+
+def test_columns_keep_their_order():
+    known = ['record', 'status', 'reason', 'stroke']
+    assert columns_of(ROWS) == [*known, 'r1', 'q1', 'r2', 'q2', 'creep.share', 'warnings']
+
+
+def test_numbers_are_read_back_exactly():
+    lines = list(csv.DictReader(io.StringIO(csv_text(ROWS))))
+    assert float(lines[0]['stroke']) == 7e-5
+    assert lines[2]['status'] == 'failed' and lines[2]['stroke'] == ''
+
+
+@pytest.mark.parametrize('name', ['=cmd|x', '+1', '-1', '@a', '\ta'])
+def test_a_name_is_no_formula_of_a_spreadsheet(name):
+    (line,) = csv.DictReader(io.StringIO(csv_text([Row(name, {'stroke': -1.0})])))
+    assert line['record'] == f"'{name}"
+    assert float(line['stroke']) == -1.0
+
+
+def test_the_picture_shows_every_quantity_that_differs():
+    trace = spread_figure(ROWS).axes[0]
+    (points,) = (line for line in trace.lines if line.get_marker() == 'o')
+    np.testing.assert_allclose(np.asarray(points.get_ydata())[:2], [70.0, 75.0])
+    stroke = next(q for q in QUANTITIES if q.column == 'stroke')
+    assert np.isnan(values_of(ROWS, stroke)[2])
+
+
+def test_every_column_is_in_the_documentation():
+    page = Path(__file__).resolve().parents[2] / 'docs/many_records.md'
+    text = page.read_text(encoding='utf-8')
+    for name, column in COLUMNS.items():
+        assert f'| `{name}` | {column.unit} |' in text
