@@ -37,7 +37,7 @@ from piezo_ident.identification.step2_dynamics import (
 )
 from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.record.record import Record
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
@@ -54,11 +54,11 @@ Work = Callable[[int], object]
 
 def record_of_17_s() -> Record:
     """Return what the simulated stage answers to the programme."""
-    stage = load_stage(find_config('paper', 'stage'))
+    stage = SimulatedStage.load('paper')
     path = Path(find_config('identification', 'program'))
     text = path.read_text(encoding='utf-8').replace('slope: 6}', f'slope: {SLOPE}}}')
     sequence = parse_program(text, path.name).build(stage.model.sample_rate)
-    return simulate(stage, sequence, np.random.default_rng(0))
+    return stage.play(sequence, np.random.default_rng(0))
 
 
 def whole(record: Record, runs: int) -> tuple[str, str]:

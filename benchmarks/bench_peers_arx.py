@@ -28,8 +28,7 @@ from typing import Any
 import warnings
 
 import numpy as np
-from piezo_ident.common.config import find_config
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.solvers.output_error import output_error, Stretch
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
@@ -38,7 +37,7 @@ from piezo_ident.identification.step2_dynamics import (
     scan_orders,
     stabilised,
 )
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Dynamics
 from scipy.signal import lfilter
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
@@ -84,9 +83,9 @@ class Data:
 @cache
 def data_of(turn: int) -> Data:
     """Return the noise segment of the paper's stage with the sensor noise of a turn."""
-    stage = load_stage(find_config('paper', 'stage'))
-    program = load_program(find_config('identification', 'program'))
-    record = simulate(stage, program.build(20_000.0), np.random.default_rng(turn))
+    stage = SimulatedStage.load('paper')
+    program = Program.load('identification')
+    record = stage.play(program.build(20_000.0), np.random.default_rng(turn))
     piece = record.pieces[0]
     (segment,) = piece.find('noise')
     cut, scaling = slice(segment.start, segment.stop), stage.model.scaling

@@ -18,8 +18,7 @@ import sys
 import warnings
 
 import numpy as np
-from piezo_ident.common.config import find_config
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
@@ -34,7 +33,7 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
 
     warnings.filterwarnings('ignore', module='control')
     runs, n = (2, 20_000) if quick else (5, 200_000)
-    model = load_stage(find_config('paper', 'stage')).model
+    model = SimulatedStage.load('paper').model
     v = 5.0 + 5.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE)
     piece, w = Piece(v, np.zeros(n), RATE), model.hysteresis(model.scaling.u(v))
     G, d = model.dynamics, model.delay.samples

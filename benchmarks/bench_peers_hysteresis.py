@@ -34,12 +34,11 @@ import warnings
 
 from numba import njit
 import numpy as np
-from piezo_ident.common.config import find_config
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Record
 from side_by_side import markdown, seconds, take_turns, Turn, versions
@@ -449,14 +448,14 @@ this frequency alone, as the next table shows, and neither finds a delay or a re
 
 def other_motions(quick: bool) -> str:
     """Return the section on the simulated stage."""
-    stage = load_stage(find_config('dense', 'stage'))
+    stage = SimulatedStage.load('dense')
     rate = stage.model.sample_rate
 
     def program(name: str) -> Any:
-        return load_program(find_config(name, 'program')).build(rate)
+        return Program.load(name).build(rate)
 
-    record = simulate(stage, program('identification'), np.random.default_rng(0))
-    truth = simulate_truth(stage, program('minor_loops'))
+    record = stage.play(program('identification'), np.random.default_rng(0))
+    truth = stage.ideal.play(program('minor_loops'))
     (piece,), (loops,) = record.pieces, truth.pieces
     (triangle,) = piece.find('triangle')
     stroke = np.ptp(loops.y)

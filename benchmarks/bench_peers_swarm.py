@@ -26,8 +26,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.config import find_config
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import prepare
 from piezo_ident.identification.solvers.least_squares import bounded_least_squares
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
@@ -39,7 +38,7 @@ from piezo_ident.identification.step3_hysteresis import (
     WEIGHT_BOX,
 )
 from piezo_ident.identification.three_steps import triangle_excerpts
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from scipy.optimize import Bounds, differential_evolution
 from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
 
@@ -72,9 +71,9 @@ class Problem:
 
 def problem() -> Problem:
     """Return the third step of the identification of the paper's stage."""
-    stage = load_stage(find_config('paper', 'stage'))
-    sequence = load_program(find_config('identification', 'program')).build(20_000.0)
-    record = simulate(stage, sequence, np.random.default_rng(0))
+    stage = SimulatedStage.load('paper')
+    sequence = Program.load('identification').build(20_000.0)
+    record = stage.play(sequence, np.random.default_rng(0))
     excerpts = triangle_excerpts(prepare([record]).runs)
     r = even_thresholds(max(float(np.ptp(e.u[e.use])) for e in excerpts), OPERATORS)
     R = factorise(excerpts, r, stage.model.dynamics.normalised(), stage.model.delay)

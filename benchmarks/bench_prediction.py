@@ -25,10 +25,10 @@ import sys
 
 from numba import njit
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.live.predictor import Predictor
-from piezo_ident.model.simulated_stage import load_stage
-from piezo_ident.model.stage_model import CHUNK, EffectSetting, StageModel
+from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
@@ -335,7 +335,7 @@ def voltage(model: StageModel, n: int) -> np.ndarray:
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
-    model = load_stage(find_config('paper', 'stage')).model
+    model = SimulatedStage.load('paper').model
     runs = 3 if quick else RUNS
     return [
         whole_record(model, 300_000 if quick else 4_000_000, runs),

@@ -30,11 +30,10 @@ from bench_identification import record_of_17_s
 from bench_prediction import BLOCK, fused_plays, voltage
 from numba import njit
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.identification.filtered_plays import filtered_plays
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.solvers.output_error import _Problem, Stretch
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
@@ -251,7 +250,7 @@ def silenced(work: Callable[[], object]) -> Callable[[int], None]:
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
-    model = load_stage(find_config('paper', 'stage')).model
+    model = SimulatedStage.load('paper').model
     runs = 3 if quick else RUNS
     return [
         of_identification(),

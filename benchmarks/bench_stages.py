@@ -25,10 +25,8 @@ import time
 
 from bench_live import Fetcher, machine, RATE, Shares, sine
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.model.files import save_model
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.starter import Nodes
 
 SIZES = (20, 50, 100, 200, 500, 1000)
@@ -60,7 +58,7 @@ class Bench:
     def __init__(self, client, folder: Path, seconds: float) -> None:
         self.client, self.folder, self.seconds = client, folder, seconds
         self.model = folder / 'model.yaml'
-        save_model(load_stage(find_config('paper', 'stage')).model, self.model)
+        SimulatedStage.load('paper').model.save(self.model)
 
     def play(
         self, spaces: list[str], size: int, composed: tuple[str, ...] = (), *, read: bool = True

@@ -19,9 +19,7 @@ import time
 
 import numpy as np
 from piezo_ident.cli import main as piezo_ident
-from piezo_ident.common.config import find_config
-from piezo_ident.model.files import save_model
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.bags.read import read_bag, typestore, write_bag
 from piezo_ident.record.bags.recover import opened_bag
@@ -37,7 +35,7 @@ Measure = tuple[float, float]
 
 def paper() -> StageModel:
     """Return the paper's stage."""
-    return load_stage(find_config('paper', 'stage')).model
+    return SimulatedStage.load('paper').model
 
 
 def sine(n: int, model: StageModel) -> Piece:
@@ -102,7 +100,7 @@ def converting(suffix: str) -> Callable[[float, Path], Measure]:
 def predicting(size: float, folder: Path) -> Measure:
     """Measure ``piezo_ident predict MODEL BAG --out OUT.npz``."""
     model = folder / 'paper.yaml'
-    save_model(paper(), model)
+    paper().save(model)
     return _command(
         size, folder, lambda bag, out: ['predict', str(model), bag, '--out', out], 'out.npz'
     )

@@ -22,13 +22,12 @@ import time
 from growth_of_bags import Measure, RATE
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis.beginnings import rest_of
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.files import load
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from side_by_side import last_line, markdown, peak_memory, seconds
@@ -59,8 +58,8 @@ segments:
 def labelled(times: float) -> Record:
     """Return the identification record with noise, steps and triangle so many times as long."""
     text = PROGRAM.format(steps=2 * round(8 * times), noise=5 * times, slope=6 / times)
-    stage = load_stage(find_config('paper', 'stage'))
-    return simulate(stage, parse_program(text).build(RATE), np.random.default_rng(0))
+    stage = SimulatedStage.load('paper')
+    return stage.play(parse_program(text).build(RATE), np.random.default_rng(0))
 
 
 def identifying(size: float, folder: Path) -> Measure:
@@ -114,12 +113,12 @@ def base_model(folder: Path, seed: int = 1) -> StageModel:
     path = folder / 'base.yaml'
     if not path.exists():
         stage = make_stage(EFFECT, SIZE, seed, noise='white')
-        sequence = load_program(find_config('identification', 'program')).build(RATE)
+        sequence = Program.load('identification').build(RATE)
         t = np.arange(sequence.n) / RATE
         y = stage.respond(t, sequence.v, changed=False, channels=None)
         piece = Piece(sequence.v, y, RATE, segments=tuple(sequence.segments))
-        save_model(identify(Record((piece,), 'identification')).model, path)
-    return load_model(path)
+        identify(Record((piece,), 'identification')).model.save(path)
+    return load(path)
 
 
 def diagnosing(size: float, folder: Path) -> Measure:

@@ -30,12 +30,11 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from tqdm import tqdm
@@ -150,9 +149,7 @@ def measured(
     def other(t: np.ndarray, number: int) -> dict[str, np.ndarray] | None:
         return {'other': other_axis(t, np.random.default_rng(number))} if coupled else None
 
-    sequence = load_program(find_config('program_identification.yaml', 'program')).build(
-        sample_rate=RATE
-    )
+    sequence = Program.load('program_identification.yaml').build(sample_rate=RATE)
     t = np.arange(sequence.n) / RATE
     y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
@@ -176,7 +173,7 @@ def judged(case: Case) -> Row:
         start = time.perf_counter()
         result = diagnose(model, record, DiagnosisSettings(without=case.without))
         spent = time.perf_counter() - start
-        errors = [predict_record(m, unseen).whole.percent for m in (model, result.model)]
+        errors = [free_run(m, unseen).errors.percent for m in (model, result.model)]
         return Row(
             key=case.key,
             verdict=result.verdict,

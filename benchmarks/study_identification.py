@@ -24,14 +24,13 @@ import sys
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.common.config import find_config
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.model.free_run import free_run, sine_errors
 from piezo_ident.model.metrics import percent_of_stroke
-from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth, SimulatedStage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import sine_errors
 from piezo_ident.record.record import Record
 import scipy
 from tqdm import tqdm
@@ -42,14 +41,14 @@ NOISES = (1e-5, 1e-4, 5e-4)
 
 def record_of(stage: SimulatedStage, program: str, seed: int) -> Record:
     """Return what the stage answers to a shipped programme, with its noise."""
-    sequence = load_program(find_config(program, 'program')).build(stage.model.sample_rate)
-    return simulate(stage, sequence, np.random.default_rng(seed))
+    sequence = Program.load(program).build(stage.model.sample_rate)
+    return stage.play(sequence, np.random.default_rng(seed))
 
 
 def truth_of(stage: SimulatedStage, program: str) -> Record:
     """Return the same without noise and converters."""
-    sequence = load_program(find_config(program, 'program')).build(stage.model.sample_rate)
-    return simulate_truth(stage, sequence)
+    sequence = Program.load(program).build(stage.model.sample_rate)
+    return stage.ideal.play(sequence)
 
 
 def with_noise(stage: SimulatedStage, share: float) -> SimulatedStage:
@@ -61,7 +60,7 @@ def with_noise(stage: SimulatedStage, share: float) -> SimulatedStage:
 def minor_loop_error(model: StageModel, truth: Record) -> float:
     """Return the error over all minor loops and decaying triangles."""
     y = np.concatenate([p.y for p in truth])
-    return percent_of_stroke(y, np.concatenate(model.predict(truth).pieces))
+    return percent_of_stroke(y, free_run(model, truth).predicted)
 
 
 def seeds_table(stage: SimulatedStage) -> list[str]:
@@ -120,7 +119,7 @@ def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
 def main() -> None:
     """Write the study to the file named on the command line."""
     target = Path(sys.argv[1])
-    paper, dense = (load_stage(find_config(name, 'stage')) for name in ('paper', 'dense'))
+    paper, dense = (SimulatedStage.load(name) for name in ('paper', 'dense'))
     noise = paper.sensor.noise_rms / abs(paper.model.scaling.Y)
     text = [
         '# How well simulated stages are identified',

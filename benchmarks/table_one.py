@@ -23,15 +23,14 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import diagnose
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
+from piezo_ident.model.free_run import sine_errors
 from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import sine_errors
 from piezo_ident.record.record import Piece, Record, Segment
 from truths import table_one_sines
 from truths.table_one import table_one_stage
@@ -104,9 +103,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('out', type=Path)
     out = parser.parse_args().out
-    sequence = load_program(find_config('program_identification', 'program')).build(
-        sample_rate=RATE
-    )
+    sequence = Program.load('program_identification').build(sample_rate=RATE)
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
     record = record_of(sequence.v, labels, 'identification', 1)
     model = identify(record, Settings(thresholds=10)).model

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from piezo_ident.identification.identify import identify
     from piezo_ident.identification.results import Identification, Settings
     from piezo_ident.live.guard import Guard, GuardSettings
-    from piezo_ident.model.files import load_model as load
-    from piezo_ident.model.free_run import predict_record as free_run
+    from piezo_ident.model.files import load
+    from piezo_ident.model.free_run import free_run, FreeRun
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
     from piezo_ident.record.io import read_record as read
@@ -53,6 +53,7 @@ _HOMES = {
     'DataError': 'common.errors',
     'Diagnosis': 'diagnosis.results',
     'DiagnosisSettings': 'diagnosis.results',
+    'FreeRun': 'model.free_run',
     'Guard': 'live.guard',
     'GuardSettings': 'live.guard',
     'Identification': 'identification.results',
@@ -66,9 +67,9 @@ _HOMES = {
     'StageModel': 'model.stage_model',
     'diagnose': 'diagnosis.procedure',
     'effects': 'effects',
-    'free_run': 'model.free_run:predict_record',
+    'free_run': 'model.free_run',
     'identify': 'identification.identify',
-    'load': 'model.files:load_model',
+    'load': 'model.files',
     'read': 'record.io:read_record',
     'write': 'record.io:write_record',
     'write_report': 'report.folder',
@@ -80,6 +81,7 @@ __all__ = [
     'DataError',
     'Diagnosis',
     'DiagnosisSettings',
+    'FreeRun',
     'Guard',
     'GuardSettings',
     'Identification',

@@ -20,8 +20,8 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
-from piezo_ident.model.validation import sine_frequency
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Fault, Piece, Record, Segment

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from piezo_ident.effects import find_effect, View
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[1]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 H = PAPER.hysteresis
 
 #: a setting of each effect that can be seen

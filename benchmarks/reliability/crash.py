@@ -38,10 +38,9 @@ import warnings
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from piezo_ident.cli import main as piezo_ident
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.files import load
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.figures import draw  # noqa: F401 - loaded once, not in every copy
@@ -87,9 +86,9 @@ def _record(n: int, seed: int) -> Record:
 
 def _save(model: Path) -> Callable[[Path], int]:
     def run(folder: Path) -> int:
-        loaded = load_model(model)
+        loaded = load(model)
         for _ in range(100):
-            save_model(loaded, folder / 'model.yaml')
+            loaded.save(folder / 'model.yaml')
         return 0
 
     return run
@@ -97,7 +96,7 @@ def _save(model: Path) -> Callable[[Path], int]:
 
 def _report(model: Path) -> Callable[[Path], int]:
     def run(folder: Path) -> int:
-        loaded = load_model(model)
+        loaded = load(model)
         shown = [('loops', 'loops', '', bytes(300_000))]
         texts = {'report.html': '<p>' + 'x' * 300_000, 'identification.json': '{}\n'}
         for _ in range(40):
@@ -119,7 +118,7 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
         Whether identifications and diagnoses are among it.
     """
     stage, record = inputs / 'model.yaml', inputs / 'record.npz'
-    save_model(load_stage(find_config('stage_paper', 'stage')).model, stage)
+    SimulatedStage.load('stage_paper').model.save(stage)
     write_record(_record(60_000, 1), record, overwrite=True)
 
     def command(*words: object) -> Callable[[Path], int]:

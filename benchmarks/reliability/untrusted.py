@@ -32,8 +32,8 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
-from piezo_ident.model.free_run import predict_record
-from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Piece, Record
@@ -90,7 +90,7 @@ def stage() -> SimulatedStage:
 def measured(programme: str) -> Record:
     """Return what the stage answers to a programme."""
     sequence = parse_program(programme).build(RATE)
-    return simulate(stage(), sequence, np.random.default_rng(0))
+    return stage().play(sequence, np.random.default_rng(0))
 
 
 @cache
@@ -192,7 +192,7 @@ def _identify(record: Record) -> str:
     found = identify(record, SETTINGS)
     if not _finite(found.model):
         return 'NOT FINITE'
-    error = predict_record(found.model, record).whole.percent
+    error = free_run(found.model, record).errors.percent
     missing = ', '.join(what for what, _ in found.not_identified)
     warned = ', warns' if found.warnings or record.faults else ''
     lacking = f', not identified: {missing}' if missing else ''
@@ -200,11 +200,11 @@ def _identify(record: Record) -> str:
 
 
 def _predict(record: Record) -> str:
-    free_run = predict_record(stage().model, record)
-    said = ', warns' if free_run.prediction.warnings else ''
-    if not all(np.all(np.isfinite(y)) for y in free_run.prediction.pieces):
+    run = free_run(stage().model, record)
+    said = ', warns' if run.warnings else ''
+    if not np.all(np.isfinite(run.predicted)):
         return 'NOT FINITE'
-    return f'errs by {free_run.whole.percent:.2g} % of stroke{said}'
+    return f'errs by {run.errors.percent:.2g} % of stroke{said}'
 
 
 def _diagnose(record: Record) -> str:

@@ -52,15 +52,14 @@ def make_data(path: Path, *, quick: bool) -> None:
         write_record(untrusted.measured(programme), path / 'identification.npz')
         write_record(untrusted.measured(untrusted.CHECK), path / 'validation.npz')
         return
-    from piezo_ident.common.config import find_config
-    from piezo_ident.excitation.program import load_program
-    from piezo_ident.model.simulated_stage import load_stage, simulate
+    from piezo_ident.excitation.program import Program
+    from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.record.io import write_record
 
-    stage = load_stage(find_config('stage_paper', 'stage'))
+    stage = SimulatedStage.load('stage_paper')
     for name in ('identification', 'validation'):
-        sequence = load_program(find_config(name, 'program')).build(stage.model.sample_rate)
-        record = simulate(stage, sequence, np.random.default_rng(1))
+        sequence = Program.load(name).build(stage.model.sample_rate)
+        record = stage.play(sequence, np.random.default_rng(1))
         write_record(record, path / f'{name}.npz')
 
 
@@ -70,6 +69,7 @@ def measure(path: Path) -> None:
     from piezo_ident.identification.identify import identify
     from piezo_ident.identification.results import Settings
     from piezo_ident.model.files import model_to_dict
+    from piezo_ident.model.free_run import free_run
     from piezo_ident.record.io import read_record
     import scipy
 
@@ -86,7 +86,7 @@ def measure(path: Path) -> None:
             'p': [data['hysteresis']['p1'], data['hysteresis']['p2']],
             'a': data['dynamics']['a'],
             'b': data['dynamics']['b'],
-            'prediction': np.concatenate(model.predict(check).pieces)[::97].tolist(),
+            'prediction': free_run(model, check).predicted[::97].tolist(),
         }
     print(
         json.dumps(

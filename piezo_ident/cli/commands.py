@@ -18,8 +18,8 @@ from piezo_ident.cli.model_commands import identify_command, predict_command
 from piezo_ident.cli.outputs import check_apart, check_folder, check_link
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.excitation.program import load_program
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.excitation.program import Program
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.io import write_record
 from piezo_ident.record.long_record import LongRecord
 from piezo_ident.record.record import Record
@@ -49,7 +49,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
         files[kind] = find_config(name, kind)
         if Path(name).suffix and not Path(name).is_file():
             console.note(f'{name} is not here; taking the shipped {files[kind]}')
-    stage, program = load_stage(files['stage']), load_program(files['program'])
+    stage, program = SimulatedStage.load(files['stage']), Program.load(files['program'])
     rate = stage.model.sample_rate if args.sample_rate is None else args.sample_rate
     if not stage.model.is_static and rate != stage.model.sample_rate:
         raise ConfigError(
@@ -58,7 +58,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
         )
     seed = stage.seed if args.seed is None else args.seed
     sequence = program.build(rate)
-    record = simulate(stage, sequence, np.random.default_rng(seed), name=out.name)
+    record = stage.play(sequence, np.random.default_rng(seed), name=out.name)
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
     with interrupts.waiting():

@@ -17,15 +17,13 @@ import time
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.free_run import free_run, sine_errors, SineError
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.simulated_stage import load_stage, simulate, SimulatedStage
-from piezo_ident.model.validation import sine_errors, SineError
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.starter import rclpy_is_there
 from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Record
@@ -147,7 +145,7 @@ def _on_the_graph(
 
 def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineError, ...]]:
     console.say('   the same, without nodes')
-    stage = load_stage(find_config('stage_paper', 'stage'))
+    stage = SimulatedStage.load('stage_paper')
     record = _play(stage, 'identification', 1)
     found = _identify('ten thresholds', record, Settings(thresholds=10), console)
     played = _play(stage, 'validation', 2)
@@ -156,7 +154,7 @@ def _offline(out: Path, console: Console) -> tuple[Identification, tuple[SineErr
 
 
 def _dense_stage(out: Path, console: Console) -> None:
-    stage = load_stage(find_config('stage_dense', 'stage'))
+    stage = SimulatedStage.load('stage_dense')
     console.say('2. A harder stage: forty thresholds, none of them where the fit puts its own')
     record = _play(stage, 'identification', 3)
     sines, loops = _play(stage, 'validation', 4), _play(stage, 'minor_loops', 5)
@@ -170,7 +168,7 @@ def _dense_stage(out: Path, console: Console) -> None:
     for name, found in (('ten', ten), ('chosen', chosen)):
         count = found.hysteresis.hysteresis.thresholds.size
         errors = _percents(sine_errors(found.model, sines))
-        loop = predict_record(found.model, loops).whole.percent
+        loop = free_run(found.model, loops).errors.percent
         console.say(_row(f'{name} thresholds ({count} fitted)', [*errors, loop]))
     console.say()
 
@@ -214,8 +212,8 @@ def _lacking(out: Path, console: Console) -> str:
 
 
 def _play(stage: SimulatedStage, program: str, seed: int) -> Record:
-    sequence = load_program(find_config(program, 'program')).build(stage.model.sample_rate)
-    return simulate(stage, sequence, np.random.default_rng([stage.seed, seed]), name=program)
+    sequence = Program.load(program).build(stage.model.sample_rate)
+    return stage.play(sequence, np.random.default_rng([stage.seed, seed]), name=program)
 
 
 def _identify(title: str, record: Record, settings: Settings, console: Console) -> Identification:

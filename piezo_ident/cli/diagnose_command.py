@@ -21,11 +21,10 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis.diagnosis_json import to_json
 from piezo_ident.effects import catalogue
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.files import load
+from piezo_ident.model.free_run import free_run, sine_errors
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import sine_errors
 from piezo_ident.record.record import Record
 from piezo_ident.report import (
     changes,
@@ -50,7 +49,7 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     check_order(args.model_file, args.records[0], 'diagnose')
     paths, further = expand_apart(args.records, args.validation, console)
     _check_outputs(args, [args.model_file, *paths, *further])
-    given = load_model(args.model_file)
+    given = load(args.model_file)
     everything = read_all([*paths, *further], args)
     records, validation = everything[: len(paths)], everything[len(paths) :]
     for record in validation:
@@ -74,7 +73,7 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
                 progress=lambda step, share: interrupts.check(),
             )
         if args.model is not None:
-            save_model(found.model, args.model)
+            found.model.save(args.model)
     console.say(diagnosis_summary(found, unseen))
     changed = changes(given, found.model)
     _say_files(args, page, changed, console)
@@ -126,8 +125,8 @@ def _check_outputs(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
 
 def _unseen(given: StageModel, refined: StageModel, record: Record) -> Unseen:
     """Return the errors of both models on a record that took no part in the diagnosis."""
-    runs = [predict_record(model, record) for model in (given, refined)]
-    before, after = (run.after or run.whole for run in runs)
+    runs = [free_run(model, record) for model in (given, refined)]
+    before, after = (run.errors_after_start or run.errors for run in runs)
     sines = zip(*(sine_errors(model, record) for model in (given, refined)), strict=True)
     return Unseen(
         record=record.name,

@@ -18,13 +18,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.graph_demo import _ask, _follow, _set, lab_graph
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.diagnosis import diagnose
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.model.free_run import predict_record
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.starter import Nodes
 from piezo_ident.record.record import Record
 
@@ -204,7 +203,7 @@ def _wait_for_model(nodes: Nodes, client: Client, number: int) -> None:
 
 def _probe(nodes: Nodes, client: Client, console: Console, ear: _Ear) -> float:
     """Return the rms of the residual while the probe is played [m]."""
-    end = parse_program(PROBE).build(load_stage(find_config(STAGE, 'stage')).model.sample_rate)
+    end = parse_program(PROBE).build(SimulatedStage.load(STAGE).model.sample_rate)
     _set(client, 'excitation', 'program', PROBE)
     ear.clear()
     _ask(client, 'excitation/start')
@@ -246,22 +245,22 @@ def offline_diagnosis_demo(console: Console) -> DiagnosisRun:
     ----------
     console : Console
     """
-    stage = load_stage(find_config(STAGE, 'stage'))
+    stage = SimulatedStage.load(STAGE)
     rate = stage.model.sample_rate
 
     def play(text: str, seed: int) -> Record:
         sequence = parse_program(text).build(rate)
-        return simulate(stage, sequence, np.random.default_rng([stage.seed, seed]))
+        return stage.play(sequence, np.random.default_rng([stage.seed, seed]))
 
-    program = load_program(find_config('identification', 'program')).build(rate)
-    record = simulate(stage, program, np.random.default_rng([stage.seed, 6]))
+    program = Program.load('identification').build(rate)
+    record = stage.play(program, np.random.default_rng([stage.seed, 6]))
     probe, holds, again = (play(text, 7 + i) for i, text in enumerate((PROBE, HOLDS, PROBE)))
     with console.progress() as progress:
         model = identify(record, progress=progress).model
     with console.progress() as progress:
         found = diagnose(model, [probe, holds], progress=progress)
     before, after = (
-        predict_record(m, again).whole.percent * again.stroke / 100.0 for m in (model, found.model)
+        free_run(m, again).errors.percent * again.stroke / 100.0 for m in (model, found.model)
     )
     return DiagnosisRun(
         verdict=found.verdict,

@@ -20,7 +20,7 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.many.figures import QUANTITIES, spread_figure, values_of
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, Row, unit_of, write_table
-from piezo_ident.model.files import load_model
+from piezo_ident.model.files import load
 from piezo_ident.report.figures.style import NothingToDraw
 
 __all__ = ['check_each', 'diagnose_each', 'identify_each']
@@ -58,7 +58,7 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     """Run ``piezo_ident diagnose MODEL RECORD... --each DIR``."""
     if not args.model_file.is_dir():
         # a bad model is one error, not one a record
-        load_model(args.model_file)
+        load(args.model_file)
     _each(args, Diagnose(args.model_file.absolute(), settings, _reading(args)), console)
 
 

@@ -23,14 +23,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.free_run import PieceRun, SineError, sines_of
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import FreeRun, SineError, sines_of
 from piezo_ident.nodes.starter import Nodes
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.io import read_record
@@ -214,7 +213,7 @@ def _identify(
 ) -> tuple[StageModel, Path, dict[str, int]]:
     """Have the identifier drive the stage; return its model, the bag, and what was lost."""
     models = client.listen('model')
-    sent = load_program(find_config('identification', 'program')).build(RATE).n
+    sent = Program.load('identification').build(RATE).n
     for name, factor in (('identification', REAL_TIME), ('identification_again', ALL_ANSWER)):
         bag, before = folder / name, client.count('identifier')
         models.clear()
@@ -337,7 +336,7 @@ def _live_errors(bag: Path, model: StageModel) -> tuple[tuple[SineError, ...], i
     # what was lost on the way is left out of the comparison, on both sides alike
     y_hat = np.where(both, y_hat, piece.y)
     y_static = np.where(both, model.without_dynamics().predict_piece(piece), piece.y)
-    run = FreeRun(bag.name, piece, y_hat, y_static)
+    run = PieceRun(bag.name, piece, y_hat, y_static)
     return sines_of([run]), int(piece.n - both.sum())
 
 

@@ -31,8 +31,8 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.free_run import predict_record, RecordPrediction
+from piezo_ident.model.files import load
+from piezo_ident.model.free_run import free_run, FreeRun
 from piezo_ident.model.long_prediction import predict_long
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
@@ -101,7 +101,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
                 progress=lambda step, share: interrupts.check(),
             )
         if args.model is not None:
-            save_model(result.model, args.model)
+            result.model.save(args.model)
     console.say(report.text_summary(result))
     for check in checks:
         console.say()
@@ -135,16 +135,16 @@ class _Check:
 
 
 def _validate(model: StageModel, record: Record) -> _Check:
-    from piezo_ident.model.validation import sine_errors
+    from piezo_ident.model.free_run import sine_errors
     from piezo_ident.report import table_one
 
-    free_run = predict_record(model, record)
-    text = [f'{record.name}, not fitted:', *_error_lines(free_run)]
+    run = free_run(model, record)
+    text = [f'{record.name}, not fitted:', *_error_lines(run)]
     sines = sine_errors(model, record) if record.find('sine') else ()
     if sines:
         text += ['', *table_one(sines).splitlines()]
     data = {
-        **_error_data(free_run),
+        **_error_data(run),
         'record': record.name,
         'sines': [asdict(row) for row in sines],
     }
@@ -162,19 +162,19 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             check_file(path, overwrite=True)
             check_distinct(path, [args.model, args.record])
     check_order(args.model, args.record, 'predict')
-    model = load_model(args.model)
+    model = load(args.model)
     with console.progress() as progress:
         try:
-            record, free_run = _predicted(model, args, progress)
+            record, run = _predicted(model, args, progress)
         except NeedsWhole:
-            record, free_run = _predicted_whole(model, args)
+            record, run = _predicted_whole(model, args)
     if args.plot is not None and isinstance(record, Record):
         from piezo_ident.report.figures import write_prediction_plot
 
         with interrupts.waiting():
-            write_prediction_plot(record, free_run.prediction, args.plot)
+            write_prediction_plot(run, args.plot)
     console.say(f'{args.model} on {record.name}, free run:')
-    console.say('\n'.join(_error_lines(free_run)))
+    console.say('\n'.join(_error_lines(run)))
     say_faults(record, (), console)
     for path in (args.out, args.plot):
         if path is not None:
@@ -183,7 +183,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
         {
             'model': str(args.model),
             **story(record, ()),
-            **_error_data(free_run),
+            **_error_data(run),
             'out': None if args.out is None else str(args.out),
             'plot': None if args.plot is None else str(args.plot),
         }
@@ -192,7 +192,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
 
 def _predicted(
     model: StageModel, args: argparse.Namespace, progress: Progress
-) -> tuple[Record | LongRecord, RecordPrediction]:
+) -> tuple[Record | LongRecord, FreeRun]:
     """Predict a record, and write the prediction where that is asked for."""
     if args.plot is not None:
         return _predicted_whole(model, args)
@@ -217,16 +217,16 @@ def _predicted(
 
 def _predicted_whole(
     model: StageModel, args: argparse.Namespace, record: Record | None = None
-) -> tuple[Record, RecordPrediction]:
+) -> tuple[Record, FreeRun]:
     record = read(args.record, args) if record is None else record
     with naming(str(args.model)):
-        free_run = predict_record(model, record)
+        run = free_run(model, record)
     if args.out is not None:
         columns = {
             't': np.concatenate([p.t for p in record]),
             'v': np.concatenate([p.v for p in record]),
             'y': np.concatenate([p.y for p in record]),
-            'y_hat': np.concatenate(free_run.prediction.pieces),
+            'y_hat': run.predicted,
         }
         with (
             interrupts.waiting(),
@@ -234,7 +234,7 @@ def _predicted_whole(
             target.open('xb') as file,
         ):
             WRITERS[args.out.suffix.lower()](file, Table(columns))
-    return record, free_run
+    return record, run
 
 
 def check_order(model: Path, record: Path, verb: str) -> None:
@@ -252,16 +252,16 @@ def check_order(model: Path, record: Path, verb: str) -> None:
         raise ConfigError(f'{record}: is no record; {order}')
 
 
-def _error_lines(free_run: RecordPrediction) -> list[str]:
+def _error_lines(run: FreeRun) -> list[str]:
     from piezo_ident.report.numbers import length
 
     lines = []
-    rows = [('whole record', free_run.whole)]
-    if any(free_run.estimated):
-        if free_run.after is None:
+    rows = [('whole record', run.errors)]
+    if any(run.estimated):
+        if run.errors_after_start is None:
             lines.append('  no sample at which the start is forgotten: drive a wider range')
         else:
-            rows.append(('start forgotten', free_run.after))
+            rows.append(('start forgotten', run.errors_after_start))
     centred = [
         f', {e.percent_without_offset:.3g} % after removing a mean of {length(e.offset)}'
         if e.mostly_offset
@@ -280,11 +280,11 @@ def _error_lines(free_run: RecordPrediction) -> list[str]:
         *table,
         *lines,
         f'  % of stroke = {FORMULA}; fit = 100 (1 - |y - y_hat| / |y - mean y|)',
-        *(f'  warning: {warning}' for warning in free_run.prediction.warnings),
+        *(f'  warning: {warning}' for warning in run.warnings),
     ]
 
 
-def _error_data(free_run: RecordPrediction) -> dict[str, Any]:
+def _error_data(run: FreeRun) -> dict[str, Any]:
     def row(errors: Any) -> dict[str, Any]:
         return {
             'percent_of_stroke': errors.percent,
@@ -294,10 +294,11 @@ def _error_data(free_run: RecordPrediction) -> dict[str, Any]:
             'percent_of_stroke_without_offset': errors.percent_without_offset,
         }
 
+    late = run.errors_after_start
     return {
         'formula': FORMULA,
-        'whole': row(free_run.whole),
-        'start_forgotten': None if free_run.after is None else row(free_run.after),
-        'memory_estimated': list(free_run.estimated),
-        'warnings': list(free_run.prediction.warnings),
+        'whole': row(run.errors),
+        'start_forgotten': None if late is None else row(late),
+        'memory_estimated': list(run.estimated),
+        'warnings': list(run.warnings),
     }

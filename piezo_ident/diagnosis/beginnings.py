@@ -11,14 +11,14 @@ out of what was before a section, and only a beginning has nothing before it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.diagnosis.verdict import SMALLEST
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import same_rate
-from piezo_ident.model.initial_memory import memories_of
+from piezo_ident.model.initial_memory import connected_pieces, start_memory
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 
@@ -72,6 +72,11 @@ def _fits(model: StageModel, piece: Piece) -> bool:
     return same_rate(piece.sample_rate, model.sample_rate)
 
 
+def _neighbours(record: Record) -> Iterator[tuple[Piece | None, Piece]]:
+    for pieces in connected_pieces(record):
+        yield from zip((None, *pieces[:-1]), pieces, strict=True)
+
+
 def _begun(pieces: Sequence[Piece], n: int) -> list[Piece]:
     begun: list[Piece] = []
     for piece in pieces:
@@ -111,10 +116,13 @@ def rest_of(
     for record in records:
         sums = np.zeros((2, 3))
         left = begun.get(record.name, 0)
-        for piece, memory in zip(record, memories_of(model, record), strict=True):
+        for before, piece in _neighbours(record):
             if not _fits(model, piece):
                 continue
-            stream = model.stream(memory)
+            if before is None:
+                stream = model.stream(start_memory(model, piece))
+            else:
+                stream.bridge(before, piece)
             start = 0
             while start < piece.n:
                 tick()

@@ -11,7 +11,7 @@ from piezo_ident.diagnosis.fit import Fitted
 from piezo_ident.diagnosis.gain import gram_of, solve
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.model.validation import sine_frequency
+from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.residual.faults import FaultSearch
 from piezo_ident.residual.floor import NoiseFloor
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.model.validation import sine_frequency
+from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.record.record import Piece, Record
 
 __all__ = ['Experiment', 'next_experiment']

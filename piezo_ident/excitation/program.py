@@ -27,13 +27,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.yaml_io import load_yaml, parse_yaml
 from piezo_ident.excitation import signals as excitation
 from piezo_ident.excitation.catalogue import Option, Part, REQUIRED, Setting, SIGNALS
 from piezo_ident.record.record import Segment
 
-__all__ = ['Entry', 'Program', 'Sequence', 'load_program', 'parse_program']
+__all__ = ['Entry', 'Program', 'Sequence', 'parse_program']
 
 _HEAD = {
     'limits': Option('V', many=True),
@@ -131,6 +132,25 @@ class Program:
     seed: int = 0
     rest: float = 0.0
     slew: float = 20.0
+
+    @classmethod
+    def load(cls, name_or_path: str | os.PathLike[str]) -> Program:
+        """
+        Read a programme: ``identification`` or another that is shipped, or a file of one's own.
+
+        Raises
+        ------
+        ConfigError
+            When the file cannot be read, or as `parse_program` says.
+
+        Examples
+        --------
+        >>> import piezo_ident as pi
+        >>> pi.Program.load('identification').limits
+        (0.0, 10.0)
+        """
+        path = find_config(name_or_path, 'program')
+        return _program(load_yaml(path), str(path))
 
     def build(
         self,
@@ -241,18 +261,6 @@ class Program:
 
 def _where(name: str, number: int, signal: object) -> str:
     return f'{name}: segment {number} ({reprlib.repr(signal).strip(chr(39))})'
-
-
-def load_program(path: str | os.PathLike[str]) -> Program:
-    """
-    Read a programme file.
-
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read, or as `parse_program` says.
-    """
-    return _program(load_yaml(path), str(path))
 
 
 def parse_program(text: str, name: str = 'program') -> Program:

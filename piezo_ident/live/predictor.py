@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
-from piezo_ident.model.stage_model import Scaling, StageModel, Stream
+from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import weighted_plays

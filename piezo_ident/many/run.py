@@ -26,7 +26,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.many.table import diagnosed, identified, natural, Row
 from piezo_ident.many.workers import completed, dask, processes
-from piezo_ident.model.files import load_model, save_model, write_text
+from piezo_ident.model.files import load, write_text
 from piezo_ident.record.io import read_record
 
 __all__ = ['Diagnose', 'Identify', 'Task', 'run_many']
@@ -54,7 +54,7 @@ class Identify:
         """Identify a record, write its model and its report, and return its row."""
         record = read_record(path, **self.reading)
         result = identify(record, self.settings)
-        save_model(result.model, model_file)
+        result.model.save(model_file)
         if report is not None:
             from piezo_ident.report import write_report
 
@@ -93,8 +93,8 @@ class Diagnose:
         """Diagnose a record, write the refined model and the report, and return its row."""
         given = self.model_of(name)
         record = read_record(path, **self.reading)
-        result = diagnose(load_model(given), record, self.settings)
-        save_model(result.model, model_file)
+        result = diagnose(load(given), record, self.settings)
+        result.model.save(model_file)
         if report is not None:
             from piezo_ident.report import write_diagnosis_report
 

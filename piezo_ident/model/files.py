@@ -25,13 +25,13 @@ import yaml
 
 __all__ = [
     'SCHEMA_VERSION',
-    'load_model',
+    'load',
     'load_yaml',
     'model_from_dict',
     'model_to_dict',
+    'model_to_yaml',
     'parse_yaml',
     'plain',
-    'save_model',
     'write_text',
 ]
 
@@ -256,7 +256,7 @@ def model_to_yaml(model: StageModel) -> str:
     return text
 
 
-def load_model(path: str | os.PathLike[str]) -> StageModel:
+def load(path: str | os.PathLike[str]) -> StageModel:
     """
     Read a model file.
 
@@ -266,20 +266,16 @@ def load_model(path: str | os.PathLike[str]) -> StageModel:
         When the file cannot be read or is not YAML.
     ModelError
         When it is not a model, or one of a later schema.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
+    >>> model = pi.load('model.yaml')
+    >>> model.sample_rate, model.hysteresis.thresholds.size
+    (20000.0, 9)
     """
     return model_from_dict(load_yaml(path), str(path))
-
-
-def save_model(model: StageModel, path: str | os.PathLike[str]) -> None:
-    """
-    Write a model file; the old one stays whole until the new one is.
-
-    Raises
-    ------
-    DataError
-        When the file cannot be written.
-    """
-    write_text(path, model_to_yaml(model))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

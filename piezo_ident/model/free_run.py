@@ -1,30 +1,52 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recorded drive through a model: free run, with the unknown start estimated, and its errors."""
+"""
+Free runs: the displacement that a model predicts from the voltage of a record, and its errors.
+
+The unknown memory at the start of a record is estimated from its early part.  Over a short gap
+the run goes on along a straight line of voltage.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+import re
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.model.initial_memory import memories_of, Sweep, sweeps_of
+from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke
-from piezo_ident.model.stage_model import Prediction, StageModel
-from piezo_ident.record.gaps import follows
-from piezo_ident.record.record import Record
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Piece, Record
 
-__all__ = ['DIVERGES', 'RecordErrors', 'RecordPrediction', 'predict_record', 'start_warning']
+__all__ = [
+    'DIVERGES',
+    'Errors',
+    'FreeRun',
+    'PieceRun',
+    'SineError',
+    'free_run',
+    'piece_runs',
+    'run_pieces',
+    'sine_errors',
+    'sine_frequency',
+    'sines_of',
+    'start_warning',
+]
 
-#: what is said of a prediction that is not finite
 DIVERGES = 'the model diverges on this record; identify it again'
+#: what is dropped at the start of a sine: this time and at least one period [s]
+SETTLING = 1.0
+
+_SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class RecordErrors:
+class Errors:
     """
     How far a free run is from the measurement.
 
@@ -55,35 +77,60 @@ class RecordErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordPrediction:
+class FreeRun:
     """
-    Free run over a record.
+    A model's free run over a record, beside what was measured.
 
     Attributes
     ----------
-    prediction : Prediction
-        With what a reader has to know before trusting it.
+    record : Record
+    pieces : tuple of ndarray
+        Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
         For each piece, whether its memory at the start was estimated from its early part.
-    whole : RecordErrors
+    errors : Errors
         Of every sample.
-    after : RecordErrors or None
+    errors_after_start : Errors or None
         Of the samples at which the start is forgotten, or was known; None when there are none.
+    warnings : tuple of str
+        What limits the trust in the prediction.
     """
 
-    prediction: Prediction
+    record: Record
+    pieces: tuple[NDArray[np.float64], ...]
     estimated: tuple[bool, ...]
-    whole: RecordErrors
-    after: RecordErrors | None
+    errors: Errors
+    errors_after_start: Errors | None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def predicted(self) -> NDArray[np.float64]:
+        """Predicted displacement of all pieces [m], shape (n,)."""
+        return np.concatenate(self.pieces)
+
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """Measured displacement of all pieces [m], shape (n,)."""
+        return np.concatenate([piece.y for piece in self.record])
+
+    def _repr_html_(self) -> str:
+        e = self.errors
+        rows = [
+            ('error', f'{e.percent:.3g} % of stroke'),
+            ('fit', f'{e.fit:.4g} %'),
+            ('samples', f'{e.n}'),
+            *(('warning', warning) for warning in self.warnings),
+        ]
+        cells = ''.join(f'<tr><th>{name}</th><td>{escape(x)}</td></tr>' for name, x in rows)
+        return f'<table><caption>Free run on {escape(self.record.name)}</caption>{cells}</table>'
 
 
-def predict_record(model: StageModel, record: Record) -> RecordPrediction:
+def free_run(model: StageModel, record: Record) -> FreeRun:
     """
-    Predict a record in free run.
+    Predict a record in free run, and compare it with what was measured.
 
-    A piece that does not start at the lowest voltage starts from an unknown memory, which is
-    estimated from its early part; the error behind that part is the one that nothing was fitted
-    to.
+    A record that does not start at the lowest voltage starts from an unknown memory, which is
+    estimated from its early part; nothing is fitted to the samples after that part.
 
     Parameters
     ----------
@@ -95,42 +142,72 @@ def predict_record(model: StageModel, record: Record) -> RecordPrediction:
     ------
     ModelError
         When a piece has another sampling rate than the model, or the prediction overflows.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('minor_loops'))
+    >>> run = pi.free_run(stage.model, record)
+    >>> run.predicted.shape == run.measured.shape
+    True
+    >>> run.errors.percent < 0.01
+    True
     """
     for piece in record:
         try:
             model.check_rate(piece)
         except ModelError as error:
             raise ModelError(f'{record.name}: {error}') from None
-    memories = tuple(memories_of(model, record))
-    before = (None, *record.pieces[:-1])
-    estimated = tuple(
-        memory is not None and (last is None or follows(last, piece) is None)
-        for memory, last, piece in zip(memories, before, record, strict=True)
-    )
-    prediction = model.predict(record, memories)
-    if any(estimated):
-        said = start_warning(model, record.name, estimated)
-        prediction = replace(prediction, warnings=(said, *prediction.warnings))
-    late = []
-    sweeps = sweeps_of(record.pieces, [(float(p.v.min()), float(p.v.max())) for p in record])
-    sweep: Sweep | None = None
-    for piece, last, unknown, own in zip(record, before, estimated, sweeps, strict=True):
-        if last is None or follows(last, piece) is None:
-            sweep = own if unknown else None
-        mask = np.ones(piece.n, dtype=bool)
-        mask[: sweep.before(piece.v) if sweep else 0] = False
+    predicted: list[NDArray[np.float64]] = []
+    estimated: list[bool] = []
+    late: list[NDArray[np.bool_]] = []
+    for pieces in connected_pieces(record):
+        memory = start_memory(model, pieces[0])
+        predicted += run_pieces(model, pieces, memory)
+        estimated += [memory is not None, *[False] * (len(pieces) - 1)]
+        mask = np.ones(sum(piece.n for piece in pieces), dtype=bool)
+        if memory is not None:
+            v = np.concatenate([piece.v for piece in pieces])
+            # a voltage that rests forgets nothing
+            mask[: forgotten(v) if np.ptp(v) > 0.0 else v.size] = False
         late.append(mask)
-    y = np.concatenate([piece.y for piece in record])
-    y_hat = np.concatenate(prediction.pieces)
+    y, y_hat = np.concatenate([piece.y for piece in record]), np.concatenate(predicted)
     if not np.all(np.isfinite(y_hat)):
         raise ModelError(f'{record.name}: {DIVERGES}')
     mask = np.concatenate(late)
-    return RecordPrediction(
-        prediction=prediction,
-        estimated=estimated,
-        whole=_errors(y, y_hat, record.stroke),
-        after=_errors(y[mask], y_hat[mask], record.stroke) if mask.any() else None,
+    warnings = [start_warning(model, record.name, estimated)] if any(estimated) else []
+    return FreeRun(
+        record=record,
+        pieces=tuple(predicted),
+        estimated=tuple(estimated),
+        errors=_errors(y, y_hat, record.stroke),
+        errors_after_start=_errors(y[mask], y_hat[mask], record.stroke) if mask.any() else None,
+        warnings=(*warnings, *model.extrapolation(record)),
     )
+
+
+def run_pieces(
+    model: StageModel, pieces: Sequence[Piece], memory: ArrayLike | None
+) -> list[NDArray[np.float64]]:
+    """
+    Return the predicted displacement [m] of pieces that follow each other over short gaps.
+
+    Parameters
+    ----------
+    model : StageModel
+    pieces : sequence of Piece
+        From `piezo_ident.model.initial_memory.connected_pieces`.
+    memory : array_like or None
+        Play outputs at the start of the first.
+    """
+    stream = model.stream(memory)
+    predicted: list[NDArray[np.float64]] = []
+    for i, piece in enumerate(pieces):
+        if i:
+            stream.bridge(pieces[i - 1], piece)
+        predicted.append(stream.follow(piece))
+    return predicted
 
 
 def start_warning(model: StageModel, name: str, estimated: Sequence[bool]) -> str:
@@ -142,12 +219,171 @@ def start_warning(model: StageModel, name: str, estimated: Sequence[bool]) -> st
     )
 
 
-def _errors(y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float) -> RecordErrors:
+def _errors(y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float) -> Errors:
     offset = float(np.mean(y - y_hat))
-    return RecordErrors(
+    return Errors(
         n=y.size,
         percent=percent_of_stroke(y, y_hat, stroke),
         fit=fit_percent(y, y_hat),
         offset=offset,
         percent_without_offset=percent_of_stroke(y, y_hat + offset, stroke),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PieceRun:
+    """
+    One piece with what the model makes of its voltage.
+
+    Attributes
+    ----------
+    record : str
+        Name of the record.
+    piece : Piece
+    y_hat, y_static : ndarray, shape (n,)
+        Displacement from the whole model, and from its hysteresis alone [m].
+    """
+
+    record: str
+    piece: Piece
+    y_hat: NDArray[np.float64]
+    y_static: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SineError:
+    """
+    Steady-state error of one sine segment.
+
+    Attributes
+    ----------
+    frequency : float
+        [Hz]
+    percent, static_percent : float
+        `piezo_ident.model.metrics.percent_of_stroke` of the whole model and of the hysteresis
+        alone;
+        the stroke is that of the samples compared.
+    n : int
+        Samples compared.
+    """
+
+    frequency: float
+    percent: float
+    static_percent: float
+    n: int
+
+
+def piece_runs(
+    model: StageModel,
+    records: Iterable[Record] | Record,
+    memories: Mapping[tuple[str, float], ArrayLike] | None = None,
+) -> list[PieceRun]:
+    """
+    Run a model over all pieces that have its sampling rate.
+
+    Parameters
+    ----------
+    model : StageModel
+    records : iterable of Record, or Record
+    memories : mapping, optional
+        Play outputs at the start of a piece, by the record's name and the piece's start time.
+
+    Returns
+    -------
+    list of PieceRun
+        The unknown memory of a piece that does not start at rest is estimated from its beginning.
+    """
+    static = model.without_dynamics()
+    known = memories or {}
+    runs = []
+    for record in [records] if isinstance(records, Record) else records:
+        for pieces in connected_pieces(record):
+            if not model.takes(pieces[0]):
+                continue
+            memory = known.get((record.name, pieces[0].start_time))
+            if memory is None:
+                memory = start_memory(model, pieces[0])
+            both = (run_pieces(m, pieces, memory) for m in (model, static))
+            for piece, y_hat, y_static in zip(pieces, *both, strict=True):
+                runs.append(PieceRun(record.name, piece, y_hat, y_static))
+    return runs
+
+
+def sine_frequency(label: str) -> float | None:
+    """
+    Return the frequency in a segment label [Hz], None when it names no sine.
+
+    Examples
+    --------
+    >>> sine_frequency('sine:50Hz'), sine_frequency('noise')
+    (50.0, None)
+    """
+    match = _SINE.match(label)
+    frequency = float(match.group(1)) if match else 0.0
+    return frequency if 0.0 < frequency < float('inf') else None
+
+
+def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
+    """
+    Return the steady-state error of every sine segment of some free runs, by frequency.
+
+    Parameters
+    ----------
+    runs : sequence of PieceRun
+
+    Returns
+    -------
+    tuple of SineError
+        Segments that hold less than one period after the first second and period are left out.
+    """
+    found = []
+    for run in runs:
+        rate = run.piece.sample_rate
+        for s in run.piece.segments:
+            frequency = sine_frequency(s.label)
+            if frequency is None:
+                continue
+            start = s.start + int(np.ceil(max(SETTLING, 1.0 / frequency) * rate))
+            # half a sample is forgiven: the period need not be a whole number of them
+            if s.stop - start < rate / frequency - 0.5:
+                continue
+            steady = slice(start, s.stop)
+            y = run.piece.y[steady]
+            found.append(
+                SineError(
+                    frequency=frequency,
+                    percent=percent_of_stroke(y, run.y_hat[steady]),
+                    static_percent=percent_of_stroke(y, run.y_static[steady]),
+                    n=y.size,
+                )
+            )
+    return tuple(sorted(found, key=lambda row: row.frequency))
+
+
+def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
+    """
+    Return the steady-state error of every sine segment of a record.
+
+    The first second and at least one period of each segment are dropped, and the stroke is
+    ``max y - min y`` of what is left.
+
+    Parameters
+    ----------
+    model : StageModel
+    record : Record
+        With segments labelled by their frequency, as ``sine:50Hz``.
+
+    Returns
+    -------
+    tuple of SineError
+        By frequency.
+
+    Raises
+    ------
+    ModelError
+        When a piece with sines has another sampling rate than the model.
+    """
+    for piece in record:
+        if piece.find('sine'):
+            model.check_rate(piece)
+    return sines_of(piece_runs(model, record))

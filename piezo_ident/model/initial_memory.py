@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import filter_arx
-from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.gaps import follows
 from piezo_ident.record.long_record import Outline
 from piezo_ident.record.record import Piece, Record
@@ -29,10 +28,10 @@ from scipy.optimize import lsq_linear
 __all__ = [
     'SHARE',
     'Sweep',
+    'connected_pieces',
     'fit_memory',
     'forgotten',
     'is_at_rest',
-    'memories_of',
     'start_memory',
     'sweeps_of',
 ]
@@ -123,30 +122,20 @@ def is_at_rest(model: StageModel, piece: Piece) -> bool:
     return abs(float(model.scaling.u(piece.v[0]))) < 0.01
 
 
-def memories_of(model: StageModel, record: Record) -> list[NDArray[np.float64] | None]:
-    """
-    Return the memory at the start of every piece of a record.
-
-    A piece that follows the one before after a short gap goes on with its memory; that of others
-    is known at the lowest voltage, and estimated elsewhere.
-    """
-    memories: list[NDArray[np.float64] | None] = []
-    h = model.hysteresis
-    for i, piece in enumerate(record):
-        before = record.pieces[i - 1] if i else None
-        if not model.takes(piece):
-            memories.append(None)
-            continue
-        if before is None or follows(before, piece) is None:
-            memories.append(start_memory(model, piece))
-            continue
-        u = model.scaling.u(before.v)
-        start = memories[-1]
-        if start is None:
-            start = h.initial_memory(float(u[0]))
-        _, end = weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, start)
-        memories.append(end)
-    return memories
+def connected_pieces(record: Record) -> list[list[Piece]]:
+    """Return the pieces of a record, those together that follow each other over short gaps."""
+    groups: list[list[Piece]] = []
+    for piece in record:
+        last = groups[-1][-1] if groups else None
+        if (
+            last is not None
+            and follows(last, piece) is not None
+            and set(last.channels) == set(piece.channels)
+        ):
+            groups[-1].append(piece)
+        else:
+            groups.append([piece])
+    return groups
 
 
 def start_memory(model: StageModel, piece: Piece) -> NDArray[np.float64] | None:
@@ -168,13 +157,14 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
     Returns
     -------
     ndarray, shape (m,)
-        For `StageModel.predict`.
+        `start` of `StageModel.simulate`.
     """
     h = model.hysteresis
     end = max(forgotten(piece.v), 10) if stop is None else stop
     end = min(end, piece.n)
     part = piece.cut(0, end)
-    u = model.scaling.u(part.v)
+    # the plays follow the voltage behind the effects of the input slot
+    u = model.hysteresis_input(part)
     x = model.scaling.x(part.y)
     memory = h.initial_memory(float(u[0]))
     low, high = float(u[0]) - h.thresholds, np.full(h.thresholds.size, float(u[0]))

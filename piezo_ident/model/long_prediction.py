@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.model.free_run import DIVERGES, RecordErrors, RecordPrediction, start_warning
+from piezo_ident.model.free_run import DIVERGES, Errors, FreeRun, start_warning
 from piezo_ident.model.initial_memory import (
     fit_memory,
     forgotten,
@@ -21,8 +21,8 @@ from piezo_ident.model.initial_memory import (
     Sweep,
     sweeps_of,
 )
-from piezo_ident.model.stage_model import Prediction, StageModel, Stream
-from piezo_ident.operators.play import weighted_plays
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
 from piezo_ident.record.gaps import follows
 from piezo_ident.record.long_record import LongRecord, NeedsWhole, Outline, Progress
 from piezo_ident.record.record import Piece
@@ -54,7 +54,7 @@ class _Moments:
 
 
 class _Errors:
-    """`RecordErrors` of samples that come in parts."""
+    """`Errors` of samples that come in parts."""
 
     def __init__(self) -> None:
         self._e, self._y = _Moments(), _Moments()
@@ -63,7 +63,7 @@ class _Errors:
         self._e.add(y - y_hat)
         self._y.add(y)
 
-    def result(self, stroke: float) -> RecordErrors:
+    def result(self, stroke: float) -> Errors:
         n, offset = self._e.n, self._e.mean
         squares = self._e.squares + n * offset**2
         spread = self._y.squares
@@ -78,7 +78,7 @@ class _Errors:
                 return 0.0 if rms == 0.0 else float('inf')
             return 100.0 * rms / stroke
 
-        return RecordErrors(n, percent(squares), fit, offset, percent(self._e.squares))
+        return Errors(n, percent(squares), fit, offset, percent(self._e.squares))
 
     def __bool__(self) -> bool:
         return self._e.n > 0
@@ -89,7 +89,6 @@ class _Run:
     """A piece under way: the model's stream, its plays, and whether its start was estimated."""
 
     stream: Stream
-    plays: Vector | None
     is_estimated: bool
 
 
@@ -99,9 +98,9 @@ def predict_long(
     *,
     add: Callable[[Piece, Vector], None] = lambda part, y_hat: None,
     progress: Progress = lambda step, share: None,
-) -> RecordPrediction:
+) -> FreeRun:
     """
-    Predict a long record in free run, as `piezo_ident.model.free_run.predict_record` does.
+    Predict a long record in free run, as `piezo_ident.model.free_run.free_run` does.
 
     Parameters
     ----------
@@ -115,7 +114,7 @@ def predict_long(
 
     Returns
     -------
-    RecordPrediction
+    FreeRun
         Its prediction keeps the warnings alone.
 
     Raises
@@ -129,7 +128,7 @@ def predict_long(
     estimated: list[bool] = []
     outside = 0
     last: Piece | None = None
-    plays: Vector | None = None
+    run: _Run | None = None
     sweep: Sweep | None = None
     sweeps = sweeps_of(record.pieces, [(p.v.low, p.v.high) for p in record])
     for (outline, parts), own in zip(record.parts(progress), sweeps, strict=True):
@@ -138,10 +137,10 @@ def predict_long(
             model.check_rate(first)
         except ModelError as error:
             raise ModelError(f'{record.name}: {error}') from None
-        connects = last is not None and follows(last, first) is not None
         held = [first]
-        if connects:
-            run = _Run(model.stream(plays), plays, False)
+        if run and last and follows(last, first) is not None:
+            run.stream.bridge(last, first)
+            run.is_estimated = False
         else:
             run, held = _started(model, outline, first, parts)
             sweep = own if run.is_estimated else None
@@ -154,18 +153,17 @@ def predict_long(
             late = sweep.before(part.v) if sweep else 0
             after.add(part.y[late:], y_hat[late:])
             outside += model.outside(part.v)
-            if len(record.pieces) > 1:
-                run.plays = _moved(model, part, run.plays)
             add(part, y_hat)
             last = part
-        plays = run.plays
     warnings = [start_warning(model, record.name, estimated)] if any(estimated) else []
     warnings += model.range_warnings(record.name, outside / record.n, record.voltage_range)
-    return RecordPrediction(
-        prediction=Prediction((), tuple(warnings)),
+    return FreeRun(
+        record=record,  # type: ignore[arg-type]
+        pieces=(),
         estimated=tuple(estimated),
-        whole=whole.result(record.stroke),
-        after=after.result(record.stroke) if after else None,
+        errors=whole.result(record.stroke),
+        errors_after_start=after.result(record.stroke) if after else None,
+        warnings=tuple(warnings),
     )
 
 
@@ -174,7 +172,7 @@ def _started(
 ) -> tuple[_Run, list[Piece]]:
     """Return the run of a piece that follows no other, and the parts that this took."""
     if is_at_rest(model, first):
-        return _Run(model.stream(), None, False), [first]
+        return _Run(model.stream(), False), [first]
     held = [first]
     low, high = np.inf, -np.inf
     # as far as the piece needs to sweep its range
@@ -194,13 +192,4 @@ def _started(
     )
     start = forgotten(early.v, SHARE, outline.v.span)
     memory = fit_memory(model, early, max(start, 10))
-    return _Run(model.stream(memory), memory, True), held
-
-
-def _moved(model: StageModel, part: Piece, plays: Vector | None) -> Vector:
-    """Return the plays behind a part."""
-    h, u = model.hysteresis, model.scaling.u(part.v)
-    if plays is None:
-        plays = h.initial_memory(float(u[0]))
-    _, end = weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, plays)
-    return end
+    return _Run(model.stream(memory), True), held

@@ -20,10 +20,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.excitation.program import Sequence
+from piezo_ident.excitation.program import Program, Sequence
 from piezo_ident.model.files import load_yaml, model_from_dict
-from piezo_ident.model.stage_model import CHUNK, StageModel
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import CHUNK
 from piezo_ident.record.record import Fault, Piece, Record
 
 __all__ = [
@@ -31,9 +33,6 @@ __all__ = [
     'Sensor',
     'SimulatedStage',
     'StageRun',
-    'load_stage',
-    'simulate',
-    'simulate_truth',
     'stage_from_dict',
 ]
 
@@ -127,9 +126,91 @@ class SimulatedStage:
     sensor: Sensor = field(default_factory=Sensor)
     seed: int = 0
 
+    @classmethod
+    def load(cls, name_or_path: str | os.PathLike[str]) -> SimulatedStage:
+        """
+        Read a simulated stage: ``paper``, ``dense`` or ``effects``, or a file of one's own.
+
+        Raises
+        ------
+        ConfigError
+            When the file cannot be read, or its sensor is not understood.
+        ModelError
+            When its model is not understood.
+
+        Examples
+        --------
+        >>> import piezo_ident as pi
+        >>> pi.SimulatedStage.load('paper').model.sample_rate
+        20000.0
+        """
+        path = find_config(name_or_path, 'stage')
+        return stage_from_dict(load_yaml(path), str(path))
+
+    @property
+    def ideal(self) -> SimulatedStage:
+        """The same stage without noise and converters: its record is the displacement itself."""
+        return SimulatedStage(self.model)
+
     def run(self, rng: np.random.Generator) -> StageRun:
         """Return a run of this stage that takes the command block by block."""
         return StageRun(self, rng)
+
+    def play(
+        self,
+        program: Program | Sequence,
+        rng: np.random.Generator | None = None,
+        name: str = 'simulated',
+    ) -> Record:
+        """
+        Return what is measured while the stage plays a programme.
+
+        Parameters
+        ----------
+        program : Program or Sequence
+            The command, which the record holds as its voltage.
+        rng : numpy.random.Generator, optional
+            For the sensor noise; one from the stage's seed when absent.
+        name : str, optional
+            Of the record.
+
+        Returns
+        -------
+        Record
+            With a fault for each converter whose range the signal leaves.
+
+        Raises
+        ------
+        ConfigError
+            When the programme cannot be built at the stage's sampling rate.
+        ModelError
+            When stage and sequence differ in sampling rate.
+
+        Examples
+        --------
+        >>> import piezo_ident as pi
+        >>> stage = pi.SimulatedStage.load('paper')
+        >>> record = stage.play(pi.Program.load('validation'))
+        >>> [s.label for s in record.pieces[0].segments if s.kind == 'sine'][:2]
+        ['sine:1Hz', 'sine:10Hz']
+        """
+        model = self.model
+        sequence = program.build(model.sample_rate) if isinstance(program, Program) else program
+        run = self.run(np.random.default_rng(self.seed) if rng is None else rng)
+        # one piece without measurement yet, so that the model's own check and clock are used
+        piece = _piece(sequence, np.zeros(sequence.n))
+        model.check_rate(piece)
+        t, y = piece.t, np.empty(sequence.n)
+        for start in range(0, sequence.n, CHUNK):
+            cut = slice(start, start + CHUNK)
+            y[cut] = run.process(sequence.v[cut], t[cut])
+        clipped = {'voltage': run.clipped_input, 'displacement': run.clipped_output}
+        faults = tuple(
+            Fault('clipping', where, count, 'held at the end of the converter range')
+            for where, count in clipped.items()
+            if count
+        )
+        return Record((_piece(sequence, y),), name, faults)
 
 
 class StageRun:
@@ -188,87 +269,13 @@ class StageRun:
         return y
 
 
-def simulate(
-    stage: SimulatedStage,
-    sequence: Sequence,
-    rng: np.random.Generator,
-    name: str = 'simulated',
-) -> Record:
-    """
-    Return what would be measured while the stage plays a sequence.
-
-    Parameters
-    ----------
-    stage : SimulatedStage
-        The stage.
-    sequence : Sequence
-        The command; it is what the record holds as voltage.
-    rng : numpy.random.Generator
-        Draws the sensor noise.
-    name : str, optional
-        Of the record.
-
-    Returns
-    -------
-    Record
-        With a fault for each converter whose range was left.
-
-    Raises
-    ------
-    ModelError
-        When stage and sequence differ in sampling rate.
-    """
-    run = stage.run(rng)
-    # one piece without measurement yet, so that the model's own check and clock are used
-    piece = _piece(sequence, np.zeros(sequence.n))
-    stage.model.check_rate(piece)
-    t, y = piece.t, np.empty(sequence.n)
-    for start in range(0, sequence.n, CHUNK):
-        cut = slice(start, start + CHUNK)
-        y[cut] = run.process(sequence.v[cut], t[cut])
-    clipped = {'voltage': run.clipped_input, 'displacement': run.clipped_output}
-    faults = tuple(
-        Fault('clipping', where, count, 'held at the end of the converter range')
-        for where, count in clipped.items()
-        if count
-    )
-    return Record((_piece(sequence, y),), name, faults)
-
-
-def simulate_truth(stage: SimulatedStage, sequence: Sequence, name: str = 'truth') -> Record:
-    """
-    Return the displacement itself: no noise, no converters.
-
-    Raises
-    ------
-    ModelError
-        When stage and sequence differ in sampling rate.
-    """
-    ideal = SimulatedStage(stage.model)
-    return simulate(ideal, sequence, np.random.default_rng(0), name)
-
-
 def _piece(sequence: Sequence, y: NDArray[np.float64]) -> Piece:
     return Piece(v=sequence.v, y=y, sample_rate=sequence.sample_rate, segments=sequence.segments)
 
 
-def load_stage(path: str | os.PathLike[str]) -> SimulatedStage:
-    """
-    Read the configuration of a simulated stage.
-
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read, or its sensor is not understood.
-    ModelError
-        When its model is not understood.
-    """
-    return stage_from_dict(load_yaml(path), str(path))
-
-
 def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedStage:
     """
-    Build a simulated stage from plain data; see `load_stage`.
+    Build a simulated stage from plain data; see `SimulatedStage.load`.
 
     Parameters
     ----------

@@ -8,30 +8,29 @@ StageModel: the chain of operators with its scaling, and what it predicts.
                   effects in their slots stand where their names say
 
 A model is frozen.  `StageModel.stream` makes a `Stream`, which carries the state of one run;
-`StageModel.predict` is a stream over a whole record, so both give the same numbers.
+`StageModel.simulate` is a stream over a whole signal, so both give the same numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+import os
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.effects import find_effect
-from piezo_ident.operators.chain import Block, Chain, Operator
+from piezo_ident.model.stream import Stream
+from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
-from piezo_ident.operators.fused import fused, FusedOperator
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['EffectSetting', 'Prediction', 'Scaling', 'StageModel', 'Stream']
+__all__ = ['EffectSetting', 'Scaling', 'StageModel']
 
-#: samples that pass the chain at once; small enough for the signals to stay in the cache
-CHUNK = 8192
 #: share of the identified voltages below which another unit is likelier than a small signal
 FAINT = 2e-3
 
@@ -104,23 +103,6 @@ class EffectSetting:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """
-    Free-run prediction of a record.
-
-    Attributes
-    ----------
-    pieces : tuple of ndarray
-        Predicted displacement of each piece [m].
-    warnings : tuple of str
-        What the reader should know before trusting it.
-    """
-
-    pieces: tuple[NDArray[np.float64], ...]
-    warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class StageModel:
     """
     A stage: H, G, delay and effects, with scaling and the story of its identification.
@@ -181,30 +163,37 @@ class StageModel:
         memory : array_like, shape (m,), optional
             Play outputs at the start, normalised.
         """
-        in_slot: dict[str, list[EffectSetting]] = {}
-        for setting in self.effects:
-            if not find_effect(setting.name).in_delay_line:
-                in_slot.setdefault(setting.slot, []).append(setting)
-
-        def make(slot: str) -> list[Operator]:
-            return [
-                find_effect(s.name)(self.sample_rate, s.parameters) for s in in_slot.get(slot, [])
-            ]
-
         core: Operator = HysteresisOperator(self.hysteresis, memory)
-        for s in in_slot.get('hysteresis', []):
-            core = find_effect(s.name)(self.sample_rate, s.parameters, self.hysteresis, core)
+        for setting in self.effects_in('hysteresis'):
+            effect = find_effect(setting.name)
+            core = effect(self.sample_rate, setting.parameters, self.hysteresis, core)
         return Chain(
             (
-                *make('input'),
+                *self._operators('input'),
                 core,
-                *make('hidden'),
+                *self._operators('hidden'),
                 DynamicsOperator(self.dynamics),
                 DelayOperator(self.total_delay),
-                *make('output'),
-                *make('acquisition'),
+                *self._operators('output'),
+                *self._operators('acquisition'),
             )
         )
+
+    def effects_in(self, slot: Slot) -> list[EffectSetting]:
+        """Return the effects that are operators of a slot; a change of the delay is none."""
+        return [
+            s for s in self.effects if s.slot == slot and not find_effect(s.name).in_delay_line
+        ]
+
+    def _operators(self, slot: Slot) -> list[Operator]:
+        return [find_effect(s.name)(self.sample_rate, s.parameters) for s in self.effects_in(slot)]
+
+    def hysteresis_input(self, piece: Piece) -> NDArray[np.float64]:
+        """Return the normalised voltage behind the effects of the input slot, shape (n,)."""
+        u = self.scaling.u(piece.v)
+        chain = Chain(tuple(self._operators('input')))
+        chain.reset(float(u[0]), float(u[0]))
+        return chain.process(Block(t=piece.t, v=u, x=u, channels=piece.channels)).x
 
     @property
     def total_delay(self) -> Delay:
@@ -228,8 +217,74 @@ class StageModel:
         whole = int(total)
         return Delay(whole, total - whole)
 
+    def simulate(
+        self,
+        v: ArrayLike,
+        *,
+        channels: Mapping[str, ArrayLike] | None = None,
+        start: ArrayLike | None = None,
+    ) -> NDArray[np.float64]:
+        """
+        Return the displacement that a voltage causes, in free run.
+
+        Parameters
+        ----------
+        v : array_like, shape (n,)
+            Voltage [V], sampled at `sample_rate`; the stage is at rest under the first sample.
+        channels : mapping of str to array_like, shape (n,), optional
+            Further signals that effects of the model depend on.
+        start : array_like, shape (m,), optional
+            Play outputs before the first sample, normalised; those of a stage that last came
+            down to zero when absent.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            [m]
+
+        Raises
+        ------
+        DataError
+            When the voltage is not a vector of finite numbers, or a channel has another length.
+        ModelError
+            When an effect needs a channel that is not given.
+
+        Examples
+        --------
+        >>> import piezo_ident as pi
+        >>> model = pi.SimulatedStage.load('paper').model
+        >>> y = model.simulate([0.0] * 3 + [10.0] * 997)
+        >>> [round(1e6 * y[k], 1) for k in (0, 999)]
+        [0.0, 71.3]
+        """
+        x = np.asarray(v, dtype=np.float64)
+        if x.ndim != 1 or not np.all(np.isfinite(x)):
+            raise DataError('simulate: the voltage must be a vector of finite numbers, in volts')
+        if not x.size:
+            return np.empty(0)
+        piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
+        return self.stream(start).follow(piece)
+
     def stream(self, memory: ArrayLike | None = None) -> Stream:
-        """Return a run of this model that takes the voltage block by block."""
+        """
+        Return a run of this model that takes the voltage block by block.
+
+        Parameters
+        ----------
+        memory : array_like, shape (m,), optional
+            As `start` of `simulate`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import piezo_ident as pi
+        >>> model = pi.SimulatedStage.load('paper').model
+        >>> v = 5 + 5 * np.sin(np.arange(300) / 50)
+        >>> stream = model.stream()
+        >>> y = np.concatenate([stream.process(v[:100]), stream.process(v[100:])])
+        >>> bool(np.all(y == model.simulate(v)))
+        True
+        """
         return Stream(self, memory)
 
     def predict_piece(self, piece: Piece, memory: ArrayLike | None = None) -> NDArray[np.float64]:
@@ -244,28 +299,25 @@ class StageModel:
         self.check_rate(piece)
         return self.stream(memory).follow(piece)
 
-    def predict(
-        self, record: Record, memories: tuple[ArrayLike | None, ...] | None = None
-    ) -> Prediction:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """
-        Return the free-run prediction of a record.
-
-        Parameters
-        ----------
-        record : Record
-            Only its voltage, time and further channels are used.
-        memories : tuple of (array_like or None), optional
-            Play outputs at the start of each piece; see
-            `piezo_ident.model.initial_memory.fit_memory`.
+        Write the model file, in one piece: an old file stays whole until the new one is.
 
         Raises
         ------
-        ModelError
-            When a piece has another sampling rate than the model.
+        DataError
+            When the file cannot be written.
+
+        Examples
+        --------
+        >>> import piezo_ident as pi
+        >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
+        >>> pi.load('model.yaml').delay.samples
+        3
         """
-        starts = memories if memories is not None else (None,) * len(record.pieces)
-        pieces = tuple(self.predict_piece(p, m) for p, m in zip(record, starts, strict=True))
-        return Prediction(pieces, self.extrapolation(record))
+        from piezo_ident.model.files import model_to_yaml, write_text
+
+        write_text(path, model_to_yaml(self))
 
     def takes(self, piece: Piece) -> bool:
         """Return whether the model holds at the sampling rate of a piece."""
@@ -327,81 +379,3 @@ class StageModel:
                 'are they in volts?',
             )
         return ()
-
-
-class Stream:
-    """
-    One run of a model, block by block, in volts and metres.
-
-    The first sample after `reset`, or after construction, is taken as the command under which the
-    stage was at rest.
-    """
-
-    def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
-        self.model = model
-        self._chain = fused(model.chain(memory))
-        self._count = 0
-        # a chain that is one kernel needs no block to pass along, and knows the scaling itself
-        match self._chain.operators:
-            case (FusedOperator() as alone,):
-                s = model.scaling
-                self._alone: FusedOperator | None = alone.scaled(s.v0, s.V, s.y0, s.Y)
-                self._chain = Chain((self._alone,))
-            case _:
-                self._alone = None
-        self._started = False
-
-    @property
-    def sees_more(self) -> bool:
-        """Whether anything but the voltage can matter: time, further channels."""
-        return self._alone is None
-
-    def reset(self, v0: float) -> float:
-        """Come to rest at a voltage [V] and return the displacement there [m]."""
-        u0 = float(self.model.scaling.u(v0))
-        self._count, self._started = 0, True
-        return float(self.model.scaling.y(self._chain.reset(u0, u0)))
-
-    def follow(self, piece: Piece) -> NDArray[np.float64]:
-        """Return the displacement [m] for the next samples, which are a piece or a part of one."""
-        if not self.sees_more:
-            return self.process(piece.v)
-        y = np.empty(piece.n)
-        for start in range(0, piece.n, CHUNK):
-            cut = slice(start, start + CHUNK)
-            channels = {name: x[cut] for name, x in piece.channels.items()}
-            y[cut] = self.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
-        return y
-
-    def process(
-        self,
-        v: ArrayLike,
-        t: ArrayLike | None = None,
-        channels: Mapping[str, NDArray[np.float64]] | None = None,
-    ) -> NDArray[np.float64]:
-        """
-        Return the displacement [m] for the next stretch of voltage [V].
-
-        Parameters
-        ----------
-        v : array_like, shape (n,)
-        t : array_like, shape (n,), optional
-            Time [s]; counted from the first sample when absent.
-        channels : mapping of str to ndarray, optional
-            Further measured signals.
-        """
-        x = np.asarray(v, dtype=np.float64)
-        if x.size == 0:
-            return np.empty(0)
-        if not self._started:
-            self.reset(float(x[0]))
-        if self._alone is not None:
-            return self._alone.run(x)
-        if t is None:
-            time = (self._count + np.arange(x.size)) / self.model.sample_rate
-        else:
-            time = np.asarray(t, dtype=np.float64)
-        self._count += x.size
-        u = self.model.scaling.u(x)
-        block = self._chain.process(Block(t=time, v=u, x=u, channels=channels or {}))
-        return self.model.scaling.y(block.x)

@@ -35,9 +35,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
-from piezo_ident.excitation.program import load_program, parse_program, Program, Sequence
+from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.pacing import BlockClock
 from piezo_ident.nodes.answers import Answers, answers_problem
@@ -75,7 +74,7 @@ def read_program(text: str) -> Program:
     """
     if '\n' in text or ('segments' in text and ':' in text):
         return parse_program(text)
-    return load_program(find_config(text, 'program'))
+    return Program.load(text)
 
 
 @dataclass(eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 from piezo_ident.cli.outputs import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.identification.results import Steps
-from piezo_ident.model.files import load_model, model_to_yaml
+from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.diagnosis_jobs import Judgement, save_both_job
@@ -220,7 +220,7 @@ class IdentifierNode(LabNode):
             if self._is_busy():
                 return f'busy: {self._doing}; set the model when that has ended, or call ~/cancel'
             try:
-                self._files = {value: load_model(value)}
+                self._files = {value: load(value)}
             except PiezoIdentError as error:
                 return str(error)
         return None

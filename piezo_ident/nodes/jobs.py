@@ -16,15 +16,14 @@ import functools
 import json
 
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.identification.single_steps import find_delay, find_dynamics, find_hysteresis
 from piezo_ident.model.files import model_to_yaml
-from piezo_ident.model.simulated_stage import load_stage, simulate
-from piezo_ident.model.validation import free_runs
+from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.capture import refuse_incomplete, Snapshot
 from piezo_ident.record.record import Record
 from piezo_ident.report import steps_to_json, to_json, verdict, write_report
@@ -153,7 +152,7 @@ def _identify(
     else:
         result = identify(records, settings, progress=tick)
     tick('report', 0.98)
-    runs = free_runs(result.model, records, result.memories)
+    runs = piece_runs(result.model, records, result.memories)
     tick('report', 0.99)
     return Outcome(
         message=verdict(result),
@@ -186,8 +185,8 @@ def _save(identification: Identification, record: Record, folder: str, tick: Tic
 
 def warm_up() -> None:
     """Compile, or load, all that an identification needs, so that the first one is not slower."""
-    stage = load_stage(find_config('paper', 'stage'))
+    stage = SimulatedStage.load('paper')
     sequence = parse_program(_SMALL).build(stage.model.sample_rate)
-    record = simulate(stage, sequence, np.random.default_rng(0))
+    record = stage.play(sequence, np.random.default_rng(0))
     settings = Settings(thresholds=3, max_order=2, solver='swarm', swarm_size=4)
     identify(record, replace(settings, swarm_iterations=100))

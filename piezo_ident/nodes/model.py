@@ -16,7 +16,7 @@ import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import expected_error, Predictor, warm_up
-from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
+from piezo_ident.model.files import load, model_from_dict, parse_yaml
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
@@ -69,7 +69,7 @@ class ModelNode(LabNode):
         """Refuse a model file that cannot be used."""
         if name == 'model' and value:
             try:
-                self._files = {value: _tried(load_model(value))}
+                self._files = {value: _tried(load(value))}
             except PiezoIdentError as error:
                 return str(error)
         return None

@@ -50,11 +50,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Follower, Kind
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.base import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
@@ -89,7 +88,7 @@ class StageNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         try:
-            self._stage = load_stage(find_config(self.values['stage'], 'stage'))
+            self._stage = SimulatedStage.load(self.values['stage'])
         except OSError as error:
             raise DataError(f'stage: {error}') from None
         seed = self._stage.seed if self.values['seed'] < 0 else self.values['seed']

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.identification.results import Identification, Progress, silent
-from piezo_ident.model.files import save_model
+from piezo_ident.model.free_run import piece_runs, sines_of
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import free_runs, sines_of
 from piezo_ident.record.record import Record
 from piezo_ident.report.html import Shown
 from piezo_ident.report.numbers import to_json
@@ -77,7 +76,7 @@ def write_report(
     from piezo_ident.report.figures import draw, NAMES
 
     records = [records] if isinstance(records, Record) else list(records)
-    runs = free_runs(identification.model, records, identification.memories)
+    runs = piece_runs(identification.model, records, identification.memories)
     drawn = draw(identification, runs, lambda share: progress('drawing', 0.4 * share))
     shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.4 + 0.5 * share))
     progress('writing', 0.9)
@@ -196,7 +195,7 @@ def put_in_place(
             for name, text in texts.items():
                 # file names need not be Unicode
                 (work / name).write_bytes(text.encode('utf-8', 'replace'))
-            save_model(model, work / MODEL)
+            model.save(work / MODEL)
             # the numbers first: they tell that what comes after them is of a report
             for name in sorted(os.listdir(work), key=lambda n: (n == PAGE, n not in texts)):
                 os.replace(work / name, target / name)

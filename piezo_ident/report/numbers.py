@@ -21,8 +21,8 @@ from piezo_ident.identification.results import (
     Steps,
 )
 from piezo_ident.model.files import plain
+from piezo_ident.model.free_run import PieceRun, sines_of
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.validation import FreeRun, sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 
@@ -177,7 +177,7 @@ def _static_error(identification: Identification, data: str) -> float:
 def to_json(
     identification: Identification,
     records: Sequence[Record] = (),
-    runs: Iterable[FreeRun] = (),
+    runs: Iterable[PieceRun] = (),
 ) -> dict[str, Any]:
     """
     Return the result as plain data, ready for strict JSON.
@@ -187,7 +187,7 @@ def to_json(
     identification : Identification
     records : sequence of Record, optional
         For the faults that were met in the data.
-    runs : iterable of FreeRun, optional
+    runs : iterable of PieceRun, optional
         For the steady-state errors of sines.
 
     Returns

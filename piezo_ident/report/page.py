@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from piezo_ident.identification.results import Identification
-from piezo_ident.model.validation import SineError
+from piezo_ident.model.free_run import SineError
 from piezo_ident.record.record import Record
 from piezo_ident.report.html import cards, document, figures, listed, Shown, table
 from piezo_ident.report.numbers import verdict

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.identification.results import Identification
+from piezo_ident.model.free_run import SineError
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.validation import SineError
 from piezo_ident.record.record import Record
 from piezo_ident.report.numbers import fit_share, KINDS, length, modes, moves, number
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 import textwrap
 
 from piezo_ident.identification.results import Identification
+from piezo_ident.model.free_run import sine_errors, SineError
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.validation import sine_errors, SineError
 from piezo_ident.record.record import Record
 from piezo_ident.report.numbers import fit_share, KINDS, length, moves, number, verdict
 
@@ -44,7 +44,7 @@ def table_one(rows: Sequence[SineError]) -> str:
     Parameters
     ----------
     rows : sequence of SineError
-        From `piezo_ident.model.validation.sine_errors`.
+        From `piezo_ident.model.free_run.sine_errors`.
     """
     if not rows:
         return 'no sine segment is long enough for its steady state'

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.model.metrics import percent_of_stroke
-from piezo_ident.model.validation import sine_frequency
 from piezo_ident.record.record import Segment
 from piezo_ident.residual.floor import NoiseFloor
 from piezo_ident.residual.stretches import find_repeats, ResidualPart, strokes_of

@@ -26,7 +26,7 @@ from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_file, check_folder
 from piezo_ident.common.config import find_config, shipped_names
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.model.files import load_model
+from piezo_ident.model.files import load
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record
 import pytest
@@ -171,7 +171,7 @@ def test_simulate_json(capsys, tmp_path, made):
 
 
 def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made):
-    model = load_model(made / 'model.yaml')
+    model = load(made / 'model.yaml')
     assert model.delay.samples == 2
     out, picture = tmp_path / 'y.csv', tmp_path / 'y.png'
     argv = ['predict', made / 'model.yaml', made / 'sine.csv', '--out', out, '--plot', picture]
@@ -263,7 +263,7 @@ def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
     argv = ['identify', folder, '--model', model, '--report', report, *FAST]
     data = json.loads(succeed(capsys, *argv, '--validation', made / 'sine.csv', '--json'))
     assert data['files'] == {'model': str(model), 'report': str(report / 'report.html')}
-    assert load_model(model).delay.samples == 2
+    assert load(model).delay.samples == 2
     assert (report / 'report.html').is_file()
     (check,) = data['validation']
     assert check['record'] == 'sine.csv'
@@ -667,7 +667,7 @@ def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, 
         raise AssertionError('the work began')
 
     monkeypatch.setattr('piezo_ident.cli.model_commands.identify', forbidden)
-    monkeypatch.setattr('piezo_ident.cli.model_commands.predict_record', forbidden)
+    monkeypatch.setattr('piezo_ident.cli.model_commands.free_run', forbidden)
     monkeypatch.setattr('piezo_ident.cli.commands.simulate', forbidden)
     (tmp_path / 'file').write_text('')
     (tmp_path / 'mine').mkdir()
@@ -874,7 +874,7 @@ def test_interrupt_while_files_are_replaced(tmp_path, made, number):
     names = {p.name for p in (tmp_path / 'report').iterdir()}
     assert {'report.html', 'model.yaml', 'identification.json'} <= names
     assert not any(name.startswith('.') for name in names)
-    assert load_model(tmp_path / 'm.yaml').delay.samples == 2
+    assert load(tmp_path / 'm.yaml').delay.samples == 2
 
 
 def test_interrupt_behind_the_work_is_too_late():

@@ -8,9 +8,8 @@ from piezo_ident import cli
 from piezo_ident.cli import demo as demonstration
 from piezo_ident.cli import graph_demo
 from piezo_ident.cli.graph_demo import GraphRun, largest_difference
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 import pytest
 
 
@@ -78,6 +77,6 @@ def test_without_ros_there_is_nothing_to_fail(short, monkeypatch, tmp_path, caps
 
 
 def test_difference_of_two_models():
-    model = load_stage(find_config('paper', 'stage')).model
+    model = SimulatedStage.load('paper').model
     assert largest_difference(model, model) == 0.0
     assert largest_difference(model, model.without_dynamics()) > 0.1

@@ -18,8 +18,8 @@ from piezo_ident.cli import diagnose_command as module
 from piezo_ident.cli import effects_command, main
 from piezo_ident.diagnosis.diagnosis_json import diagnosis_schema
 from piezo_ident.effects import catalogue
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.files import load
+from piezo_ident.model.free_run import free_run
 from piezo_ident.record.io import write_record
 from piezo_ident.record.record import Record
 import pytest
@@ -55,7 +55,7 @@ def refuse(capsys, folder: Path, argv: list[object], *words: object) -> None:
 @pytest.fixture
 def made(tmp_path) -> Path:
     """Return a folder with a model that knows no creep, and records of a stage that creeps."""
-    save_model(base_model(), tmp_path / 'model.yaml')
+    base_model().save(tmp_path / 'model.yaml')
     record = measured('val.npz')
     write_record(record, tmp_path / 'val.npz')
     (piece,) = record.pieces
@@ -97,19 +97,19 @@ def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
     # the noise of the example is 0.0053 % of its stroke
     assert data['error']['before']['overall'] > 0.5
     assert data['error']['after']['overall'] < 0.01
-    model = load_model(refined)
+    model = load(refined)
     assert [e.name for e in model.effects] == ['creep']
     assert (report / 'model.yaml').read_bytes() == refined.read_bytes()
     record = measured()
-    assert predict_record(model, record).whole.percent < 0.01
-    assert predict_record(base_model(), record).whole.percent > 0.5
+    assert free_run(model, record).errors.percent < 0.01
+    assert free_run(base_model(), record).errors.percent > 0.5
     (row,) = [line for line in text.splitlines() if line.startswith('unseen.npz  ')]
     before, after = map(float, row.split()[1:3])
     assert after < 0.2 * before
     assert f'model: {refined} (' in text
     assert 'with creep' in text
     assert (report / 'report.html').is_file()
-    assert load_model(made / 'model.yaml').effects == ()
+    assert load(made / 'model.yaml').effects == ()
 
 
 def test_help(capsys):
@@ -329,7 +329,7 @@ def test_a_plug_in_is_listed_with_its_package(capsys, monkeypatch):
 def test_the_model_of_the_example_is_what_it_says():
     # what the fast tests lean on
     assert os.fspath(measured().name) == 'val.npz'
-    assert predict_record(refined_model(), measured()).whole.percent < 0.01
+    assert free_run(refined_model(), measured()).errors.percent < 0.01
 
 
 def test_the_example_in_the_documentation_is_the_one_that_is_tested():

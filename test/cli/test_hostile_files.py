@@ -25,7 +25,7 @@ from piezo_ident.cli import main
 from piezo_ident.common import yaml_io
 from piezo_ident.common.errors import ConfigError, DataError, ModelError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
+from piezo_ident.model.files import load, model_from_dict, parse_yaml
 from piezo_ident.model.simulated_stage import stage_from_dict
 from piezo_ident.record.bags.check import check_journal
 from piezo_ident.record.blocks import decode, Dimension
@@ -186,7 +186,7 @@ def test_counts_of_another_type_in_metadata(tmp_path, count):
 def test_yaml_bombs(tmp_path, bomb):
     path = tmp_path / 'x.yaml'
     path.write_text(BOMBS[bomb])
-    for read in (load_model, lambda p: parse_program(p.read_text())):
+    for read in (load, lambda p: parse_program(p.read_text())):
         soon(lambda r=read: r(path), seconds=20.0)
 
 
@@ -397,7 +397,7 @@ def test_what_has_no_end_is_not_opened(tmp_path, suffix, target):
     os.mkfifo(tmp_path / 'pipe')
     path = tmp_path / f'r{suffix}'
     path.symlink_to(target)
-    read = load_model if suffix == '.yaml' else read_record
+    read = load if suffix == '.yaml' else read_record
     soon(lambda: read(path), 'device or a pipe')
 
 

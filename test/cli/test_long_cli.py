@@ -11,13 +11,12 @@ import sys
 import numpy as np
 from piezo_ident.cli import main
 from piezo_ident.cli.console import Console
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import DataError
 from piezo_ident.model import long_prediction
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.files import load
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.long_prediction import predict_long
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record import long_bag
 from piezo_ident.record.bags.read import write_bag
@@ -30,7 +29,7 @@ RATE, WINDOW = 20_000.0, 4000
 
 
 def model(*effects: EffectSetting) -> StageModel:
-    paper = load_stage(find_config('paper', 'stage')).model
+    paper = SimulatedStage.load('paper').model
     return StageModel(
         paper.sample_rate,
         paper.scaling,
@@ -90,7 +89,7 @@ def nearly(one: object, other: object) -> None:
 
 @pytest.mark.parametrize('suffix', ['.csv', '.npz'])
 def test_prediction_of_a_long_bag_is_that_of_the_whole(bag, tmp_path, capsys, monkeypatch, suffix):
-    save_model(model(), tmp_path / 'm.yaml')
+    model().save(tmp_path / 'm.yaml')
     out, results, files = tmp_path / f'o{suffix}', [], []
     for window in (long_bag.WINDOW, WINDOW):
         monkeypatch.setattr(long_bag, 'WINDOW', window)
@@ -117,12 +116,10 @@ def test_prediction_with_effects_and_further_range(bag, short_windows):
     long, parts = read_long(bag), []
     assert isinstance(long, LongRecord)
     got = predict_long(narrow, long, add=lambda part, y_hat: parts.append(y_hat))
-    want = predict_record(narrow, read_record(bag))
-    np.testing.assert_allclose(
-        np.concatenate(parts), np.concatenate(want.prediction.pieces), rtol=0, atol=1e-15
-    )
-    assert got.prediction.warnings == want.prediction.warnings
-    assert len(got.prediction.warnings) == 2
+    want = free_run(narrow, read_record(bag))
+    np.testing.assert_allclose(np.concatenate(parts), want.predicted, rtol=0, atol=1e-15)
+    assert got.warnings == want.warnings
+    assert len(got.warnings) == 2
     assert got.estimated == want.estimated
     for one, other in ((got.whole, want.whole), (got.after, want.after)):
         nearly(vars(one), vars(other))
@@ -134,7 +131,7 @@ def test_range_that_is_swept_late_is_left_to_the_whole(
     monkeypatch.setattr(long_prediction, 'MOST', 100)
     with pytest.raises(NeedsWhole):
         predict_long(model(), read_long(bag))
-    save_model(model(), tmp_path / 'm.yaml')
+    model().save(tmp_path / 'm.yaml')
     result = said(capsys, 'predict', tmp_path / 'm.yaml', bag, '--out', tmp_path / 'o.npz')
     assert result['whole']['n'] == 60_000
 
@@ -152,10 +149,10 @@ def test_conversion_of_a_long_bag(bag, tmp_path, capsys, short_windows):
 
 
 def test_model_of_another_rate_is_refused(bag, tmp_path, capsys, short_windows):
-    save_model(model(), tmp_path / 'm.yaml')
-    slow = load_model(tmp_path / 'm.yaml')
+    model().save(tmp_path / 'm.yaml')
+    slow = load(tmp_path / 'm.yaml')
     slow = StageModel(5000.0, slow.scaling, slow.hysteresis, slow.dynamics, slow.delay)
-    save_model(slow, tmp_path / 'slow.yaml')
+    slow.save(tmp_path / 'slow.yaml')
     assert main(['predict', str(tmp_path / 'slow.yaml'), str(bag)]) == 2
     assert 'bag: the record is sampled at 20000 Hz, the model at 5000' in capsys.readouterr().err
 
@@ -214,7 +211,7 @@ print(int(status.partition('VmHWM:')[2].split()[0]) / 1024)
 @pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='Linux tells the peak memory')
 @pytest.mark.parametrize('name', ['o', 'o.npz', 'prediction.npz'])
 def test_memory_does_not_grow_with_the_bag(tmp_path, name):
-    save_model(model(), tmp_path / 'm.yaml')
+    model().save(tmp_path / 'm.yaml')
     peaks = []
     for n in (80_000, 400_000):
         v = 5.0 - 5.0 * np.cos(2 * np.pi * 50.0 * np.arange(n) / RATE)

@@ -12,7 +12,7 @@ import sys
 import numpy as np
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.files import model_from_dict, model_to_dict
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.free_run import free_run
 from piezo_ident.record.assemble import assemble
 import pytest
 
@@ -41,7 +41,7 @@ def test_a_model_that_overflows_is_no_prediction():
     data['output']['Y'] = 1e308
     data['hysteresis']['p2'] = 1e10
     with np.errstate(over='ignore'), pytest.raises(ModelError, match='diverges'):
-        predict_record(model_from_dict(data), untrusted.measured(untrusted.CHECK))
+        free_run(model_from_dict(data), untrusted.measured(untrusted.CHECK))
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,15 @@
 """Long records: what is used of them, and what the rest says."""
 
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis import beginnings as module
 from piezo_ident.diagnosis.beginnings import beginnings, rest_of, said_of
-from piezo_ident.model.free_run import predict_record
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
 RATE = 20_000.0
-PAPER = load_stage(find_config('paper', 'stage')).model
+PAPER = SimulatedStage.load('paper').model
 
 
 def record_of(*lengths, name='long', wrong=0.0, since=0):
@@ -59,11 +58,11 @@ def test_errors_on_both_sides_are_those_of_the_prediction(monkeypatch, window):
     record = record_of(4000, 6000, wrong=0.01, since=5000)
     # where the record is whole, what is used has all of it
     whole = rest_of(PAPER, [record], [record])
-    errors = predict_record(PAPER, record).whole
+    errors = free_run(PAPER, record).whole
     assert whole.used == pytest.approx(errors.percent_without_offset, rel=1e-6)
     assert whole.unused == 0.0
     (part,) = beginnings(PAPER, [record], 2500)
-    y_hat = np.concatenate(predict_record(PAPER, record).prediction.pieces)
+    y_hat = np.concatenate(free_run(PAPER, record).prediction.pieces)
     e = np.concatenate([p.y for p in record]) - y_hat
     e -= e[: part.n].mean()
     found = rest_of(PAPER, [record], [part])

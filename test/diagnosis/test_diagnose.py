@@ -25,7 +25,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
@@ -82,7 +82,7 @@ def measured(effect, size, seed):
 
 
 def unseen_errors(result, record) -> tuple[float, float]:
-    before, after = (predict_record(m, record).whole.percent for m in (result.given, result.model))
+    before, after = (free_run(m, record).whole.percent for m in (result.given, result.model))
     return before, after
 
 
@@ -126,7 +126,7 @@ def test_of_a_long_record_the_beginning_is_searched_and_all_is_fitted(truths, dr
         assert 'fitted to all of them' in said and 'changes later' not in said
         # errors are those of the model that comes back, over all
         for percent, one in ((result.before.overall, model), (result.after.overall, result.model)):
-            whole = predict_record(one, record).whole.percent
+            whole = free_run(one, record).whole.percent
             assert percent == pytest.approx(whole, rel=0.25)
 
 

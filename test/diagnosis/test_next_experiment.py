@@ -8,10 +8,9 @@ from dataclasses import replace
 
 from diagnosis_examples import example, measured
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.diagnosis.next_experiment import next_experiment
 from piezo_ident.diagnosis.results import FoundEffect, Untestable
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.record.record import Piece, Record
 import pytest
 
@@ -28,7 +27,7 @@ def played(*segments: str, slew: float = 40.0) -> Record:
 
 def shipped(name: str) -> Record:
     """Return what a shipped programme would record."""
-    sequence = load_program(find_config(name, 'program')).build(RATE)
+    sequence = Program.load(name).build(RATE)
     piece = Piece(sequence.v, np.zeros(sequence.n), RATE, segments=sequence.segments)
     return Record((piece,), name)
 

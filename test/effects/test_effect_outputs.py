@@ -13,6 +13,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import find_effect
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -164,13 +165,13 @@ def test_cross_coupling_says_which_channel_is_missing_and_what_there_is():
         model.stream().process(v)
     piece = Piece(v, v, FS, channels={'temperature': v, 'b': v})
     with pytest.raises(ModelError, match="'other_axis'; the data have b, temperature;"):
-        model.predict(Record((piece,)))
+        free_run(model, Record((piece,)))
 
 
 def test_cross_coupling_in_a_record_is_that_of_the_stream():
     model, v = with_effects('cross_coupling'), signal()
     record = Record((Piece(v, np.zeros(v.size), FS, channels={'other_axis': other(v.size)}),))
-    assert_array_equal(model.predict(record).pieces[0], played(model, v))
+    assert_array_equal(free_run(model, record).pieces[0], played(model, v))
 
 
 # -- hum, drift and gain: driven by time -------------------------------------------------------
@@ -215,7 +216,7 @@ def test_drift_goes_on_through_a_gap():
     static = with_effects('thermal_drift', model=STATIC)
     zero = np.zeros(100)
     early, late = Piece(zero, zero, FS), Piece(zero, zero, FS, start_time=2.0)
-    first, second = static.predict(Record((early, late))).pieces
+    first, second = free_run(static, Record((early, late))).pieces
     assert first[0] == 0.0
 
     def law(t):

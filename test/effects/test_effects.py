@@ -25,7 +25,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import catalogue, Effect, find_effect, Parameter, Trial, View
-from piezo_ident.model.files import load_model, model_from_dict, model_to_dict, save_model
+from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.chain import Block, SLOTS
 import pytest
@@ -191,8 +191,8 @@ def test_sample_by_sample_is_batch(name):
 
 def test_saving_and_loading_changes_nothing(tmp_path):
     model = with_effects(*VISIBLE)
-    save_model(model, tmp_path / 'model.yaml')
-    again = load_model(tmp_path / 'model.yaml')
+    model.save(tmp_path / 'model.yaml')
+    again = load(tmp_path / 'model.yaml')
     assert [e.name for e in again.effects] == list(VISIBLE)
     assert_array_equal(played(again, signal()), played(model, signal()))
 
@@ -201,8 +201,8 @@ def test_saving_and_loading_changes_nothing(tmp_path):
 def test_saving_and_loading_neutral_values_changes_nothing(name, tmp_path):
     # infinity and the like have to survive the file too
     model = with_setting(name, catalogue()[name].neutral(VISIBLE[name]))
-    save_model(model, tmp_path / 'model.yaml')
-    again = load_model(tmp_path / 'model.yaml')
+    model.save(tmp_path / 'model.yaml')
+    again = load(tmp_path / 'model.yaml')
     assert model_to_dict(again)['effects'] == model_to_dict(model)['effects']
     assert_array_equal(played(again, signal()), played(PAPER, signal()))
 

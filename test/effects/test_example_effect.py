@@ -28,9 +28,9 @@ import json
 import sys
 import numpy as np
 from piezo_ident.effects import catalogue, View
-from piezo_ident.model.files import load_model
+from piezo_ident.model.files import load
 
-model = load_model(sys.argv[1])
+model = load(sys.argv[1])
 view = View(20_000.0, 0.0, 1.0, np.array([1.0, 10.0]), 1.0)
 effect = catalogue()['soft_stop']
 print(json.dumps({

@@ -6,7 +6,7 @@
 from pathlib import Path
 
 from piezo_ident.excitation.catalogue import Option, REQUIRED, SIGNALS
-from piezo_ident.excitation.program import _HEAD, load_program
+from piezo_ident.excitation.program import _HEAD, Program
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,6 +56,6 @@ def test_every_key_of_the_head_stands_on_the_page(key):
 def test_what_the_page_says_of_the_shipped_programmes():
     text = '\n'.join(LINES)
     for name in ('identification', 'diagnosis', 'holds', 'validation', 'survey'):
-        program = load_program(ROOT / f'config/program_{name}.yaml')
+        program = Program.load(ROOT / f'config/program_{name}.yaml')
         assert f'`program_{name}.yaml`' in text or f'`config/program_{name}.yaml`' in text
         assert program.limits == (0.0, 10.0)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as ex
 from piezo_ident.excitation.catalogue import SIGNALS
-from piezo_ident.excitation.program import load_program, parse_program, Program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import KINDS
 import pytest
@@ -25,7 +25,7 @@ CONFIG = ('identification', 'validation', 'minor_loops', 'survey', 'diagnosis', 
 
 
 def config(name: str) -> Program:
-    return load_program(ROOT / f'config/program_{name}.yaml')
+    return Program.load(ROOT / f'config/program_{name}.yaml')
 
 
 def program(*segments: dict, **head) -> Program:
@@ -409,7 +409,7 @@ def test_rate_is_needed_from_somewhere():
 
 def test_missing_file_is_named():
     with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such file'):
-        load_program('nowhere.yaml')
+        Program.load('nowhere.yaml')
 
 
 def test_every_signal_says_its_kind():

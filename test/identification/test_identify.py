@@ -11,18 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import three_steps
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.files import load_model, model_from_dict, model_to_dict, save_model
-from piezo_ident.model.simulated_stage import (
-    load_stage,
-    Sensor,
-    simulate,
-    simulate_truth,
-    SimulatedStage,
-)
+from piezo_ident.model.files import load, model_from_dict, model_to_dict
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, Scaling
 from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Piece, Record, Segment
@@ -32,9 +27,9 @@ pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get('PIEZO_IDENT_DATA', ROOT.parent / 'shared/data'))
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml')
-DENSE = load_stage(ROOT / 'config/stage_dense.yaml')
-FULL = load_program(ROOT / 'config/program_identification.yaml')
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
+DENSE = SimulatedStage.load(ROOT / 'config/stage_dense.yaml')
+FULL = Program.load(ROOT / 'config/program_identification.yaml')
 SHORT = """
 limits: [0, 10]
 sample_rate: 20000
@@ -56,7 +51,7 @@ FREQUENCIES = (1, 10, 50, 80, 100, 120)
 def short(stage=PAPER, noise=None, seed=1, text=SHORT) -> Record:
     if noise is not None:
         stage = replace(stage, sensor=replace(stage.sensor, noise_rms=noise * 75e-6))
-    return simulate(stage, parse_program(text).build(), np.random.default_rng(seed), 'short')
+    return stage.play(parse_program(text).build(), np.random.default_rng(seed), 'short')
 
 
 def sine_errors(truth, model) -> list[float]:
@@ -76,14 +71,14 @@ def sine_errors(truth, model) -> list[float]:
 
 def loop_error(truth, model) -> float:
     """Return the error over minor loops, % of their stroke."""
-    v = load_program(ROOT / 'config/program_minor_loops.yaml').build().v
+    v = Program.load(ROOT / 'config/program_minor_loops.yaml').build().v
     y, y_hat = (m.stream().process(v) for m in (truth, model))
     return 100 * float(np.sqrt(np.mean((y - y_hat) ** 2)) / np.ptp(y))
 
 
 @pytest.fixture(scope='module')
 def paper():
-    record = simulate(PAPER, FULL.build(), np.random.default_rng(1), 'paper')
+    record = PAPER.play(FULL.build(), np.random.default_rng(1), 'paper')
     return record, identify(record)
 
 
@@ -178,8 +173,8 @@ def test_inputs_stay_and_the_seed_repeats_bit_for_bit():
 
 def test_model_keeps_its_story_in_the_file(paper, tmp_path):
     _, result = paper
-    save_model(result.model, tmp_path / 'model.yaml')
-    again = load_model(tmp_path / 'model.yaml')
+    result.model.save(tmp_path / 'model.yaml')
+    again = load(tmp_path / 'model.yaml')
     assert model_to_dict(again) == model_to_dict(result.model)
     story = again.identification
     assert story['records'] == ['paper']
@@ -200,7 +195,7 @@ def test_seeds_and_noise(seed, noise):
 
 
 def test_dense_truth_that_no_ten_thresholds_can_hit():
-    record = simulate(DENSE, FULL.build(), np.random.default_rng(1), 'dense')
+    record = DENSE.play(FULL.build(), np.random.default_rng(1), 'dense')
     for count, limit in ((10, 0.25), (None, 0.05)):
         model = identify(record, Settings(thresholds=count)).model
         sines, loops = sine_errors(DENSE.model, model), loop_error(DENSE.model, model)
@@ -498,7 +493,7 @@ def test_triangle_that_does_not_cover_the_range_warns():
     result = identify(short(text=TALL.replace('step, bias: 5', 'step, bias: 9')), QUICK)
     assert any('does not cover' in w for w in result.warnings)
     assert result.model.scaling.range == pytest.approx((0.0, 6.0), abs=0.01)
-    wide = result.model.predict(simulate_truth(PAPER, FULL.build()))
+    wide = free_run(result.model, PAPER.ideal.play(FULL.build()))
     assert wide.warnings
 
 
@@ -520,7 +515,7 @@ def test_creep_does_not_become_dynamics():
     """Slow poles that stand for creep halved G at 80 Hz before slow motion was filtered out."""
     setting = EffectSetting('creep', {'gain': [0.012] * 3, 'time_constant': [0.1, 1.0, 10.0]})
     crept = replace(PAPER, model=replace(PAPER.model, effects=(setting,)))
-    record = simulate(crept, FULL.build(), np.random.default_rng(1), 'crept')
+    record = crept.play(FULL.build(), np.random.default_rng(1), 'crept')
     G = identify(record, QUICK).model.dynamics
     f = np.array([10.0, 80.0, 300.0])
     true = np.abs(PAPER.model.dynamics.normalised().response(f, 20_000.0))

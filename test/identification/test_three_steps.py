@@ -14,7 +14,7 @@ from piezo_ident.identification.prepare import runs_of, scaling_of
 from piezo_ident.identification.results import Settings, silent
 from piezo_ident.identification.step3_hysteresis import factorise
 from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
@@ -22,7 +22,7 @@ import pytest
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 ROOT = Path(__file__).resolve().parents[2]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml')
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
 PROGRAM = """
 limits: [0, 10]
 sample_rate: 20000
@@ -42,7 +42,7 @@ def runs(*records):
 
 
 def record(stage=PAPER, labels=('step', 'settle', 'noise', 'triangle')):
-    made = simulate(stage, parse_program(PROGRAM).build(), np.random.default_rng(0))
+    made = stage.play(parse_program(PROGRAM).build(), np.random.default_rng(0))
     p = made.pieces[0]
     return Record((replace(p, segments=tuple(s for s in p.segments if s.kind in labels)),))
 

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose
-from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import runs_of, scaling_of
 from piezo_ident.identification.results import Settings, silent
 from piezo_ident.identification.unlabelled import joint_fit
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record
 import pytest
@@ -28,7 +27,10 @@ FS = 5000.0
 POLE = np.exp(2 * np.pi * 700 / FS * (-0.03 + 1j * np.sqrt(1 - 0.03**2)))
 G = Dynamics(np.real(np.poly([POLE, np.conj(POLE)]))[1:], [0.3, 0.3]).normalised()
 STAGE = replace(
-    load_stage(ROOT / 'config/stage_paper.yaml').model, sample_rate=FS, dynamics=G, delay=Delay(2)
+    SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model,
+    sample_rate=FS,
+    dynamics=G,
+    delay=Delay(2),
 )
 
 
@@ -101,9 +103,9 @@ def test_given_delay_is_taken_and_too_little_is_refused():
 
 
 def test_steps_alone_do_not_identify_hysteresis():
-    stage = load_stage(find_config('paper', 'stage'))
+    stage = SimulatedStage.load('paper')
     text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.1, count: 40}'
-    played = simulate(stage, parse_program(text).build(20000.0), np.random.default_rng(1))
+    played = stage.play(parse_program(text).build(20000.0), np.random.default_rng(1))
     steps = played.find('step')[0]
     record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
     missing = dict(identify(record).not_identified)

@@ -21,8 +21,8 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
 from piezo_ident.many.run import Diagnose, Identify, run_many
 from piezo_ident.many.table import csv_text, Row
-from piezo_ident.model.files import load_model, save_model
-from piezo_ident.model.simulated_stage import Sensor, simulate, SimulatedStage
+from piezo_ident.model.files import load
+from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -64,7 +64,7 @@ def records(tmp_path_factory) -> list[Path]:
     folder = tmp_path_factory.mktemp('line')
     sequence = parse_program(PROGRAM).build(RATE)
     for i, (name, stroke) in enumerate(STROKES.items()):
-        record = simulate(stage(stroke), sequence, np.random.default_rng(i))
+        record = stage(stroke).play(sequence, np.random.default_rng(i))
         write_record(record, folder / f'{name}.npz')
     (folder / 'stage_3.npz').write_bytes(b'a cable was loose')
     return [folder / f'stage_{i}.npz' for i in (1, 2, 10, 3)]
@@ -87,7 +87,7 @@ def test_each_record_is_a_row_with_its_stage(rows, folder):
     for row in rows:
         if row.record in STROKES:
             assert row.values['delay_samples'] == pytest.approx(2, abs=0.3)
-            model = load_model(folder / 'models' / f'{row.record}.yaml')
+            model = load(folder / 'models' / f'{row.record}.yaml')
             assert row.values['p2'] == pytest.approx(model.hysteresis.p2)
 
 
@@ -158,7 +158,7 @@ def test_diagnosis_with_a_model_for_each(tmp_path):
     paths = [tmp_path / 'records' / f'{name}.npz' for name in ('a', 'b')]
     for path in paths:
         write_record(record, path)
-    save_model(base_model(), tmp_path / 'given/a.yaml')
+    base_model().save(tmp_path / 'given/a.yaml')
     first, second = run_many(paths, tmp_path / 'out', Diagnose(tmp_path / 'given'), jobs=1)
     assert first.is_good, first.reason
     assert first.values['verdict'] and first.values['model'] == 'a.yaml'

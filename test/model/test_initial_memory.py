@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.model import initial_memory as memory_module
-from piezo_ident.model.free_run import predict_record
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.initial_memory import fit_memory, forgotten, is_at_rest, start_memory
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Piece, Record
@@ -21,7 +21,7 @@ import pytest
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[2]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 V = 5 + 5 * np.sin(2 * np.pi * 10 * np.arange(4000) / FS)
 
 
@@ -130,8 +130,8 @@ def test_a_gap_does_not_make_an_unknown_start_known():
     piece = started_from(None)
     # a sample is lost long before the range is swept
     record = Record((piece.cut(0, 500), piece.cut(501, piece.n)))
-    found = predict_record(PAPER, record)
+    found = free_run(PAPER, record)
     assert found.estimated == (True, False)
-    assert found.after.n == piece.n - forgotten(V)
+    assert found.errors_after_start.n == piece.n - forgotten(V)
     still = Record((replace(piece, v=np.full(piece.n, 5.0)),))
-    assert predict_record(PAPER, still).after is None
+    assert free_run(PAPER, still).errors_after_start is None

@@ -14,17 +14,16 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import ConfigError, DataError, ModelError
 from piezo_ident.model.files import (
-    load_model,
+    load,
     load_yaml,
     model_from_dict,
     model_to_dict,
     model_to_yaml,
     plain,
-    save_model,
     SCHEMA_VERSION,
     write_text,
 )
-from piezo_ident.model.simulated_stage import load_stage, stage_from_dict
+from piezo_ident.model.simulated_stage import SimulatedStage, stage_from_dict
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Delay
 import pytest
@@ -32,7 +31,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = replace(
-    load_stage(ROOT / 'config/stage_paper.yaml').model,
+    SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model,
     delay=Delay(3, 0.25),
     effects=(EffectSetting('creep', {'gain': [0.012, 0.01], 'time_constant': [0.1, 1 / 3]}),),
     identification={
@@ -49,8 +48,8 @@ def data() -> dict:
 
 
 def test_save_and_load_is_exact(tmp_path):
-    save_model(PAPER, tmp_path / 'model.yaml')
-    again = load_model(tmp_path / 'model.yaml')
+    PAPER.save(tmp_path / 'model.yaml')
+    again = load(tmp_path / 'model.yaml')
     assert model_to_dict(again) == model_to_dict(PAPER)
     assert again.scaling == PAPER.scaling
     assert again.delay == PAPER.delay
@@ -96,7 +95,7 @@ def test_numbers_as_people_write_them(tmp_path):
     # YAML 1.1 takes 75e-6 for text
     path = tmp_path / 'model.yaml'
     path.write_text(text.replace('75.0e-6', '75e-6').replace('20000.0', '2e4'), encoding='utf-8')
-    model = load_model(path)
+    model = load(path)
     assert model.scaling.Y == 75e-6
     assert model.sample_rate == 2e4
 
@@ -270,7 +269,7 @@ def test_hostile_yaml_gives_an_error_of_ours(tmp_path, text):
     path = tmp_path / 'model.yaml'
     path.write_text(text, encoding='utf-8')
     with pytest.raises((ConfigError, ModelError)) as caught:
-        load_model(path)
+        load(path)
     assert '\n' not in str(caught.value)
     assert len(str(caught.value)) < 1000
 
@@ -302,7 +301,7 @@ def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
     path = tmp_path / 'model.yaml'
     path.write_text(BOMB, encoding='utf-8')
     with pytest.raises(ConfigError, match='too large'):
-        load_model(path)
+        load(path)
     path.write_text(
         model_to_yaml(replace(PAPER, identification={}, effects=())).replace(
             'identification: {}', 'identification: &me {x: *me}'
@@ -310,7 +309,7 @@ def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
         encoding='utf-8',
     )
     with pytest.raises(ConfigError, match='identification'):
-        load_model(path)
+        load(path)
 
 
 def test_unreadable_files_are_named(tmp_path):
@@ -329,7 +328,7 @@ def test_unreadable_files_are_named(tmp_path):
 
 def test_old_file_stays_whole_when_writing_fails(tmp_path, monkeypatch):
     path = tmp_path / 'model.yaml'
-    save_model(PAPER, path)
+    PAPER.save(path)
     before = path.read_bytes()
 
     def full(*_):
@@ -339,7 +338,7 @@ def test_old_file_stays_whole_when_writing_fails(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(os, name, full)
             with pytest.raises(DataError, match='No space left'):
-                save_model(replace(PAPER, sample_rate=1.0), path)
+                replace(PAPER, sample_rate=1.0).save(path)
         assert path.read_bytes() == before
         assert os.listdir(tmp_path) == ['model.yaml']
 
@@ -356,7 +355,7 @@ def test_interrupt_leaves_no_rubbish(tmp_path, monkeypatch):
 
 def test_impossible_places_are_named(tmp_path):
     with pytest.raises(DataError, match='cannot be written'):
-        save_model(PAPER, tmp_path / 'no folder' / 'model.yaml')
+        PAPER.save(tmp_path / 'no folder' / 'model.yaml')
     (tmp_path / 'folder').mkdir()
     with pytest.raises(DataError, match='cannot be written'):
         write_text(tmp_path / 'folder', 'x')

@@ -12,22 +12,14 @@ from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ConfigError, ModelError, PiezoIdentError
-from piezo_ident.excitation.program import load_program, parse_program
+from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.model.files import load_yaml
-from piezo_ident.model.simulated_stage import (
-    Converter,
-    load_stage,
-    Sensor,
-    simulate,
-    simulate_truth,
-    SimulatedStage,
-    stage_from_dict,
-)
+from piezo_ident.model.simulated_stage import Converter, Sensor, SimulatedStage, stage_from_dict
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml')
-VALIDATION = load_program(ROOT / 'config/program_validation.yaml').build()
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
+VALIDATION = Program.load(ROOT / 'config/program_validation.yaml').build()
 FS = 20_000.0
 
 
@@ -47,7 +39,7 @@ ALONE = {1: 0.09, 10: 0.85, 50: 4.3, 80: 6.8, 100: 8.5, 120: 10.2}
 @pytest.fixture(scope='module')
 def truth_and_alone():
     alone = SimulatedStage(PAPER.model.without_dynamics())
-    return simulate_truth(PAPER, VALIDATION), simulate_truth(alone, VALIDATION)
+    return PAPER.ideal.play(VALIDATION), alone.ideal.play(VALIDATION)
 
 
 @pytest.mark.parametrize('f', ALONE)
@@ -61,14 +53,14 @@ def test_hysteresis_alone_misses_as_the_papers_coefficients_say(truth_and_alone,
 
 
 def test_full_stroke_is_that_of_the_paper():
-    y = simulate_truth(PAPER, VALIDATION).find('sine:1Hz')[0].y
+    y = PAPER.ideal.play(VALIDATION).find('sine:1Hz')[0].y
     # 0.6411 x 1.483 of 75 um
     assert y.max() == pytest.approx(71.3e-6, rel=1e-3)
     assert PAPER.model.dynamics.gain == pytest.approx(0.6411, abs=1e-4)
 
 
 def test_dense_stage_has_the_same_full_stroke_and_no_threshold_on_the_papers_grid():
-    dense = load_stage(ROOT / 'config/stage_dense.yaml')
+    dense = SimulatedStage.load(ROOT / 'config/stage_dense.yaml')
     h, p = dense.model.hysteresis, PAPER.model.hysteresis
     assert h.thresholds.size == 40
     assert np.abs(h.thresholds[:, None] - p.thresholds[None, :]).min() > 0.01
@@ -79,11 +71,11 @@ def test_dense_stage_has_the_same_full_stroke_and_no_threshold_on_the_papers_gri
 
 
 def test_stage_with_effects_differs_from_the_papers_in_nothing_else():
-    stage = load_stage(ROOT / 'config/stage_effects.yaml')
+    stage = SimulatedStage.load(ROOT / 'config/stage_effects.yaml')
     assert [e.name for e in stage.model.effects] == ['creep', 'rate_dependent_hysteresis']
     bare = SimulatedStage(replace(stage.model, effects=()), stage.sensor, stage.seed)
     s = sequence('{signal: sine, bias: 5, amplitude: 4, frequency: 20, periods: 4}')
-    assert_array_equal(simulate_truth(bare, s).pieces[0].y, simulate_truth(PAPER, s).pieces[0].y)
+    assert_array_equal(bare.ideal.play(s).pieces[0].y, PAPER.ideal.play(s).pieces[0].y)
     assert bare.sensor == PAPER.sensor
 
 
@@ -93,7 +85,7 @@ def test_stage_with_effects_differs_from_the_papers_in_nothing_else():
     which=st.sampled_from(['stage_paper', 'stage_effects']),
 )
 def test_result_does_not_depend_on_the_cutting(cuts, which):
-    stage = load_stage(ROOT / f'config/{which}.yaml')
+    stage = SimulatedStage.load(ROOT / f'config/{which}.yaml')
     s = sequence('{signal: sine, bias: 5, amplitude: 5, frequency: 100, periods: 5}', 2e4)
     v = s.v[-3000:]
     whole = stage.run(np.random.default_rng(7)).process(v)
@@ -105,7 +97,7 @@ def test_result_does_not_depend_on_the_cutting(cuts, which):
 
 def test_simulate_is_the_stream():
     s = sequence('{signal: noise, bias: 5, amplitude: 1, cutoff: 2000, duration: 1.3}')
-    record = simulate(PAPER, s, np.random.default_rng(3))
+    record = PAPER.play(s, np.random.default_rng(3))
     run = PAPER.run(np.random.default_rng(3))
     parts = [run.process(s.v[k : k + 100]) for k in range(0, s.n, 100)]
     assert_array_equal(record.pieces[0].y, np.concatenate(parts))
@@ -113,7 +105,7 @@ def test_simulate_is_the_stream():
 
 def test_record_holds_the_command_the_clock_and_the_segments():
     s = sequence('{signal: hold, level: 3.14159265, duration: 0.1}')
-    record = simulate(PAPER, s, np.random.default_rng(0), name='mine')
+    record = PAPER.play(s, np.random.default_rng(0), name='mine')
     (piece,) = record.pieces
     assert record.name == 'mine'
     assert_array_equal(piece.v, s.v)
@@ -138,13 +130,13 @@ def test_stage_moves_by_what_the_dac_gives_it():
 def test_noise_level_is_the_configured_one():
     s = sequence('{signal: idle, duration: 4}')
     bare = replace(PAPER, sensor=replace(PAPER.sensor, adc=None))
-    y = simulate(bare, s, np.random.default_rng(1)).pieces[0].y
+    y = bare.play(s, np.random.default_rng(1)).pieces[0].y
     # 80000 samples: the rms is known to 0.25 %
     assert y.std() == pytest.approx(1.5e-9, rel=0.01)
     spread = np.corrcoef(y[:-1], y[1:])[0, 1]
     assert abs(spread) < 4 / np.sqrt(y.size)
     # the converter adds its step^2 / 12
-    read = simulate(PAPER, s, np.random.default_rng(1)).pieces[0].y
+    read = PAPER.play(s, np.random.default_rng(1)).pieces[0].y
     step = 150e-6 / 2**16
     assert read.std() == pytest.approx(np.hypot(1.5e-9, step / np.sqrt(12)), rel=0.02)
     assert_allclose(read / step, np.rint(read / step), atol=1e-6)
@@ -154,7 +146,7 @@ def test_seed_reproduces_and_matters():
     s = sequence('{signal: idle, duration: 0.1}')
 
     def y(seed):
-        return simulate(PAPER, s, np.random.default_rng(seed)).pieces[0].y
+        return PAPER.play(s, np.random.default_rng(seed)).pieces[0].y
 
     assert_array_equal(y(1), y(1))
     assert not np.array_equal(y(1), y(2))
@@ -162,31 +154,31 @@ def test_seed_reproduces_and_matters():
 
 def test_truth_has_neither_noise_nor_steps():
     s = sequence('{signal: hold, level: 2, duration: 0.1}')
-    y = simulate_truth(PAPER, s).pieces[0].y
+    y = PAPER.ideal.play(s).pieces[0].y
     assert y[0] == 0.0
     assert np.unique(y).size > 0.9 * np.flatnonzero(np.diff(y)).size
-    assert_array_equal(y, PAPER.model.predict_piece(simulate_truth(PAPER, s).pieces[0]))
+    assert_array_equal(y, PAPER.model.predict_piece(PAPER.ideal.play(s).pieces[0]))
 
 
 def test_clipping_is_reported_and_counted():
     small = replace(PAPER, sensor=replace(PAPER.sensor, adc=Converter(16, -30e-6, 30e-6)))
     s = sequence('{signal: triangle, peaks: [10], base: 0, slope: 100}')
-    record = simulate(small, s, np.random.default_rng(1))
-    truth = simulate_truth(small, s).pieces[0].y
+    record = small.play(s, np.random.default_rng(1))
+    truth = small.ideal.play(s).pieces[0].y
     (fault,) = record.faults
     assert (fault.name, fault.where) == ('clipping', 'displacement')
     assert fault.count == pytest.approx(np.sum(truth > 30e-6), abs=3)
     assert record.pieces[0].y.max() == 30e-6 - 60e-6 / 2**16
 
     s = sequence('{signal: hold, level: 12, duration: 0.1}')
-    faults = {f.where: f.count for f in simulate(PAPER, s, np.random.default_rng(1)).faults}
+    faults = {f.where: f.count for f in PAPER.play(s, np.random.default_rng(1)).faults}
     assert faults == {'voltage': np.sum(s.v > 10)} | (
         {'displacement': faults['displacement']} if 'displacement' in faults else {}
     )
 
 
 def test_full_range_is_not_clipping():
-    assert simulate(PAPER, VALIDATION, np.random.default_rng(1)).faults == ()
+    assert PAPER.play(VALIDATION, np.random.default_rng(1)).faults == ()
 
 
 @given(
@@ -210,7 +202,7 @@ def test_converter_takes_the_nearest_code(bits, low, span, x):
 
 def test_wrong_rate_is_refused():
     with pytest.raises(ModelError, match='sampled at 1000 Hz'):
-        simulate(PAPER, sequence('{signal: idle, duration: 1}', 1000), np.random.default_rng(0))
+        PAPER.play(sequence('{signal: idle, duration: 1}', 1000), np.random.default_rng(0))
 
 
 def test_plain_model_file_is_an_ideal_stage():
@@ -253,5 +245,5 @@ def test_exponents_that_yaml_reads_as_text_are_numbers():
 
 
 def test_missing_file_is_named():
-    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such file'):
-        load_stage('nowhere.yaml')
+    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such stage'):
+        SimulatedStage.load('nowhere.yaml')

@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.effects import catalogue, View
-from piezo_ident.model.simulated_stage import load_stage
-from piezo_ident.model.stage_model import CHUNK, EffectSetting, Scaling, StageModel
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record
@@ -22,7 +24,7 @@ import pytest
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[2]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 
 
 #: what effects may know of the signals of this file
@@ -77,8 +79,7 @@ def test_streamed_is_batch_with_every_effect_of_the_catalogue(cuts, names, d, fr
     )
     v = long_signal(4000)
     other = np.sin(np.arange(v.size) / 50)
-    record = Record((Piece(v, np.zeros(v.size), FS, channels={'other_axis': other}),))
-    (batch,) = model.predict(record).pieces
+    batch = model.simulate(v, channels={'other_axis': other})
     stream, edges = model.stream(), [0, *sorted(cuts), v.size]
     parts = [
         stream.process(v[a:b], channels={'other_axis': other[a:b]}) for a, b in pairwise(edges)
@@ -89,8 +90,7 @@ def test_streamed_is_batch_with_every_effect_of_the_catalogue(cuts, names, d, fr
 
 def test_prediction_does_not_show_its_own_chunks():
     v = long_signal()
-    (batch,) = PAPER.predict(Record((Piece(v, np.zeros(v.size), FS),))).pieces
-    assert_array_equal(PAPER.stream().process(v), batch)
+    assert_array_equal(PAPER.stream().process(v), PAPER.simulate(v))
 
 
 def test_chain_is_h_then_g_then_delay():
@@ -160,32 +160,32 @@ def record(v, rate=FS, name='mine'):
 def test_other_rates_are_refused_unless_nothing_depends_on_them():
     v = np.linspace(0, 10, 100)
     with pytest.raises(ModelError, match='5000 Hz'):
-        PAPER.predict(record(v, 5000.0))
-    PAPER.predict(record(v, FS * (1 + 1e-8)))
+        free_run(PAPER, record(v, 5000.0))
+    free_run(PAPER, record(v, FS * (1 + 1e-8)))
     static = replace(PAPER, dynamics=Dynamics.unit(), delay=Delay(0))
     assert static.is_static
     assert static.without_dynamics().is_static
-    static.predict(record(v, 5000.0))
+    free_run(static, record(v, 5000.0))
     assert not PAPER.is_static
 
 
 def test_leaving_the_identified_range_warns_with_numbers():
-    assert PAPER.predict(record(np.linspace(0, 10, 100))).warnings == ()
+    assert free_run(PAPER, record(np.linspace(0, 10, 100))).warnings == ()
     # rounding at the ends is no extrapolation
-    assert PAPER.predict(record([0, -1e-3, 10.004])).warnings == ()
-    (warning,) = PAPER.predict(record([0, 5, 10, 12])).warnings
+    assert free_run(PAPER, record([0, -1e-3, 10.004])).warnings == ()
+    (warning,) = free_run(PAPER, record([0, 5, 10, 12])).warnings
     assert warning.startswith('mine: 25.0%')
     assert '0 .. 10 V' in warning
     assert '12 V' in warning
 
 
 def test_millivolts_are_taken_for_what_they_are():
-    (warning,) = PAPER.predict(record([0, 5e-3, 10e-3])).warnings
+    (warning,) = free_run(PAPER, record([0, 5e-3, 10e-3])).warnings
     assert 'mine: ' in warning
     assert 'are they in volts?' in warning
     # a small signal is a signal, and a stage at 0 V is at rest
-    assert PAPER.predict(record([0, 0.05, 0.03])).warnings == ()
-    assert PAPER.predict(record([0, 0, 0])).warnings == ()
+    assert free_run(PAPER, record([0, 0.05, 0.03])).warnings == ()
+    assert free_run(PAPER, record([0, 0, 0])).warnings == ()
 
 
 def test_hysteresis_alone_keeps_the_static_gain():
@@ -207,16 +207,17 @@ def test_stream_comes_to_rest_where_it_is_told():
     assert stream.process([]).size == 0
 
 
-def test_each_piece_starts_afresh_and_from_the_memory_given():
+def test_simulate_starts_from_rest_or_from_the_memory_given():
     v = 5 + np.linspace(0, 2, 200)
-    pieces = Record((Piece(v, 0 * v, FS), Piece(v, 0 * v, FS)))
     top = v[0] / 10 - 0 * PAPER.hysteresis.thresholds
-    one, two = PAPER.predict(pieces, (None, top)).pieces
+    one, two = PAPER.simulate(v), PAPER.simulate(v, start=top)
     assert_array_equal(one, PAPER.stream().process(v))
     assert_array_equal(two, PAPER.stream(top).process(v))
     assert np.abs(one - two).max() > 1e-6
-    with pytest.raises(ValueError, match='shorter'):
-        PAPER.predict(pieces, (None,))
+    assert PAPER.simulate([]).size == 0
+    for wrong in ([[1.0, 2.0]], [1.0, np.nan], 3.0):
+        with pytest.raises(DataError, match='voltage'):
+            PAPER.simulate(wrong)
 
 
 def test_unknown_effect_is_refused():

@@ -5,8 +5,8 @@
 
 import numpy as np
 from piezo_ident.common.errors import ModelError
+from piezo_ident.model.free_run import piece_runs, sine_errors, sine_frequency
 from piezo_ident.model.stage_model import Scaling, StageModel
-from piezo_ident.model.validation import free_runs, sine_errors, sine_frequency
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record, Segment
@@ -86,18 +86,18 @@ def test_frequency_of_a_label(label, frequency):
     assert sine_frequency(label) == frequency
 
 
-def test_another_rate_is_refused_for_sines_and_left_out_of_free_runs():
+def test_another_rate_is_refused_for_sines_and_left_out_of_piece_runs():
     v = sine(5.0, 2.0)
     other = Record((Piece(v, v, 500.0, 0.0, (Segment('sine:5Hz', 0, v.size),)),), 'r')
     model = linear_stage(delay=1)
     with pytest.raises(ModelError, match='500 Hz'):
         sine_errors(model, other)
-    assert free_runs(model, other) == []
+    assert piece_runs(model, other) == []
 
 
 def test_free_run_of_a_piece_from_an_unknown_start():
     model = linear_stage(weights=(0.2, 0.2))
     v = sine(1.0, 3.0)
     y = model.predict_piece(Piece(v, v, RATE), memory=np.array([0.4, 0.1]))
-    (run,) = free_runs(model, Record((Piece(v, y, RATE),), 'r'))
+    (run,) = piece_runs(model, Record((Piece(v, y, RATE),), 'r'))
     assert np.abs(run.y_hat - y).max() < 1e-8

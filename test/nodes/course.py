@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import model_from_dict, parse_yaml
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Record
@@ -124,8 +124,8 @@ def voltage_of(program: str, size: int = SIZE) -> list[Samples]:
 
 def simulated(program: str = PROGRAM, seed: int = 1) -> Record:
     """Return what the paper's stage answers."""
-    stage = load_stage(find_config('paper', 'stage'))
-    return simulate(stage, parse_program(program).build(), np.random.default_rng(seed))
+    stage = SimulatedStage.load('paper')
+    return stage.play(parse_program(program).build(), np.random.default_rng(seed))
 
 
 def pairs_of(record: Record, size: int = SIZE) -> list[tuple[Samples, Samples]]:

@@ -21,7 +21,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from graph import Graph
 from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.files import load_model, model_from_dict, parse_yaml
+from piezo_ident.model.files import load, model_from_dict, parse_yaml
 import yaml
 
 TRUTHS = ('creep', 'rate_dependent_hysteresis')
@@ -199,8 +199,8 @@ def test_save_writes_both_reports(lab, stories, tmp_path):
     last = end_of(lab, truth, begin(lab, truth, 'save'))[-1]
     assert last['state'] == 'done' and last['message'].count('report.html') == 2, last
     folder = tmp_path / 'out'
-    assert not load_model(folder / 'model.yaml').effects
-    assert [e.name for e in load_model(folder / 'diagnosis/model.yaml').effects] == [truth]
+    assert not load(folder / 'model.yaml').effects
+    assert [e.name for e in load(folder / 'diagnosis/model.yaml').effects] == [truth]
     written = json.loads((folder / 'diagnosis/diagnosis.json').read_text())
     assert written == json.loads(lab.texts(f'{truth}/report')[-1])
     assert (folder / 'diagnosis/report.html').is_file()

@@ -7,9 +7,8 @@
 from course import column, FS, HIGH, SHORT
 from graph import best_of_three, Graph, Late
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.simulated_stage import load_stage, simulate
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.blocks import cut_blocks
 import pytest
 from std_msgs.msg import Float64MultiArray
@@ -72,9 +71,7 @@ def test_a_programme_in_real_time(lab):
     ]
 
     # what comes back is the simulation of the same sequence and seed, bit for bit
-    record = simulate(
-        load_stage(find_config('paper', 'stage')), sequence, np.random.default_rng(3)
-    )
+    record = SimulatedStage.load('paper').play(sequence, np.random.default_rng(3))
     back = lab.collect('displacement')
     ty, y = column(back)
     assert ty.tobytes() == t.tobytes()

@@ -14,9 +14,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph
-from piezo_ident.common.config import find_config
-from piezo_ident.model.files import save_model
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.bags.read import MESSAGE_TYPE
 from piezo_ident.record.bags.write import BagWriter
@@ -117,7 +115,7 @@ def test_a_replay_waits_for_the_identifier_and_ends_when_it_has_all(tmp_path):
 def test_a_stream_that_is_a_block_ahead(tmp_path, listener, order, answer):
     # what a listener has at last may then be later than any block that it has not answered
     path = bag(tmp_path / 'bag', 50, order)
-    save_model(load_stage(find_config('paper', 'stage')).model, tmp_path / 'model.yaml')
+    SimulatedStage.load('paper').model.save(tmp_path / 'model.yaml')
     with Graph() as g:
         blocks = g.collect(answer)
         g.start(listener, {'model': str(tmp_path / 'model.yaml')})
@@ -153,7 +151,7 @@ def test_a_replay_does_not_wait_for_what_it_sends_itself(tmp_path):
 
 
 def test_the_whole_graph_as_fast_as_all_answer(tmp_path):
-    save_model(load_stage(find_config('paper', 'stage')).model, tmp_path / 'model.yaml')
+    SimulatedStage.load('paper').model.save(tmp_path / 'model.yaml')
     with Graph() as g:
         prediction = g.collect('prediction')
         g.collect('captured')

@@ -9,7 +9,7 @@ import time
 from course import FS, model_of, paper
 from graph import Graph
 import numpy as np
-from piezo_ident.model.files import load_model, model_to_yaml
+from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.blocks import Samples
 import pytest
@@ -325,7 +325,7 @@ def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     send(lab, blocks(1000))
     lab.wait(lambda: len(prediction) >= 10, 'predictions')
     _, v = sine(1000)
-    expected = load_model(other).stream().process(v, np.arange(1000) / FS)
+    expected = load(other).stream().process(v, np.arange(1000) / FS)
     np.testing.assert_array_equal(np.concatenate([b.values for b in prediction]), expected)
     # every 10 ms rather than 20
     shown, y, _ = watch(lab, blocks(4000))

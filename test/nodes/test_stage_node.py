@@ -9,9 +9,8 @@ from dataclasses import replace
 from course import block, column, FS, level
 from graph import Graph
 import numpy as np
-from piezo_ident.common.config import find_config
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import Samples
 import pytest
@@ -65,7 +64,7 @@ def test_every_fault_in_one_stream_sample_by_sample():
 
     # the same offline: what is expected sample by sample
     guard = Guard(SETTINGS)
-    run = load_stage(find_config('paper', 'stage')).run(np.random.default_rng(3))
+    run = SimulatedStage.load('paper').run(np.random.default_rng(3))
     applied, back, fast = [], [], 0
     for name in 'abcdfgh':
         if name == 'f':

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.chain import Block, Chain
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
@@ -24,7 +24,7 @@ import pytest
 
 FS = 20_000.0
 ROOT = Path(__file__).resolve().parents[2]
-PAPER = load_stage(ROOT / 'config/stage_paper.yaml').model
+PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 
 #: effects of every slot that need no further channel
 NAMES = sorted(set(VISIBLE) - {'cross_coupling'})

@@ -7,31 +7,31 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_array_equal
-from piezo_ident.excitation.program import load_program
+from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
-from piezo_ident.model.validation import sine_errors
+from piezo_ident.model.free_run import sine_errors
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.assemble import assemble, label_runs
 from piezo_ident.record.gaps import bridged, follows
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
-STAGE = load_stage(CONFIG / 'stage_paper.yaml')
+STAGE = SimulatedStage.load(CONFIG / 'stage_paper.yaml')
 
 
 def played(program):
-    return load_program(CONFIG / f'program_{program}.yaml').build(20000.0)
+    return Program.load(CONFIG / f'program_{program}.yaml').build(20000.0)
 
 
 @pytest.fixture(scope='module')
 def whole():
-    return simulate(STAGE, played('identification'), np.random.default_rng(3)).pieces[0]
+    return STAGE.play(played('identification'), np.random.default_rng(3)).pieces[0]
 
 
 @pytest.fixture(scope='module')
 def truth():
-    return simulate_truth(STAGE, played('validation'))
+    return STAGE.ideal.play(played('validation'))
 
 
 def with_losses(piece, lost):

@@ -15,7 +15,7 @@ import numpy as np
 from piezo_ident.common.errors import Cancelled, DataError
 from piezo_ident.diagnosis.diagnosis_json import to_json
 from piezo_ident.diagnosis.results import Errors, FORMULA, FoundParameter
-from piezo_ident.model.files import load_model
+from piezo_ident.model.files import load
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.report import changes, diagnosis_summary, Unseen, write_diagnosis_report
@@ -86,7 +86,7 @@ def test_folder_is_whole(folder):
     assert names == {'report.html', 'diagnosis.json', 'model.yaml'} | pictures
     data = json.loads((folder / 'diagnosis.json').read_text(encoding='utf-8'))
     assert data == to_json(example('class'))
-    assert [e.name for e in load_model(folder / 'model.yaml').effects] == ['creep']
+    assert [e.name for e in load(folder / 'model.yaml').effects] == ['creep']
 
 
 def test_pictures_are_not_blank(folder):

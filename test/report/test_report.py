@@ -17,9 +17,9 @@ from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.files import load_model
-from piezo_ident.model.simulated_stage import load_stage, simulate
-from piezo_ident.model.validation import SineError
+from piezo_ident.model.files import load
+from piezo_ident.model.free_run import free_run, SineError
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Fault, Record, Segment
 from piezo_ident.report import (
     error_table_for_sines,
@@ -63,9 +63,9 @@ segments:
 
 
 def measured(text: str, name: str) -> Record:
-    stage = load_stage(CONFIG / 'stage_paper.yaml')
+    stage = SimulatedStage.load(CONFIG / 'stage_paper.yaml')
     sequence = parse_program(text, name).build(20_000.0)
-    return simulate(stage, sequence, np.random.default_rng(5), name)
+    return stage.play(sequence, np.random.default_rng(5), name)
 
 
 def relabelled(record: Record, old: str, new: str) -> Record:
@@ -233,7 +233,7 @@ def test_what_is_unknown_is_null(found):
 
 
 def test_model_is_copied(folder, found):
-    model = load_model(folder / 'model.yaml')
+    model = load(folder / 'model.yaml')
     assert np.array_equal(model.hysteresis.weights, found.model.hysteresis.weights)
 
 
@@ -276,7 +276,7 @@ def test_table_of_sines(found, records):
 
 
 def test_modes_and_their_uncertainty():
-    model = load_stage(CONFIG / 'stage_paper.yaml').model
+    model = SimulatedStage.load(CONFIG / 'stage_paper.yaml').model
     G, n = model.dynamics, model.dynamics.a.size
     rng = np.random.default_rng(2)
     root = 1e-7 * rng.standard_normal((n, n))
@@ -329,14 +329,14 @@ def test_labels_in_pictures_are_plain_text():
 
 
 def test_prediction_picture(found, records, tmp_path):
-    prediction = found.model.predict(records[1])
-    write_prediction_plot(records[1], prediction, tmp_path / 'p.png')
+    run = free_run(found.model, records[1])
+    write_prediction_plot(run, tmp_path / 'p.png')
     assert np.any(imread(tmp_path / 'p.png')[..., :3] < 0.5)
-    write_prediction_plot(records[1], prediction, tmp_path / 'p.svg')
+    write_prediction_plot(run, tmp_path / 'p.svg')
     with pytest.raises(ConfigError, match=r'\.png'):
-        write_prediction_plot(records[1], prediction, tmp_path / 'p.gif')
+        write_prediction_plot(run, tmp_path / 'p.gif')
     with pytest.raises(DataError, match='cannot be written'):
-        write_prediction_plot(records[1], prediction, tmp_path / 'nowhere' / 'p.png')
+        write_prediction_plot(run, tmp_path / 'nowhere' / 'p.png')
 
 
 def test_pictures_leave_global_settings_alone():

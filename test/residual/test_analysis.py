@@ -8,8 +8,8 @@ import time
 
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.excitation.program import load_program
-from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
+from piezo_ident.excitation.program import Program
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece
 from piezo_ident.report.figures.residual import (
     residual_errors_figure,
@@ -42,10 +42,10 @@ def noise(seed: int = 0) -> np.ndarray:
 @pytest.fixture(scope='module')
 def survey():
     """Return the survey of the stage of the paper, with creep that nobody told the model."""
-    stage = load_stage(CONFIG / 'stage_paper.yaml')
-    sequence = load_program(CONFIG / 'program_survey.yaml').build()
-    read = simulate(stage, sequence, np.random.default_rng(1)).pieces[0]
-    y = simulate_truth(stage, sequence).pieces[0].y
+    stage = SimulatedStage.load(CONFIG / 'stage_paper.yaml')
+    sequence = Program.load(CONFIG / 'program_survey.yaml').build()
+    read = stage.play(sequence, np.random.default_rng(1)).pieces[0]
+    y = stage.ideal.play(sequence).pieces[0].y
     hidden = creep(read.v, 20_000.0)
     piece = Piece(read.v, read.y + hidden, 20_000.0, 0.0, read.segments)
     started = time.process_time()

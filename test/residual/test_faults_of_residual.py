@@ -6,8 +6,8 @@
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.excitation.program import load_program, parse_program
-from piezo_ident.model.simulated_stage import load_stage, simulate, simulate_truth
+from piezo_ident.excitation.program import parse_program, Program
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece
 from piezo_ident.residual import find_faults, ResidualPart
 from piezo_ident.residual.scatter import quantum_of
@@ -30,15 +30,15 @@ segments:
 
 @pytest.fixture(scope='module')
 def stage():
-    return load_stage(CONFIG / 'stage_paper.yaml')
+    return SimulatedStage.load(CONFIG / 'stage_paper.yaml')
 
 
 @pytest.fixture(scope='module')
 def truth(stage):
     """Voltage, displacement without and with the stage's noise and 16-bit converters."""
     sequence = parse_program(PROGRAM).build()
-    ideal = simulate_truth(stage, sequence).pieces[0]
-    read = simulate(stage, sequence, np.random.default_rng(1)).pieces[0]
+    ideal = stage.ideal.play(sequence).pieces[0]
+    read = stage.play(sequence, np.random.default_rng(1)).pieces[0]
     return ideal.v, ideal.y, read.y
 
 
@@ -68,9 +68,9 @@ def test_readings_without_any_noise_have_no_fault(truth):
 
 @pytest.mark.parametrize('name', ['identification', 'validation', 'minor_loops'])
 def test_shipped_programmes_have_no_fault(stage, name):
-    sequence = load_program(CONFIG / f'program_{name}.yaml').build()
-    read = simulate(stage, sequence, np.random.default_rng(2)).pieces[0]
-    y = simulate_truth(stage, sequence).pieces[0].y
+    sequence = Program.load(CONFIG / f'program_{name}.yaml').build()
+    read = stage.play(sequence, np.random.default_rng(2)).pieces[0]
+    y = stage.ideal.play(sequence).pieces[0].y
     assert faults(read.v, read.y, y)[0] == {}
     assert faults(read.v, read.y, 0.7 * y + 0.3 * lfilter([0.02], [1, -0.98], y))[0] == {}
 

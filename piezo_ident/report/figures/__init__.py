@@ -15,9 +15,7 @@ import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.identification.results import Identification
-from piezo_ident.model.stage_model import Prediction
-from piezo_ident.model.validation import FreeRun, sine_frequency, sines_of
-from piezo_ident.record.record import Record
+from piezo_ident.model.free_run import FreeRun, PieceRun, sine_frequency, sines_of
 from piezo_ident.report.figures.errors import (
     loops_figure,
     overview_figure,
@@ -86,7 +84,7 @@ class Drawn:
     left_out: tuple[tuple[str, str], ...]
 
 
-def held_out_from(identification: Identification, run: FreeRun) -> int | None:
+def held_out_from(identification: Identification, run: PieceRun) -> int | None:
     """Return the first held-out sample of a piece whose end was kept back, None otherwise."""
     if identification.dynamics.table is not None:
         return None
@@ -108,7 +106,7 @@ def response_caption(identification: Identification) -> str:
     )
 
 
-def _floor_of_sines(identification: Identification, runs: Sequence[FreeRun]) -> float | None:
+def _floor_of_sines(identification: Identification, runs: Sequence[PieceRun]) -> float | None:
     """Return the sensor noise in % of the stroke of the sines, None where these differ."""
     found = [
         float(np.ptp(run.piece.y[s.start : s.stop]))
@@ -124,7 +122,7 @@ def _floor_of_sines(identification: Identification, runs: Sequence[FreeRun]) -> 
 
 def draw(
     identification: Identification,
-    runs: Sequence[FreeRun],
+    runs: Sequence[PieceRun],
     tick: Callable[[float], None] = lambda share: None,
 ) -> Drawn:
     """
@@ -133,8 +131,8 @@ def draw(
     Parameters
     ----------
     identification : Identification
-    runs : sequence of FreeRun
-        From `piezo_ident.model.validation.free_runs`.
+    runs : sequence of PieceRun
+        From `piezo_ident.model.free_run.piece_runs`.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
 
@@ -219,17 +217,14 @@ def draw(
     return Drawn(tuple(pictures), tuple(left_out))
 
 
-def write_prediction_plot(
-    record: Record, prediction: Prediction, path: str | os.PathLike[str]
-) -> None:
+def write_prediction_plot(run: FreeRun, path: str | os.PathLike[str]) -> None:
     """
     Draw a record with its prediction and write the picture.
 
     Parameters
     ----------
-    record : Record
-    prediction : Prediction
-        From `StageModel.predict`; the longest piece is drawn.
+    run : FreeRun
+        From `piezo_ident.model.free_run.free_run`; the longest piece is drawn.
     path : path
         Ending in .png, .pdf or .svg.
 
@@ -243,9 +238,7 @@ def write_prediction_plot(
     target = Path(path)
     if target.suffix.lower() not in ENDINGS:
         raise ConfigError(f'{path}: a picture ends in {", ".join(ENDINGS)}')
-    piece, y_hat = max(
-        zip(record.pieces, prediction.pieces, strict=True), key=lambda pair: pair[0].n
-    )
-    drawn = overview_figure(FreeRun(record.name, piece, y_hat, y_hat))
+    piece, y_hat = max(zip(run.record.pieces, run.pieces, strict=True), key=lambda pair: pair[0].n)
+    drawn = overview_figure(PieceRun(run.record.name, piece, y_hat, y_hat))
     with temporary_output(target, overwrite=True) as file:
         drawn.savefig(file, dpi=DPI)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.model.validation import FreeRun, sine_frequency, SineError
+from piezo_ident.model.free_run import PieceRun, sine_frequency, SineError
 from piezo_ident.record.record import Segment
 from piezo_ident.report.figures.style import (
     COLOURS,
@@ -45,7 +45,7 @@ READABLE = 6.0
 NAMES = 12
 
 
-def loops_figure(runs: Sequence[FreeRun], edges: Sequence[int | None] = ()) -> Figure:
+def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> Figure:
     """
     Draw displacement over voltage, measured and modelled, with the error below.
 
@@ -53,7 +53,7 @@ def loops_figure(runs: Sequence[FreeRun], edges: Sequence[int | None] = ()) -> F
 
     Parameters
     ----------
-    runs : sequence of FreeRun
+    runs : sequence of PieceRun
     edges : sequence of (int or None), optional
         For each run the first sample that was not fitted, where its end was kept back.
 
@@ -99,12 +99,12 @@ def loops_figure(runs: Sequence[FreeRun], edges: Sequence[int | None] = ()) -> F
     return fig
 
 
-def _loop(runs: Sequence[FreeRun]) -> tuple[FreeRun, Segment] | None:
+def _loop(runs: Sequence[PieceRun]) -> tuple[PieceRun, Segment] | None:
     """Return the triangle, or else the whole piece, that covers the widest range."""
     candidates = [(run, s) for run in runs for s in run.piece.find('triangle')]
     candidates = candidates or [(run, Segment('', 0, run.piece.n)) for run in runs]
 
-    def width(candidate: tuple[FreeRun, Segment]) -> float:
+    def width(candidate: tuple[PieceRun, Segment]) -> float:
         run, s = candidate
         return float(np.ptp(run.piece.v[s.start : s.stop]))
 
@@ -190,13 +190,13 @@ def _draw_error(
     return unit, scale
 
 
-def overview_figure(run: FreeRun, held_out_from: int | None = None) -> Figure:
+def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
     """
     Draw a whole piece: voltage, displacement measured and modelled, and the error.
 
     Parameters
     ----------
-    run : FreeRun
+    run : PieceRun
     held_out_from : int, optional
         First sample that was not fitted, where the end of a record was kept back.
     """
@@ -230,7 +230,7 @@ def overview_figure(run: FreeRun, held_out_from: int | None = None) -> Figure:
     return fig
 
 
-def _name_segments(axes: Axes, run: FreeRun) -> None:
+def _name_segments(axes: Axes, run: PieceRun) -> None:
     named = [s for s in run.piece.segments if s.kind not in ('idle', 'ramp')]
     if not named or len(named) > NAMES:
         return
@@ -253,14 +253,14 @@ def _name_segments(axes: Axes, run: FreeRun) -> None:
 
 
 def segments_figure(
-    runs: Sequence[FreeRun], errors: dict[tuple[str, str], str] | None = None
+    runs: Sequence[PieceRun], errors: dict[tuple[str, str], str] | None = None
 ) -> Figure:
     """
     Draw a readable stretch of every segment with its error below.
 
     Parameters
     ----------
-    runs : sequence of FreeRun
+    runs : sequence of PieceRun
     errors : dict, optional
         Error in words for each (record, segment label).
 
@@ -300,7 +300,7 @@ def segments_figure(
     return fig
 
 
-def _stretch(run: FreeRun, s: Segment) -> tuple[slice, str]:
+def _stretch(run: PieceRun, s: Segment) -> tuple[slice, str]:
     """Return what of a segment can be read in a small picture, and how to say so."""
     rate = run.piece.sample_rate
     frequency = sine_frequency(s.label)
@@ -313,7 +313,7 @@ def _stretch(run: FreeRun, s: Segment) -> tuple[slice, str]:
     return slice(s.start, s.stop), ''
 
 
-def _draw_segment(trace: Axes, error: Axes, run: FreeRun, s: Segment, words: str) -> None:
+def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, words: str) -> None:
     part, what = _stretch(run, s)
     t = run.piece.t[part]
     long = t[-1] - t[0] > 1.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from piezo_ident.identification.frequency_response import FrequencyResponse
 from piezo_ident.identification.results import Identification
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
-from piezo_ident.model.validation import FreeRun
+from piezo_ident.model.free_run import PieceRun
 from piezo_ident.report.figures.style import (
     COLOURS,
     figure,
@@ -42,14 +42,14 @@ WORST = 10.0
 MODES = 4
 
 
-def delay_figure(identification: Identification, runs: Sequence[FreeRun] = ()) -> Figure:
+def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) -> Figure:
     """
     Draw the averaged step response with the delay, and the scan of the ARX loss.
 
     Parameters
     ----------
     identification : Identification
-    runs : sequence of FreeRun, optional
+    runs : sequence of PieceRun, optional
         For what the model makes of the same steps.
 
     Raises
@@ -75,7 +75,7 @@ def delay_figure(identification: Identification, runs: Sequence[FreeRun] = ()) -
     return fig
 
 
-def _model_step(step: StepDelay, runs: Sequence[FreeRun]) -> NDArray[np.float64] | None:
+def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> NDArray[np.float64] | None:
     """Return the model's averaged response to the same steps, if they are all there."""
     before, after = -int(step.lag[0]), int(step.lag[-1]) + 1
     for labelled in (True, False):

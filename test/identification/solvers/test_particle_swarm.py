@@ -17,7 +17,7 @@ from piezo_ident.identification.step3_hysteresis import (
     factorise,
     fit_hysteresis,
 )
-from piezo_ident.model.simulated_stage import load_stage
+from piezo_ident.model.simulated_stage import SimulatedStage
 import pytest
 from scipy.optimize import Bounds, lsq_linear
 
@@ -181,7 +181,7 @@ def test_no_swarm_is_refused(size):
 @pytest.fixture(scope='module')
 def paper():
     """Return the factor of the paper's stage under a triangle, sensor noise 2e-5 of its span."""
-    stage = load_stage(ROOT / 'config/stage_paper.yaml').model
+    stage = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
     v = np.concatenate([np.zeros(100), triangle([10 / 3, 20 / 3, 10], 0, 6, 20_000)])
     y = stage.stream().process(v) / 75e-6 + 2e-5 * rng(1).standard_normal(v.size)
     use = np.ones(v.size, dtype=bool)

@@ -1,0 +1,133 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One run of a model, block by block: in volts, out metres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.operators.chain import Block, Chain
+from piezo_ident.operators.fused import fused, FusedOperator
+from piezo_ident.record.record import Piece
+
+if TYPE_CHECKING:
+    from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['CHUNK', 'Stream']
+
+#: samples that pass the chain at once; small enough for the signals to stay in the cache
+CHUNK = 8192
+
+
+class Stream:
+    """
+    One run of a model, block by block, in volts and metres.
+
+    The first sample after `reset`, or after construction, is taken as the command under which the
+    stage was at rest.
+    """
+
+    def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
+        self.model = model
+        self._chain = fused(model.chain(memory))
+        self._count = 0
+        # a chain that is one kernel needs no block to pass along, and knows the scaling itself
+        match self._chain.operators:
+            case (FusedOperator() as alone,):
+                s = model.scaling
+                self._alone: FusedOperator | None = alone.scaled(s.v0, s.V, s.y0, s.Y)
+                self._chain = Chain((self._alone,))
+            case _:
+                self._alone = None
+        self._started = False
+
+    def reset(self, v0: float) -> float:
+        """Come to rest at a voltage [V] and return the displacement there [m]."""
+        u0 = float(self.model.scaling.u(v0))
+        self._count, self._started = 0, True
+        return float(self.model.scaling.y(self._chain.reset(u0, u0)))
+
+    def follow(self, piece: Piece) -> NDArray[np.float64]:
+        """Return the displacement [m] for the next samples, which are a piece or a part of one."""
+        if self._alone is not None:
+            return self.process(piece.v)
+        y = np.empty(piece.n)
+        for start in range(0, piece.n, CHUNK):
+            cut = slice(start, start + CHUNK)
+            channels = {name: x[cut] for name, x in piece.channels.items()}
+            y[cut] = self.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
+        return y
+
+    def bridge(self, one: Piece, other: Piece) -> None:
+        """Pass the gap between two pieces of one clock along a straight line."""
+        missing = round((other.start_time - one.start_time) * one.sample_rate) - one.n
+        if missing <= 0:
+            return
+        share = np.arange(1, missing + 1) / (missing + 1)
+
+        def line(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(before[-1] + (after[0] - before[-1]) * share)
+
+        channels = {k: line(x, other.channels[k]) for k, x in one.channels.items()}
+        time = line(one.time(one.n - 1, one.n), other.time(0, 1))
+        self.process(line(one.v, other.v), time, channels)
+
+    def recall(self, v: NDArray[np.float64], t: NDArray[np.float64]) -> None:
+        """
+        Bring amplifier and plays where a past voltage leaves them; what follows them is at rest.
+
+        Parameters
+        ----------
+        v, t : ndarray, shape (n,)
+            Voltage [V] and time [s]; the stage was at rest before the first sample.
+        """
+        self.reset(float(v[0]))
+        if self._alone is not None:
+            self._alone.run(v)
+            return
+        u = self.model.scaling.u(v)
+        block = Block(t=t, v=u, x=u)
+        for operator in self._chain.operators:
+            x = block.x
+            if getattr(operator, 'slot', None) in ('hidden', 'output', 'acquisition'):
+                rest = operator.reset(float(u[-1]), float(x[-1]))
+                block = block.with_signal(np.full(x.size, rest))
+            else:
+                block = operator.process(block)
+
+    def process(
+        self,
+        v: ArrayLike,
+        t: ArrayLike | None = None,
+        channels: Mapping[str, NDArray[np.float64]] | None = None,
+    ) -> NDArray[np.float64]:
+        """
+        Return the displacement [m] for the next stretch of voltage [V].
+
+        Parameters
+        ----------
+        v : array_like, shape (n,)
+        t : array_like, shape (n,), optional
+            Time [s]; counted from the first sample when absent.
+        channels : mapping of str to ndarray, optional
+            Further measured signals.
+        """
+        x = np.asarray(v, dtype=np.float64)
+        if x.size == 0:
+            return np.empty(0)
+        if not self._started:
+            self.reset(float(x[0]))
+        if self._alone is not None:
+            return self._alone.run(x)
+        if t is None:
+            time = (self._count + np.arange(x.size)) / self.model.sample_rate
+        else:
+            time = np.asarray(t, dtype=np.float64)
+        self._count += x.size
+        u = self.model.scaling.u(x)
+        block = self._chain.process(Block(t=time, v=u, x=u, channels=channels or {}))
+        return self.model.scaling.y(block.x)
