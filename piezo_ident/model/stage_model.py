@@ -254,7 +254,7 @@ class StageModel:
         >>> import piezo_ident as pi
         >>> model = pi.SimulatedStage.load('paper').model
         >>> y = model.simulate([0.0] * 3 + [10.0] * 997)
-        >>> [round(1e6 * y[k], 1) for k in (0, 999)]
+        >>> (1e6 * y[[0, 999]]).round(1).tolist()
         [0.0, 71.3]
         """
         x = np.asarray(v, dtype=np.float64)

@@ -668,7 +668,7 @@ def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, 
 
     monkeypatch.setattr('piezo_ident.cli.model_commands.identify', forbidden)
     monkeypatch.setattr('piezo_ident.cli.model_commands.free_run', forbidden)
-    monkeypatch.setattr('piezo_ident.cli.commands.simulate', forbidden)
+    monkeypatch.setattr('piezo_ident.cli.commands.SimulatedStage.play', forbidden)
     (tmp_path / 'file').write_text('')
     (tmp_path / 'mine').mkdir()
     (tmp_path / 'mine' / 'model.yaml').write_text('')
@@ -832,13 +832,13 @@ def test_interrupt_while_modules_are_imported(module):
 
 def test_interrupt_that_is_lost_on_the_way_still_counts(tmp_path):
     done = program(
-        'import piezo_ident.cli.commands as commands\n'
-        'def simulate(*args, f=commands.simulate, **more):\n'
+        'from piezo_ident.model.simulated_stage import SimulatedStage\n'
+        'def play(*args, f=SimulatedStage.play, **more):\n'
         '    try:\n'
         f'        {RAISE}\n'
         '    except BaseException:\n'
         '        return f(*args, **more)\n'
-        'commands.simulate = simulate\n'
+        'SimulatedStage.play = play\n'
         f"sys.argv = ['piezo_ident', 'simulate', {str(tmp_path / 'r.npz')!r}]\n"
         'from piezo_ident.cli import main\n'
         'sys.exit(main())\n'
