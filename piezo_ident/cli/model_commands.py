@@ -85,7 +85,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     everything = read_all([*paths, *further], args)
     records, validation = everything[: len(paths)], everything[len(paths) :]
     with naming(*(record.name for record in records)), console.progress() as progress:
-        result = identify(records, settings, progress=progress)
+        result = identify(records, settings, validation=validation, progress=progress)
     checks = [_validate(result.model, record) for record in validation]
 
     with interrupts.quitting():

@@ -31,7 +31,12 @@ from piezo_ident.identification.results import (
     silent,
     Steps,
 )
-from piezo_ident.identification.segment_errors import errors_of, key_of, Memories
+from piezo_ident.identification.segment_errors import (
+    errors_of,
+    key_of,
+    Memories,
+    validation_errors,
+)
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     Excerpt,
@@ -62,6 +67,7 @@ def identify(
     records: Sequence[Record] | Record,
     settings: Settings | None = None,
     *,
+    validation: Sequence[Record] | Record = (),
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
@@ -75,6 +81,8 @@ def identify(
         of other kinds are then left for validation.  Without them the longest run is fitted as a
         whole, but for its end.
     settings : Settings, optional
+    validation : sequence of Record, or Record, optional
+        Records that are neither fitted nor looked at; the headline is about them.
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
     steps : Steps, optional
@@ -91,6 +99,7 @@ def identify(
     """
     settings = settings or Settings()
     records = [records] if isinstance(records, Record) else list(records)
+    further = [validation] if isinstance(validation, Record) else list(validation)
     data = prepare(records)
     runs, rate, scaling = data.runs, data.rate, data.scaling
     floor, source = noise_floor(data.pieces)
@@ -110,13 +119,14 @@ def identify(
         delay=delay,
         dynamics=dynamics,
         hysteresis=fit,
-        errors=tuple(rows),
+        errors=(*rows, *validation_errors(model, further)),
         noise_floor=None if floor is None else 100.0 * floor / stroke,
         noise_source=source,
         stroke=stroke,
         warnings=tuple(warnings),
         not_identified=tuple(missing),
         settings=settings,
+        records=(*records, *further),
         memories=memories,
     )
     result = replace(result, warnings=(*result.warnings, *remarks_on_errors(result, data.pieces)))
@@ -359,7 +369,7 @@ def _story(result: Identification, names: list[str]) -> dict[str, Any]:
             'formula': FORMULA,
             **{
                 data.replace(' ', '_'): result.error(data)
-                for data in ('fitted', 'selection', 'held out')
+                for data in ('fitted', 'selection', 'held out', 'validation')
                 if np.isfinite(result.error(data))
             },
         },

@@ -17,12 +17,14 @@ from piezo_ident.identification.step2_dynamics import OrderTable
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.record.record import Record
 from scipy.optimize import OptimizeResult
 
 __all__ = [
     'DelayResult',
     'DynamicsResult',
     'ErrorRow',
+    'Headline',
     'Identification',
     'Progress',
     'Settings',
@@ -210,8 +212,9 @@ class ErrorRow:
         `piezo_ident.model.metrics.fit_percent`.
     n : int
         Samples.
-    data : {'fitted', 'held out', 'selection'}
-        Whether these samples were fitted; 'selection' was not fitted but chose between models.
+    data : {'fitted', 'selection', 'held out', 'validation'}
+        What these samples were used for: 'selection' was not fitted but chose between models,
+        'validation' lies in a record that was given for validation.
     """
 
     record: str
@@ -222,11 +225,49 @@ class ErrorRow:
     n: int
     data: str
 
+    @property
+    def driven(self) -> bool:
+        """Whether the voltage tests the stage here, rather than rests or moves over."""
+        return self.segment.partition(':')[0] not in ('idle', 'ramp')
 
-def rms_percent(rows: Sequence[ErrorRow]) -> float:
-    """Return the error over some rows together, weighted by samples; NaN without rows."""
+
+@dataclass(frozen=True)
+class Headline:
+    """
+    The error of a model and that of its hysteresis alone, over the same samples.
+
+    Attributes
+    ----------
+    data : {'validation', 'held out', 'selection', 'fitted'}
+        Kind of data, the first of these that there is.
+    records : tuple of str
+        Names of the records that hold it.
+    percent, static_percent : float
+        As in `ErrorRow`, over all driven samples; NaN without any.
+    n : int
+        Samples.
+    """
+
+    data: str
+    records: tuple[str, ...]
+    percent: float
+    static_percent: float
+    n: int
+
+
+def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
+    """
+    Return the error over some rows together, weighted by samples; NaN without rows.
+
+    Parameters
+    ----------
+    rows : sequence of ErrorRow
+    static : bool, optional
+        Of the hysteresis alone instead of the whole model.
+    """
     n = sum(row.n for row in rows)
-    return float(np.sqrt(sum(row.n * row.percent**2 for row in rows) / n)) if n else float('nan')
+    squares = sum(row.n * (row.static_percent if static else row.percent) ** 2 for row in rows)
+    return float(np.sqrt(squares / n)) if n else float('nan')
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +292,8 @@ class Identification:
     not_identified : tuple of (str, str)
         What these data could not tell, and why.
     settings : Settings
+    records : tuple of Record
+        What was fitted, then what was given for validation.
     memories : mapping of (str, float) to ndarray
         Fitted play outputs at the start of a piece, by record name and start time.
     """
@@ -266,6 +309,7 @@ class Identification:
     warnings: tuple[str, ...]
     not_identified: tuple[tuple[str, str], ...]
     settings: Settings
+    records: tuple[Record, ...] = ()
     memories: Mapping[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
 
     @property
@@ -279,10 +323,23 @@ class Identification:
 
         Ramps and rests do not count: they are easy, and would flatter.
         """
-        easy = ('idle', 'ramp')
-        rows = [
-            row
-            for row in self.errors
-            if row.data == data and row.segment.partition(':')[0] not in easy
-        ]
-        return rms_percent(rows)
+        return rms_percent(self._driven(data))
+
+    @property
+    def headline(self) -> Headline:
+        """The errors to quote: on data for validation if there are any, else on the next best."""
+        rows: list[ErrorRow] = []
+        for data in ('validation', 'held out', 'selection', 'fitted'):
+            rows = self._driven(data)
+            if rows:
+                break
+        return Headline(
+            data=data,
+            records=tuple(dict.fromkeys(row.record for row in rows)),
+            percent=rms_percent(rows),
+            static_percent=rms_percent(rows, static=True),
+            n=sum(row.n for row in rows),
+        )
+
+    def _driven(self, data: str) -> list[ErrorRow]:
+        return [row for row in self.errors if row.data == data and row.driven]

@@ -6,16 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.identification.prepare import Run
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.results import ErrorRow
 from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
 
-__all__ = ['Memories', 'errors_of', 'key_of']
+__all__ = ['Memories', 'errors_of', 'key_of', 'validation_errors']
 
 #: memory at the start of a run, by `key_of`
 Memories = dict[tuple[str, float], NDArray[np.float64]]
@@ -79,4 +82,26 @@ def errors_of(
                         data=data,
                     )
                 )
+    return rows
+
+
+def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
+    """
+    Return the free-run errors of records that were given for validation.
+
+    Raises
+    ------
+    IdentificationError
+        When a record has no piece at the sampling rate of the model.
+    """
+    rows: list[ErrorRow] = []
+    for record in records:
+        runs = runs_of([record], model.sample_rate, model.scaling)
+        if not runs:
+            raise IdentificationError(
+                f'{record.name}: no piece is sampled at {model.sample_rate:g} Hz, the rate of the '
+                'model; record the data for validation at that rate'
+            )
+        nothing = [(np.zeros(run.piece.n, dtype=bool),) * 2 for run in runs]
+        rows += [replace(row, data='validation') for row in errors_of(model, runs, nothing)]
     return rows

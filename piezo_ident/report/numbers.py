@@ -42,7 +42,7 @@ __all__ = [
 
 JSON_VERSION = 1
 #: what is compared, in the order in which it is shown
-KINDS = ('held out', 'selection', 'fitted')
+KINDS = ('validation', 'held out', 'selection', 'fitted')
 
 
 @dataclass(frozen=True)
@@ -141,37 +141,24 @@ def fit_share(row: ErrorRow) -> str:
 
 def verdict(identification: Identification) -> str:
     """Return what was found, in one sentence."""
-    held = math.isfinite(identification.error('held out'))
-    selection = [row for row in identification.errors if row.data == 'selection']
-    if held:
-        kind, said = 'held out', 'On data it did not fit'
-    elif selection:
-        # rest and ramps flatter: they are no test of a model
-        kind = 'selection'
-        said = (
-            'On the parts of steps, noise and triangle that were kept from the fit (no other '
-            'motion was there to test it)'
-        )
-    else:
-        kind, said = 'fitted', 'Nothing was held out; on the data it was fitted to'
-    said += f', the model errs by {number(identification.error(kind))} % of stroke'
-    static = _static_error(identification, kind)
-    if not identification.model.is_static and math.isfinite(static):
-        said += f', its hysteresis alone by {number(static)} %'
+    headline = identification.headline
+    # rest and ramps flatter: they are no test of a model
+    said = {
+        'validation': f'On {", ".join(headline.records)}, recorded for validation',
+        'held out': 'On data it did not fit',
+        'selection': 'On the parts of steps, noise and triangle that were kept from the fit (no '
+        'other motion was there to test it)',
+        'fitted': 'Nothing was held out; on the data it was fitted to',
+    }[headline.data]
+    said += f', the model errs by {number(headline.percent)} % of stroke'
+    if not identification.model.is_static and math.isfinite(headline.static_percent):
+        said += f', its hysteresis alone by {number(headline.static_percent)} %'
     return f'{said} ({FORMULA}).'
 
 
 def moves(label: str) -> bool:
     """Return whether a segment drives the stage to test it, rather than rests or moves over."""
     return label.partition(':')[0] not in ('idle', 'ramp')
-
-
-def _static_error(identification: Identification, data: str) -> float:
-    rows = [row for row in identification.errors if row.data == data]
-    total = sum(row.n for row in rows)
-    if not total:
-        return math.nan
-    return math.sqrt(sum(row.n * row.static_percent**2 for row in rows) / total)
 
 
 def to_json(

@@ -141,6 +141,18 @@ def test_the_swarm_gives_what_it_found_and_polishing_is_stated():
     assert_array_equal(polished.model.hysteresis.weights, optimum.model.hysteresis.weights)
 
 
+def test_a_record_for_validation_is_what_the_headline_is_about():
+    other = short(seed=2)
+    result = identify(short(), QUICK, validation=replace(other, name='other'))
+    assert (result.headline.data, result.headline.records) == ('validation', ('other',))
+    assert result.headline.percent < result.headline.static_percent
+    assert [record.name for record in result.records] == ['short', 'other']
+    p = other.pieces[0]
+    slow = Record((Piece(p.v, p.y, 2 * p.sample_rate),), 'slow')
+    with pytest.raises(IdentificationError, match='slow'):
+        identify(short(), QUICK, validation=slow)
+
+
 def test_least_squares_and_chosen_thresholds_are_the_default():
     settings = Settings()
     assert (settings.solver, settings.polish, settings.thresholds) == (

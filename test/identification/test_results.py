@@ -59,24 +59,34 @@ def test_steps_and_scan_agree_within_a_sample():
     assert DelayResult(3, 0.3, 'scan', step(None), scan=3).agree is None
 
 
+ROWS = (
+    ErrorRow('r', 'a', 3.0, 6.0, 0, 100, 'held out'),
+    ErrorRow('r', 'b', 1.0, 2.0, 0, 300, 'held out'),
+    ErrorRow('r', 'idle', 0.0, 90.0, 0, 600, 'held out'),
+    ErrorRow('r', 'b', 50.0, 0, 0, 300, 'fitted'),
+)
+
+
+def result_of(*rows):
+    return Identification(None, None, None, None, rows, None, '', 1.0, (), (), Settings())
+
+
 def test_error_over_rows_is_weighted_by_samples():
-    rows = (
-        ErrorRow('r', 'a', 3.0, 0, 0, 100, 'held out'),
-        ErrorRow('r', 'b', 1.0, 0, 0, 300, 'held out'),
-        ErrorRow('r', 'b', 50.0, 0, 0, 300, 'fitted'),
-    )
-    result = Identification(
-        None,
-        None,
-        None,
-        None,
-        rows,
-        None,
-        '',
-        1.0,
-        (),
-        (),
-        Settings(),  # type: ignore[arg-type]
-    )
+    result = result_of(*ROWS)
     assert result.error('held out') == pytest.approx(np.sqrt((9 * 100 + 300) / 400))
     assert np.isnan(result.error('selection'))
+
+
+def test_headline_takes_both_errors_over_the_same_samples():
+    headline = result_of(*ROWS).headline
+    assert (headline.data, headline.records, headline.n) == ('held out', ('r',), 400)
+    assert headline.percent == pytest.approx(np.sqrt((9 * 100 + 300) / 400))
+    assert headline.static_percent == pytest.approx(2 * headline.percent)
+
+
+def test_headline_is_about_the_record_for_validation():
+    further = ErrorRow('other', '', 4.0, 5.0, 0, 10, 'validation')
+    headline = result_of(*ROWS, further).headline
+    assert (headline.data, headline.records) == ('validation', ('other',))
+    assert (headline.percent, headline.static_percent) == (4.0, 5.0)
+    assert np.isnan(result_of().headline.percent)
