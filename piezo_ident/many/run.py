@@ -20,6 +20,7 @@ from typing import Any
 
 from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis.procedure import diagnose
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.identify import identify
@@ -150,7 +151,7 @@ class _Job:
             pass
         return None
 
-    def __call__(self) -> Row:
+    def __call__(self, tick: Tick = lambda step, share: None) -> Row:
         self.row_file.unlink(missing_ok=True)
         try:
             row = self.task(self.path, self.name, self.model_file, self.report_folder)

@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import as_completed, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-import multiprocessing
-from multiprocessing.connection import Connection
 import os
-import signal
 import threading
 from typing import Any
 
 from piezo_ident import __version__
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.process import Job, WorkerProcess
 
 __all__ = ['completed', 'dask', 'processes']
 
@@ -36,62 +34,27 @@ def completed(futures: Iterable[Future[Any]], tick: Callable[[], None]) -> Itera
             pass
 
 
-class _Worker:
-    """A process that does one job after another and is replaced when it dies."""
-
-    def __init__(self) -> None:
-        # a fork would copy locks that other threads hold
-        context = multiprocessing.get_context('spawn')
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
-        theirs.close()
-
-    def __call__(self, job: Callable[[], Any]) -> Any:
-        self._connection.send(job)
-        return self._connection.recv()
-
-    def end(self) -> None:
-        self._process.terminate()
-        self._process.join()
-        self._connection.close()
-
-
-def _serve(connection: Connection) -> None:
-    # Ctrl-C at a terminal reaches every process; the parent decides
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    while True:
-        try:
-            connection.send(connection.recv()())
-        except (EOFError, BrokenPipeError):
-            return
-
-
 class _Processes(ThreadPoolExecutor):
     """Threads that each drive one process, so that a dead process costs one record."""
 
     def __init__(self, jobs: int) -> None:
         super().__init__(jobs)
         self._local = threading.local()
-        self._workers: list[_Worker] = []
+        self._workers: list[WorkerProcess] = []
 
     def submit(self, job: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        return super().submit(self._run, job, *args, **kwargs)
+        return super().submit(self._run, job)
 
-    def _run(self, job: Callable[[], Any]) -> Any:
-        if getattr(self._local, 'worker', None) is None:
-            self._local.worker = _Worker()
+    def _run(self, job: Job) -> Any:
+        if not hasattr(self._local, 'worker'):
+            self._local.worker = WorkerProcess()
             self._workers.append(self._local.worker)
-        try:
-            return self._local.worker(job)
-        except (EOFError, OSError):
-            self._local.worker = None
-            raise PiezoIdentError('the process ended by itself; is there enough memory?') from None
+        return self._local.worker.run(job)
 
     def end(self) -> None:
         self.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
-            worker.end()
+            worker.close()
         self.shutdown()
 
 
