@@ -48,7 +48,7 @@ bench: .venv-bench/.bench
 		$(if $(QUICK),--quick --out build/benchmarks.md,--out docs/benchmarks.md)
 
 # the running graph in real time, 20 kHz for so many seconds, and faster; then blocks of all sizes,
-# nodes in one process, and how many stages this machine carries: about a quarter of an hour
+# and how many stages this machine carries: about a quarter of an hour
 BENCH_SECONDS ?= 300
 bench-live: .venv/.demo
 	.venv/bin/python benchmarks/bench_live.py --seconds $(BENCH_SECONDS) --out docs/live.md

@@ -96,7 +96,6 @@ setup(
             'model = piezo_ident.nodes.model:main',
             'recorder = piezo_ident.nodes.recorder:main',
             'player = piezo_ident.nodes.player:main',
-            'composed = piezo_ident.nodes.composed:main',
         ],
     },
 )

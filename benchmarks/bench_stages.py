@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Blocks of all sizes, nodes in one process, several stages at once, and how soon a node is there.
+Blocks of all sizes, several stages at once, and how soon a node is there.
 
     .venv/bin/python benchmarks/bench_stages.py --out docs/live_stages.md
 
@@ -61,7 +61,7 @@ class Bench:
         SimulatedStage.load('paper').model.save(self.model)
 
     def play(
-        self, spaces: list[str], size: int, composed: tuple[str, ...] = (), *, read: bool = True
+        self, spaces: list[str], size: int, *, read: bool = True
     ) -> tuple[Watch, dict[str, float], float]:
         """Play a sine to every stage, and return what was seen, CPU shares and the time taken."""
         client = self.client
@@ -76,13 +76,8 @@ class Bench:
                 client.follow(name)
                 client.forget(name)
             for space in spaces:
-                if composed:
-                    nodes.start(
-                        'composed', namespace=space, parameters=told['model'], arguments=composed
-                    )
                 for name in NODES:
-                    if name not in composed:
-                        nodes.start(name, namespace=space, parameters=told[name])
+                    nodes.start(name, namespace=space, parameters=told[name])
             client.wait(
                 lambda: all(client.status(name).get('state') for name in names), 60.0, 'the nodes'
             )
@@ -155,20 +150,6 @@ def blocks(bench: Bench) -> Iterator[str]:
         yield row(f'{size} ({1e3 * size / RATE:g} ms)', watch, 'a', percent)
 
 
-def together(bench: Bench) -> Iterator[str]:
-    """Yield the table of nodes in processes of their own, and in one."""
-    yield '## One process or several, blocks of 100'
-    yield ''
-    yield from HEAD
-    for what, composed in (
-        ('excitation, stage, model', ()),
-        ('excitation, stage + model', ('stage', 'model')),
-        ('excitation + stage + model', ('stage', 'model', 'excitation')),
-    ):
-        watch, percent, _ = bench.play(['a'], 100, composed)
-        yield row(what, watch, 'a', percent)
-
-
 def stages(bench: Bench) -> Iterator[str]:
     """Yield the table over stages, up to the first block that is lost."""
     yield '## Stages at once, each with excitation, stage and model, blocks of 100'
@@ -224,7 +205,7 @@ def starts(bench: Bench) -> Iterator[str]:
 
 def main() -> int:
     """Run everything, print and write the page."""
-    parser = argparse.ArgumentParser(description='Measures blocks, processes, stages, starts.')
+    parser = argparse.ArgumentParser(description='Measures blocks, stages, starts.')
     parser.add_argument('--seconds', type=float, default=10.0, help='of each programme')
     parser.add_argument('--out', type=Path, help='page to write')
     args = parser.parse_args()
@@ -233,7 +214,7 @@ def main() -> int:
     from piezo_ident.nodes.client import Client
 
     lines = [
-        '# Blocks, processes, stages, starts',
+        '# Blocks, stages, starts',
         '',
         f'    .venv/bin/python benchmarks/bench_stages.py {shlex.join(sys.argv[1:])}',
         '',
@@ -242,9 +223,7 @@ def main() -> int:
     ]
     with tempfile.TemporaryDirectory() as folder, Client('observer') as client:
         bench = Bench(client, Path(folder), args.seconds)
-        for line in itertools.chain(
-            blocks(bench), [''], together(bench), [''], stages(bench), [''], starts(bench)
-        ):
+        for line in itertools.chain(blocks(bench), [''], stages(bench), [''], starts(bench)):
             print(line, flush=True)
             lines.append(line)
     if args.out:

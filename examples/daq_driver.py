@@ -11,7 +11,7 @@ import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Follower, Kind
-from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray

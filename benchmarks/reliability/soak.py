@@ -76,7 +76,7 @@ class Observer:
     """Reads the stamps of all streams in a thread, and when they came."""
 
     def __init__(self, client: Any) -> None:
-        from piezo_ident.nodes.taps import message_class, Taps
+        from piezo_ident.nodes.subscriptions import message_class, Taps
         from rclpy.serialization import deserialize_message
 
         self._kind = message_class('std_msgs/msg/Float64MultiArray')

@@ -3,7 +3,7 @@
 
 
 """
-Draws the lab graph from the declarations of its topics.
+Draws the lab graph.
 
     .venv/bin/python docs/images/draw_graph.py docs/images/graph.svg
 """
@@ -20,12 +20,22 @@ matplotlib.use('svg')
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-from piezo_ident.nodes.interfaces import TOPICS
 from piezo_ident.nodes.parameters import NODES
 
+#: topic, publishers, subscribers: as in docs/graph.md
+TOPICS = (
+    ('voltage', ('excitation', 'player'), ('stage', 'identifier', 'model')),
+    ('displacement', ('stage', 'player'), ('identifier', 'model')),
+    ('applied_voltage', ('stage',), ('identifier',)),
+    ('prediction', ('model',), ()),
+    ('residual', ('model',), ()),
+    ('preview', ('model',), ()),
+    ('model', ('identifier',), ('model',)),
+    ('report', ('identifier',), ()),
+)
 #: where each node stands, and what it is beside its name
 PLACES = {
-    'excitation': (1.0, 5.0, 'plays programmes'),
+    'excitation': (1.0, 5.0, 'plays programs'),
     'stage': (1.0, 3.2, 'simulated, or your DAQ driver'),
     'player': (1.0, 1.4, 'replays a bag'),
     'identifier': (6.2, 5.0, 'captures, learns the model'),
@@ -38,13 +48,12 @@ SPOTS = {
     'displacement': (3.6, 3.4),
     'applied_voltage': (3.6, 2.6),
     'model': (6.2, 3.8),
-    'captured': (9.0, 5.6),
     'report': (9.0, 4.8),
     'prediction': (9.0, 3.3),
     'residual': (9.0, 2.6),
     'preview': (9.0, 1.9),
 }
-NODE, TOPIC, PACE = '#2b5c8a', '#555555', '#b5651d'
+NODE, TOPIC = '#2b5c8a', '#555555'
 WIDTH, HEIGHT = 1.9, 0.72
 #: what is recorded lies in these frames: left, bottom, width, height, and a side to leave by
 FRAMES = ((2.72, 2.25, 1.76, 2.8, (3.9, 2.25)), (8.25, 2.28, 1.5, 1.35, (8.35, 2.28)))
@@ -101,18 +110,14 @@ def draw() -> Figure:
     ax.axis('off')
     for name in NODES:
         box(ax, *PLACES[name][:2], name, PLACES[name][2])
-    for topic in TOPICS:
-        if topic.name not in SPOTS:
-            continue  # status and diagnostics come from every node
-        spot(ax, *SPOTS[topic.name], topic.name)
-        for node in topic.publishers:
-            begin, end = edge(node, topic.name)
+    for topic, publishers, subscribers in TOPICS:
+        spot(ax, *SPOTS[topic], topic)
+        for node in publishers:
+            begin, end = edge(node, topic)
             # a replay takes the place of what was measured
             arrow(ax, begin, end, ls='--' if node == 'player' else '-')
-        for node in topic.subscribers:
-            if node in ('excitation', 'player'):
-                continue  # they look there how far the others are
-            begin, end = edge(node, topic.name)
+        for node in subscribers:
+            begin, end = edge(node, topic)
             arrow(ax, end, begin)
     x, y, _ = PLACES['recorder']
     for left, bottom, width, height, leave in FRAMES:
@@ -137,15 +142,11 @@ def draw() -> Figure:
     ax.text(u, 1.05, 'PlotJuggler, rqt_plot,\nFoxglove', ha='center', fontsize=8, color=TOPIC)
     arrow(ax, (u, v - 0.2), (u, 1.4))
     recorded = next(d.default for d in NODES['recorder'] if d.name == 'topics')
-    paces = [t.name for t in TOPICS if 'excitation' in t.subscribers]
-    notes = (
-        'Every node tells its ~/status, and its /diagnostics once a second.  '
-        f'Recorded unless told otherwise: {", ".join(recorded)}.',
-        f'Faster than real time, {", ".join(paces)} tell the excitation and the player how far '
-        'the others are.',
+    note = (
+        'Every node publishes its ~/status, and its /diagnostics once a second.  '
+        f'Recorded by default: {", ".join(recorded)}.'
     )
-    for k, note in enumerate(notes):
-        ax.text(-0.05, -0.08 - 0.24 * k, note, fontsize=7.5, color=TOPIC)
+    ax.text(-0.05, -0.08, note, fontsize=7.5, color=TOPIC)
     return figure
 
 

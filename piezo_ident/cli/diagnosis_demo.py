@@ -163,9 +163,7 @@ def _session(nodes: Nodes, client: Client, out: Path, console: Console) -> Diagn
         'identifier', parameters={'output': str(out), 'holds_program': HOLDS, 'requests': 1}
     )
     nodes.start('model')
-    # no faster than all answer: nothing is lost, however busy the machine
-    pace = {'rate_factor': 0.0, 'answers': 'displacement captured prediction'}
-    nodes.start('excitation', parameters={'subscribers': 3, 'wait_limit': 30.0, **pace})
+    nodes.start('excitation', parameters={'subscribers': 3, 'wait_limit': 30.0})
     _ask(client, 'identifier/run')
     _follow(nodes, client, console, 'identifier', 'identification', 120.0)
     _wait_for_model(nodes, client, 1)

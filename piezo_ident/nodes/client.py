@@ -11,9 +11,9 @@ import time
 from types import TracebackType
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.nodes.wire import LATCHED, QUESTIONS, STREAM
+from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
 import rclpy
@@ -21,7 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as PythonParameter
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 __all__ = ['Client']
@@ -105,7 +105,7 @@ class Client:
     def _ask(self, kind: Any, service: str, request: Any, timeout: float, again: float) -> Any:
         """Return the first answer to a question that is asked every so many seconds."""
         if service not in self._clients:
-            self._clients[service] = self.node.create_client(kind, service, qos_profile=QUESTIONS)
+            self._clients[service] = self.node.create_client(kind, service, qos_profile=SERVICE)
         client = self._clients[service]
         deadline = time.monotonic() + timeout
         if not client.wait_for_service(timeout_sec=timeout):
@@ -149,16 +149,16 @@ class Client:
         return texts
 
     def count(self, node: str) -> int:
-        """Return how many samples an identifier has captured, by its topic `captured`."""
-        topic = f'{node.rpartition("/")[0]}/captured'.lstrip('/')
-        if topic not in self._counts:
-            self._counts[topic] = 0
+        """Return how many samples an identifier had captured when it last told, once a second."""
+        if not self._counts:
+            self.node.create_subscription(DiagnosticArray, '/diagnostics', self._keep, PREVIEW)
+        return self._counts.setdefault(f'/{node}', 0)
 
-            def keep(message: Float64MultiArray) -> None:
-                self._counts[topic] = int(message.data[-1])
-
-            self.node.create_subscription(Float64MultiArray, topic, keep, STREAM)
-        return self._counts[topic]
+    def _keep(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            if status.name in self._counts:
+                self._counts[status.name] = int(values.get('samples', 0))
 
     def wait(
         self,

@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from piezo_ident.nodes.wire import LATCHED, QUESTIONS
+from piezo_ident.nodes.wire import LATCHED, SERVICE
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -67,7 +67,7 @@ class Drive:
         self._begin: Callable[[], None] = _nothing
         self._ended: Callable[[str | None], None] = _nothing
         self._set, self._start, self._stop = (
-            node.create_client(kind, f'excitation/{name}', qos_profile=QUESTIONS)
+            node.create_client(kind, f'excitation/{name}', qos_profile=SERVICE)
             for kind, name in (
                 (SetParameters, 'set_parameters'),
                 (Trigger, 'start'),

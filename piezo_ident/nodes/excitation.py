@@ -5,17 +5,13 @@
 """
 The excitation node: plays programmes on `voltage`.
 
-Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every programme;
-at real time a block is sent when its first sample is due, counted from the first one.  At any
-other speed there is flow control besides: no more than `in_flight` blocks are on their way to the
-slowest of those who answer on the topics `answers`; at ``rate_factor`` 0 the answers alone set
-the pace.  The first of these topics has to answer, any other is waited for from its first answer
-on: as it stands, the stage on `displacement`, the model on `prediction` once it has a model, and
-the identifier on `captured`.
+Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every program; a
+block is sent when its first sample is due, counted from the first one.  `rate_factor` makes that
+schedule faster or slower; nobody is waited for, and each listener reports what it lost.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
 and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
-A ramp runs in real time and waits for nobody.
+A ramp runs in real time.
 
 Two programmes at once would tear the stage to and fro, so a second publisher on `voltage` is
 refused at the start, and reported when it comes later.  An excitation that was killed is seen by
@@ -39,9 +35,8 @@ from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.pacing import BlockClock
-from piezo_ident.nodes.answers import Answers, answers_problem
-from piezo_ident.nodes.base import LabNode, OK, run, WARN
-from piezo_ident.nodes.taps import between_turns
+from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
+from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import cut_blocks, Samples
 from rclpy.duration import Duration
@@ -59,8 +54,6 @@ MEET = 2.0
 YOUTH = 1.0
 #: between the match of a subscriber and the first block, for the other side to know of it too [s]
 SETTLE = 0.1
-#: between the first block and the second, to hear who answers [s]
-HEAR = 0.1
 
 
 def read_program(text: str) -> Program:
@@ -114,7 +107,6 @@ class ExcitationNode(LabNode):
         self._guard_settings()
         self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
         self._born = time.monotonic()
-        self._answers: Answers | None = None
         self._ears: Any = None
         self.offer('start', self._start)
         self.offer('stop', self._stop)
@@ -123,9 +115,6 @@ class ExcitationNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programmes that cannot be played, and limits that are crossed."""
-        if name == 'answers':
-            none = 'answers must name at least one topic'
-            return answers_problem(value) if value.strip() else none
         if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
             return None
         # while parameters are declared, those that come later are not there yet
@@ -175,10 +164,7 @@ class ExcitationNode(LabNode):
         self._refuse_others()
         sequence = self._build(self.values['program'])
         playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
-        self._clean_up()
-        if playing.factor != 1.0:
-            topics = self.values['answers'].split()
-            self._answers = Answers(self, topics, topics[0])
+        self._close_ears()
         self._ears = self.create_subscription(Float64MultiArray, 'voltage', self._on_other, STREAM)
         self._playing = playing
         self._rate = (time.monotonic(), 0)
@@ -213,13 +199,6 @@ class ExcitationNode(LabNode):
                 'two programmes at once would tear the stage to and fro'
             )
 
-    def _clean_up(self) -> None:
-        """Give back what only a programme needs; on the executor's thread."""
-        self._close_ears()
-        if self._answers is not None:
-            self._answers.close()
-            self._answers = None
-
     def _close_ears(self) -> None:
         # they would hear every block that we send ourselves
         if self._ears is not None:
@@ -242,9 +221,7 @@ class ExcitationNode(LabNode):
         except PiezoIdentError as error:
             self._ramp(playing, 'failed', str(error))
         else:
-            clock = playing.clock
-            # at other speeds it is the answers that set the pace
-            late = clock.late if clock and playing.factor == 1.0 else 0
+            late = playing.clock.late if playing.clock else 0
             behind = f', {late} blocks late' if late else ''
             self.report_status('done', 100.0, f'{playing.sequence.name} played{behind}')
 
@@ -262,17 +239,12 @@ class ExcitationNode(LabNode):
                 )
             # without our own ears
             found = self._voltage.get_subscription_count() - 1
-            mute = '' if self._answers is None else self._mute(self._answers)
-            if found >= needed and not mute:
+            if found >= needed:
                 break
             if time.monotonic() - begin > limit + LISTEN:
-                what = (
-                    f'{max(0, found)} of {needed} subscribers on {self._voltage.topic_name}'
-                    if found < needed
-                    else f'nobody publishes {mute}, which rate_factor other than 1 needs,'
-                )
                 raise ConfigError(
-                    f'{what} after {limit:g} s; start the stage, or set subscribers or wait_limit'
+                    f'{max(0, found)} of {needed} subscribers on {self._voltage.topic_name} after '
+                    f'{limit:g} s; start the stage, or set subscribers or wait_limit'
                 )
             self._sleep(playing, time.monotonic() + 0.02)
         between_turns(self, self._close_ears)
@@ -290,36 +262,18 @@ class ExcitationNode(LabNode):
                 return
             self._sleep(playing, time.monotonic() + 0.02)
 
-    @staticmethod
-    def _mute(answers: Answers) -> str:
-        """Return the topic on which somebody has to answer, as long as nobody publishes it."""
-        return '' if answers.flow.slowest in answers.published else answers.flow.slowest
-
     def _sleep(self, playing: Playing, until: float) -> None:
         if playing.stop.wait(max(0.0, until - time.monotonic())):
             raise _Stopped
 
     def _play(self, playing: Playing) -> None:
-        sequence, factor, answers = playing.sequence, playing.factor, self._answers
-        clock = BlockClock(factor * sequence.sample_rate, time.monotonic())
+        sequence = playing.sequence
+        clock = BlockClock(playing.factor * sequence.sample_rate, time.monotonic())
         playing.clock = clock
-
-        def pause(seconds: float) -> None:
-            self._sleep(playing, time.monotonic() + seconds)
-
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
-            if answers is not None:
-                answers.wait(self.values['in_flight'], self.values['wait_limit'], pause)
             self._sleep(playing, clock.due(start))
             self._send(playing, sequence.v[start:stop], label)
             clock.note(start, stop - start, time.monotonic())
-            if answers is not None:
-                fs = sequence.sample_rate
-                answers.flow.sent(start / fs, (stop - 1) / fs)
-                if start == 0:
-                    # alone, so that nobody is overrun who has not been heard yet
-                    pause(HEAR)
-                    answers.look()
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
             self.report_status(
                 'running',
@@ -328,13 +282,10 @@ class ExcitationNode(LabNode):
                 level,
                 segment=label,
             )
-        if answers is not None:
-            answers.wait(1, self.values['wait_limit'], pause)
 
     def _send(self, playing: Playing, v: NDArray[np.float64], label: str) -> None:
         begin = time.perf_counter()
         t = np.arange(playing.tick, playing.tick + v.size) / playing.sequence.sample_rate
-        # counted before it is sent: the answer may be there before publish returns
         playing.tick += v.size
         playing.voltage, playing.segment = float(v[-1]), label
         self._voltage.publish(to_message(Samples(t, v, label)))
@@ -371,7 +322,7 @@ class ExcitationNode(LabNode):
         """Return rate, blocks, delays and head-room; watch for a second publisher."""
         playing = self._playing
         if not self._is_playing():
-            self._clean_up()
+            self._close_ears()
         foreign = self._other_publishers()
         self._second = f'second publisher {foreign[0]} on voltage' if foreign else ''
         values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
@@ -412,5 +363,5 @@ class ExcitationNode(LabNode):
 
 
 def main(argv: Many[str] | None = None) -> int:
-    """Run the node; see `piezo_ident.nodes.base.run`."""
+    """Run the node; see `piezo_ident.nodes.lab_node.run`."""
     return run(ExcitationNode, argv)

@@ -13,18 +13,15 @@ from pathlib import Path
 import time
 from typing import Any
 
-import numpy as np
 from piezo_ident.cli.outputs import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.identification.results import Steps
 from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.diagnosis_jobs import Judgement, save_both_job
 from piezo_ident.nodes.drive import Drive, Streams
 from piezo_ident.nodes.helper import Helper
 from piezo_ident.nodes.inquiry import Inquiry
-from piezo_ident.nodes.intake import Intake
 from piezo_ident.nodes.jobs import (
     identify_job,
     Outcome,
@@ -33,9 +30,10 @@ from piezo_ident.nodes.jobs import (
     Tick,
     warm_up,
 )
-from piezo_ident.nodes.wire import from_message, LATCHED, STREAM, to_message
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.subscriptions import BlockSubscriptions
+from piezo_ident.nodes.wire import from_message, LATCHED
 from piezo_ident.nodes.worker import Worker
-from piezo_ident.record.blocks import Samples
 from piezo_ident.record.capture import APPLIED, Capture
 from std_msgs.msg import Float64MultiArray, String
 
@@ -76,16 +74,14 @@ class IdentifierNode(LabNode):
             self._take_file(self.values['model'])
         self._counted, self._counted_at = 0, time.monotonic()
         self._passed: dict[str, int] = {}
-        self._newest: dict[str, Samples] = {}
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
-        self._captured = self.create_publisher(Float64MultiArray, 'captured', STREAM)
-        self._intake = Intake(self, lambda *block: self._held.append(block))
+        self._subscriptions = BlockSubscriptions(self, lambda *block: self._held.append(block))
         for key in ('voltage', 'displacement', APPLIED):
-            self._intake.listen(key, key)
+            self._subscriptions.add(key, key)
         for topic in self.values['channels'].split():
-            self._intake.listen(topic, '')
+            self._subscriptions.add(topic, '')
         self._drive = Drive(self, self._streams, self._unheard)
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
@@ -111,14 +107,12 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        self._intake.drain()
+        self._subscriptions.drain()
         # what was captured before a run is forgotten once it has begun, and kept if it does not
         if self._drive.is_starting or not self._held:
             return
         while self._held:
             self._take(*self._held.popleft())
-        if self._newest:
-            self._answer()
 
     def _take(
         self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
@@ -137,17 +131,6 @@ class IdentifierNode(LabNode):
         arrival = info.get('received_timestamp') or time.time_ns()
         self._capture.add(key or samples.quantity, samples, arrival)
         self._passed[topic] = self._passed.get(topic, 0) + samples.t.size
-        if key in ('voltage', 'displacement') and samples.t.size:
-            self._newest[key] = samples
-
-    def _answer(self) -> None:
-        """Tell how far the capture is, so that a fast sender does not run away from it."""
-        taken = min(self._passed.get('voltage', 0), self._passed.get('displacement', 0))
-        # of each stream: either may be a block ahead, which the sender may know of one alone
-        newest = [self._newest[k] for k in ('voltage', 'displacement') if k in self._newest]
-        t = np.array([samples.t[-1] for samples in newest])
-        rows = Samples(t, np.full(t.size, float(taken)), newest[-1].segment, 'captured')
-        self._captured.publish(to_message(rows))
 
     def _streams(self) -> Streams:
         c = self._capture
@@ -164,7 +147,9 @@ class IdentifierNode(LabNode):
 
     def _unheard(self) -> str:
         # what is sent before publisher and subscription have met is lost
-        return ', '.join(t for t in self._intake.unpublished if t not in ('voltage', APPLIED))
+        return ', '.join(
+            t for t in self._subscriptions.unpublished if t not in ('voltage', APPLIED)
+        )
 
     # state
 
@@ -410,6 +395,7 @@ class IdentifierNode(LabNode):
         values: dict[str, object] = {
             'state': self._state,
             'rate': f'{rate:.0f}',
+            'samples': min(passed, self._passed.get('displacement', 0)),
             'captured': f'{capture.seconds:.3f}',
             'topics': self._kept(),
             'segments': ' '.join(capture.segments),

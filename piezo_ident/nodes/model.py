@@ -18,7 +18,7 @@ from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, Previ
 from piezo_ident.live.predictor import expected_error, Predictor, warm_up
 from piezo_ident.model.files import load, model_from_dict, parse_yaml
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState

@@ -66,10 +66,10 @@ EXCITATION = (
     Declaration(
         'rate_factor',
         1.0,
-        'how many times faster than real time blocks are sent; 0: as fast as all answer',
+        'how many times faster than real time blocks are sent',
         '1',
-        0.0,
-        100.0,
+        0.1,
+        4.0,
     ),
     Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
     Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),
@@ -79,14 +79,6 @@ EXCITATION = (
         'subscribers', 1, 'how many must listen to voltage before the first block', '1', 0, 100
     ),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
-    Declaration(
-        'answers',
-        'displacement prediction captured',
-        'topics on which listeners answer, with blanks between; used when rate_factor is not 1',
-    ),
-    Declaration(
-        'in_flight', 40, 'blocks sent ahead of the slowest answer that counts', '1', 1, 90
-    ),
 )
 
 STAGE = (
@@ -213,7 +205,7 @@ RECORDER = (
 
 PLAYER = (
     Declaration('bag', '', 'bag to replay'),
-    Declaration('rate', 1.0, 'how many times faster than it was recorded', '1', 0.01, 100.0),
+    Declaration('rate', 1.0, 'how many times faster than it was recorded', '1', 0.1, 4.0),
     Declaration(
         'topics',
         ('voltage', 'displacement'),
@@ -221,14 +213,6 @@ PLAYER = (
     ),
     Declaration('subscribers', 1, 'how many must listen before the first message', '1', 0, 100),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
-    Declaration(
-        'answers',
-        'captured prediction',
-        'topics on which listeners answer, with blanks between; empty: by time alone',
-    ),
-    Declaration(
-        'in_flight', 40, 'blocks sent ahead of the slowest answer that counts', '1', 1, 90
-    ),
     Declaration('autostart', False, 'start to replay at once', read_only=True),
 )
 

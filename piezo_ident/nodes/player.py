@@ -2,38 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The player node: replays a bag onto topics with the original spacing, or faster.
+The player node: replays a bag onto topics with the original spacing, or a multiple of it.
 
 Blocks carry their own times, so the samples that are replayed are the samples that were measured,
 bit by bit, at whatever rate.  The spacing is that of the log times, on a schedule that is counted
 from its start.  Only the measured topics are replayed unless `topics` says otherwise.
 
-Nothing is sent before every topic has met as many subscribers as `subscribers` says.  Whoever
-answers on one of the topics `answers` - the identifier on `captured`, the model on `prediction` -
-is never overrun: no more than `in_flight` blocks of the voltage (of the first topic, where the
-voltage is not replayed) are on their way to it, and the replay is done when it has answered the
-last one.  Where somebody publishes the first of these topics he has to answer; the others are
-waited for from their first answer on.
+Nothing is sent before every topic has met as many subscribers as `subscribers` says.  After that
+nobody is waited for; each listener reports what it lost.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-import functools
 import threading
 import time
 from typing import Any
 
-import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.replay import chosen_topics, ReplayClock
-from piezo_ident.nodes.answers import Answers, answers_problem
-from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
-from piezo_ident.nodes.taps import message_class, topics_problem
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
-from piezo_ident.record.bags.recover import Bag, damage_as_data_error, opened_bag, Stored
+from piezo_ident.record.bags.recover import Bag, opened_bag, Stored
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
@@ -43,8 +35,6 @@ __all__ = ['PlayerNode', 'main']
 PATIENCE = 1.5
 #: between the match of the subscribers and the first message, for them to know of it too [s]
 SETTLE = 0.2
-#: how long the first block stands alone for somebody to answer it [s]
-HEAR = 1.0
 #: how often progress is told [s]
 TELL = 0.25
 
@@ -88,8 +78,6 @@ class PlayerNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse names that cannot be."""
-        if name == 'answers':
-            return answers_problem(value)
         return topics_problem(value) if name == 'topics' else None
 
     # services
@@ -169,15 +157,9 @@ class PlayerNode(LabNode):
                 replay.names = ', '.join(chosen.values())
                 replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
                 replay.ready.set()
-                lead = self._lead(bag, chosen)
-                answers = Answers(self, self._answering(chosen, lead))
-                try:
-                    self._await_subscribers(replay, senders)
-                    clock = self._send(replay, bag, senders, answers, lead)
-                    open_end = self._await_last(replay, answers)
-                finally:
-                    answers.close()
-                self._report_end(replay, bag, clock, open_end)
+                self._await_subscribers(replay, senders)
+                clock = self._send(replay, bag, senders)
+                self._report_end(replay, bag, clock)
         except _Stopped:
             self._report(
                 'stopped',
@@ -219,22 +201,6 @@ class PlayerNode(LabNode):
             raise DataError(f'{bag.path}: no messages on {", ".join(chosen)}; name another bag')
         return senders
 
-    def _lead(self, bag: Bag, chosen: Mapping[str, str]) -> str:
-        """Return the topic that is answered: the voltage, as every listener goes by its times."""
-        blocks = {c.topic for c in bag.connections if c.msgtype == MESSAGE_TYPE}
-        found = [topic for topic in chosen if topic in blocks]
-        voltage = self.resolve_topic_name('voltage')
-        return min(found, key=lambda topic: chosen[topic] != voltage, default='')
-
-    def _answering(self, chosen: Mapping[str, str], lead: str) -> list[str]:
-        """Return the topics on which answers may come: not from here, and to what is measured."""
-        measured = {self.resolve_topic_name(name) for name in ('voltage', 'displacement')}
-        if chosen.get(lead) not in measured:
-            return []
-        replayed = set(chosen.values())
-        names = self.values['answers'].split()
-        return [name for name in names if self.resolve_topic_name(name) not in replayed]
-
     def _await_subscribers(self, replay: Replay, senders: Mapping[str, Any]) -> None:
         """
         Wait until enough listen to every topic.
@@ -262,18 +228,12 @@ class PlayerNode(LabNode):
         if need:
             self._pause(replay, SETTLE)
 
-    def _send(
-        self, replay: Replay, bag: Bag, senders: Mapping[str, Any], answers: Answers, lead: str
-    ) -> ReplayClock:
-        """Send every message when it is due; nobody is overrun by the blocks of `lead`."""
-        pause = functools.partial(self._pause, replay)
+    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> ReplayClock:
+        """Send every message when it is due."""
         rate = self.values['rate']
         clock: ReplayClock | None = None
         first, told = 0, float('-inf')
         for connection, stamp, raw in self._chosen(bag, senders):
-            span = _span(bag, connection, raw) if connection.topic == lead else None
-            if span is not None:
-                answers.wait(self.values['in_flight'], self.values['wait_limit'], pause)
             now = time.monotonic()
             if clock is None:
                 clock, first = ReplayClock(rate, stamp, now), stamp
@@ -293,35 +253,11 @@ class PlayerNode(LabNode):
                 now = time.monotonic()
             senders[connection.topic].publish(raw)
             replay.messages += 1
-            if span is not None and not answers.flow.count:
-                self._hear(replay, answers, span)
-                clock.change_rate(self.values['rate'], stamp, time.monotonic())
-            elif span is not None:
-                answers.flow.sent(*span)
             replay.slipped = clock.slipped
             replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)
         if clock is None:
             raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
         return clock
-
-    def _hear(self, replay: Replay, answers: Answers, span: tuple[float, float]) -> None:
-        """Let the first block stand alone, so that nobody is overrun who was not heard yet."""
-        if answers.topics and answers.topics[0] in answers.published:
-            answers.flow.expect(answers.topics[0])
-        answers.flow.sent(*span)
-        alone = time.monotonic() + HEAR
-        while answers.published and not answers.flow.answering and time.monotonic() < alone:
-            self._pause(replay, 0.01)
-            answers.look()
-
-    def _await_last(self, replay: Replay, answers: Answers) -> str:
-        """Wait until everybody who answers has answered the last block; return who has not."""
-        answers.look()
-        try:
-            answers.wait(1, self.values['wait_limit'], functools.partial(self._pause, replay))
-        except PiezoIdentError as error:
-            return f'{answers.flow.ahead} blocks were not answered: {error}'
-        return ''
 
     def _chosen(self, bag: Bag, senders: Mapping[str, Any]) -> Iterator[Stored]:
         return bag.messages([c for c in bag.connections if c.topic in senders])
@@ -330,14 +266,14 @@ class PlayerNode(LabNode):
         if replay.stop.wait(seconds):
             raise _Stopped
 
-    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock, open_end: str) -> None:
+    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock) -> None:
         about = f'replayed {replay.messages} messages of {replay.bag}'
         if clock.slipped > 0.1:
             about += f', {clock.slipped:.1f} s slower than asked'
         faults = '; '.join(str(f) for f in bag.faults)
         early = f'the bag ends early: {faults}' if faults else ''
-        level = WARN if early or open_end else OK
-        self._report('done', '; '.join(filter(None, [about, early, open_end])), level, 100.0)
+        level = WARN if early else OK
+        self._report('done', '; '.join(filter(None, [about, early])), level, 100.0)
 
     # what is told
 
@@ -352,17 +288,6 @@ class PlayerNode(LabNode):
 
     def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
         self.report_status(state, progress, message, level, **self._numbers())
-
-
-def _span(bag: Bag, connection: Connection, raw: bytes) -> tuple[float, float] | None:
-    """Return the times of the first and the last sample of a block, None where it is none."""
-    if connection.msgtype != MESSAGE_TYPE:
-        return None
-    with damage_as_data_error(bag.path):
-        message: Any = typestore().deserialize_cdr(raw, connection.msgtype)
-    if message.data.size < 2 or not np.isfinite(message.data[[0, -2]]).all():
-        return None
-    return float(message.data[0]), float(message.data[-2])
 
 
 def _profile(connection: Connection) -> QoSProfile:

@@ -25,8 +25,8 @@ from typing import Any
 
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.nodes.base import ERROR, LabNode, OK, run, WARN
-from piezo_ident.nodes.taps import Taps, topics_problem
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import PartWriter
 
 __all__ = ['RecorderNode', 'main']
@@ -65,7 +65,7 @@ class RecorderNode(LabNode):
     executable = 'recorder'
 
     def __init__(self, **kwargs: Any) -> None:
-        self._taps: Taps | None = None
+        self._subscriptions: RawSubscriptions | None = None
         self._recording: Recording | None = None
         self._thread: threading.Thread | None = None
         self._last_count = (time.monotonic(), 0)
@@ -100,9 +100,9 @@ class RecorderNode(LabNode):
             raise PiezoIdentError('recording already; call stop first')
         recording = Recording(self.values['output'])
         topics = dict.fromkeys(self.resolve_topic_name(t) for t in self.values['topics'])
-        taps = self._taps = Taps(self, topics)
+        subscriptions = self._subscriptions = RawSubscriptions(self, topics)
         self._thread = threading.Thread(
-            target=self._work, args=(recording, taps), name='recording'
+            target=self._work, args=(recording, subscriptions), name='recording'
         )
         self._thread.start()
         recording.opened.wait(PATIENCE)
@@ -153,15 +153,15 @@ class RecorderNode(LabNode):
 
     def _look(self) -> None:
         """Follow the publishers while a recording is on its way."""
-        recording, taps = self._recording, self._taps
-        if recording is None or taps is None or recording.end.is_set():
+        recording, subscriptions = self._recording, self._subscriptions
+        if recording is None or subscriptions is None or recording.end.is_set():
             return
-        if taps.look() or time.monotonic() - recording.started > MATCH_LIMIT:
+        if subscriptions.look() or time.monotonic() - recording.started > MATCH_LIMIT:
             recording.ready.set()
 
     # the bag, in a thread of its own
 
-    def _work(self, recording: Recording, taps: Taps) -> None:
+    def _work(self, recording: Recording, subscriptions: RawSubscriptions) -> None:
         try:
             writer = PartWriter(
                 recording.output,
@@ -176,13 +176,13 @@ class RecorderNode(LabNode):
             )
         # nobody would hear of a thread that ends by itself
         except Exception as error:  # noqa: BLE001
-            self._give_up(recording, taps, self._said(error))
+            self._give_up(recording, subscriptions, self._said(error))
             return
         recording.path = str(writer.path)
         recording.opened.set()
         failure = ''
         try:
-            self._record(recording, taps, writer)
+            self._record(recording, subscriptions, writer)
             writer.close()
         except Exception as error:  # noqa: BLE001
             failure = self._said(error)
@@ -196,27 +196,29 @@ class RecorderNode(LabNode):
             parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
             about = f'{writer.messages} messages in {writer.path}{parts}'
             self._report('done', about, progress=100.0)
-        taps.close()
+        subscriptions.close()
 
-    def _give_up(self, recording: Recording, taps: Taps, reason: str) -> None:
+    def _give_up(self, recording: Recording, subscriptions: RawSubscriptions, reason: str) -> None:
         recording.failure = reason
         recording.end.set()
         recording.over.set()
         recording.opened.set()
-        taps.close()
+        subscriptions.close()
         # the call that asked for it has been answered by then
         if time.monotonic() - recording.started > PATIENCE:
             self._report('failed', reason, ERROR)
 
-    def _record(self, recording: Recording, taps: Taps, writer: PartWriter) -> None:
+    def _record(
+        self, recording: Recording, subscriptions: RawSubscriptions, writer: PartWriter
+    ) -> None:
         flushed = time.monotonic()
         last = told = False
         while not last:
             # once more after the end was asked for: what has arrived by then is kept
             last = recording.end.wait(POLL)
-            for stamp, topic, raw in taps.arrived():
+            for stamp, topic, raw in subscriptions.arrived():
                 if topic not in writer:
-                    writer.add_topic(topic, *taps.offers(topic))
+                    writer.add_topic(topic, *subscriptions.offers(topic))
                 writer.write(topic, stamp, raw)
             recording.messages = writer.messages
             now = time.monotonic()
@@ -228,7 +230,7 @@ class RecorderNode(LabNode):
                 recording.size, recording.path = writer.size, str(writer.path)
             if recording.ready.is_set() and (due or not told) and not last:
                 told = True
-                problems = taps.problems
+                problems = subscriptions.problems
                 about = problems or f'recording to {writer.path}'
                 self._report('recording', about, WARN if problems else OK)
 
@@ -238,7 +240,7 @@ class RecorderNode(LabNode):
         return self._recording is not None and not self._recording.over.is_set()
 
     def _lost(self) -> int:
-        return 0 if self._taps is None else self._taps.lost
+        return 0 if self._subscriptions is None else self._subscriptions.lost
 
     def _numbers(self) -> Mapping[str, object]:
         recording = self._recording or Recording('')

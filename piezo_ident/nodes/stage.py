@@ -54,7 +54,7 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Follower, Kind
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.nodes.base import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
@@ -83,7 +83,6 @@ class StageNode(LabNode):
     """Simulates a stage on the topics of a real one."""
 
     executable = 'stage'
-    drives = True
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -317,5 +316,5 @@ class StageNode(LabNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; see `piezo_ident.nodes.base.run`."""
+    """Run the node; see `piezo_ident.nodes.lab_node.run`."""
     return run(StageNode, argv)

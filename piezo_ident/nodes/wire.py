@@ -12,10 +12,22 @@ from piezo_ident.record.blocks import decode, encode, Samples
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
-__all__ = ['LATCHED', 'PREVIEW', 'QUESTIONS', 'STREAM', 'from_message', 'to_message']
+__all__ = [
+    'LATCHED',
+    'LATCHED_TOPICS',
+    'PREVIEW',
+    'SAMPLE_TOPICS',
+    'SERVICE',
+    'STREAM',
+    'from_message',
+    'to_message',
+]
 
-#: most samples of a block, and characters of a label; a label is said again in answers and status
+#: most samples of a block, and characters of a label
 MOST, LONGEST = 100_000, 200
+#: topics of Float64MultiArray with the QoS of `STREAM`, and of String with that of `LATCHED`
+SAMPLE_TOPICS = ('voltage', 'displacement', 'applied_voltage', 'prediction', 'residual')
+LATCHED_TOPICS = ('model', 'report')
 
 #: samples: reliable, the last hundred blocks
 STREAM = QoSProfile(
@@ -33,9 +45,8 @@ LATCHED = QoSProfile(
 )
 #: what people look at, and diagnostics
 PREVIEW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
-#: services: whoever asks gets the answers to all who ask, and of the usual ten the eleventh pushes
-#: out his own where he is slow to take it
-QUESTIONS = QoSProfile(
+#: services: responses go to all clients; with the default depth of 10 a slow client loses its own
+SERVICE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,

@@ -40,9 +40,9 @@ import yaml
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from piezo_ident.nodes.interfaces import STATES
-from piezo_ident.nodes.taps import between_turns
-from piezo_ident.nodes.wire import from_message, LATCHED, QUESTIONS, STREAM, to_message
+from graph_page import STATES
+from piezo_ident.nodes.subscriptions import between_turns
+from piezo_ident.nodes.wire import from_message, LATCHED, SERVICE, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from processes import alive, best_of_three, Handle, in_time, Late, LIMIT, take_domain
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
@@ -251,7 +251,7 @@ class Graph:
         if name in self._statuses:
             return
         heard = self._statuses[name] = []
-        known = {s.name for s in STATES if s.node == executable}
+        known = {state for node, state in STATES if node == executable}
 
         def keep(message: DiagnosticStatus) -> None:
             values = {pair.key: pair.value for pair in message.values}
@@ -395,7 +395,7 @@ class Graph:
         is_new = service not in self._clients
         if is_new:
             self._clients[service] = self.node.create_client(
-                kind, f'/{service.lstrip("/")}', qos_profile=QUESTIONS
+                kind, f'/{service.lstrip("/")}', qos_profile=SERVICE
             )
         self.wait(self._clients[service].service_is_ready, f'service {service}', timeout)
         node = service.strip('/').rpartition('/')[0]

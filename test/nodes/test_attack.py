@@ -9,7 +9,7 @@ import sys
 
 from course import level, paper
 from graph import Graph
-from piezo_ident.nodes.wire import QUESTIONS
+from piezo_ident.nodes.wire import SERVICE
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -126,7 +126,7 @@ def test_an_answer_waits_for_who_is_slow_to_take_it(attack):
     executor = SingleThreadedExecutor(context=g.context)
     executor.add_node(node)
     try:
-        client = node.create_client(Trigger, '/recorder/stop', qos_profile=QUESTIONS)
+        client = node.create_client(Trigger, '/recorder/stop', qos_profile=SERVICE)
         g.wait(client.service_is_ready, 'the service')
         # made after the client: when this one is known, so is that
         g.client(Trigger, 'recorder/stop')

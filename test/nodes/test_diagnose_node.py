@@ -90,7 +90,7 @@ def lab(tmp_path_factory):
                 for truth in TRUTHS
                 for node, params in (
                     ('stage', {'stage': stage_with(truth, folder), 'seed': 3}),
-                    ('excitation', {'rate_factor': 0.0, 'subscribers': 3}),
+                    ('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 3}),
                     ('identifier', IDENTIFIER),
                     ('model', {}),
                 )

@@ -68,7 +68,7 @@ def in_the_middle(number, record, tmp_path):
                 'player',
                 {
                     'bag': str(tmp_path / 'old'),
-                    'rate': 0.01,
+                    'rate': 0.1,
                     'topics': ['voltage'],
                     'autostart': True,
                 },

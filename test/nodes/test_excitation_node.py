@@ -112,22 +112,26 @@ def test_it_keeps_time(lab):
     lab.wait(lambda: len(lab.collect('displacement')) >= len(voltage), 'all answers')
 
 
-def test_faster_than_real_time_loses_nothing(lab):
+@pytest.mark.parametrize('factor', [0.5, 4.0])
+def test_slower_and_faster_than_real_time(lab, factor):
     sequence = parse_program(SHORT).build(FS)
     assert lab.set('excitation', 'program', SHORT)[0]
-    count = len(list(cut_blocks(sequence.n, sequence.segments, 100)))
+    assert lab.set('excitation', 'block_size', 1000)[0]
+    count = len(list(cut_blocks(sequence.n, sequence.segments, 1000)))
     back, altered = lab.collect('displacement'), counts(lab, 'altered')
+    seen, arrivals = len(back), lab.arrivals('voltage')
+    sent = len(arrivals)
     try:
-        for factor in (0.0, 3.0):
-            assert lab.set('excitation', 'rate_factor', factor) == (True, '')
-            answered = len(back)
-            assert play(lab)['state'] == 'done'
-            lab.wait(lambda answered=answered: len(back) >= answered + count, 'all answers')
-            # every run starts the sample clock
-            t, _ = column(back[answered:])
-            assert t.tobytes() == (np.arange(sequence.n) / FS).tobytes()
+        assert lab.set('excitation', 'rate_factor', factor) == (True, '')
+        assert play(lab)['state'] == 'done'
+        lab.wait(lambda: len(back) >= seen + count, 'all of displacement')
+        # every run starts the sample clock
+        t, _ = column(back[seen:])
+        assert t.tobytes() == (np.arange(sequence.n) / FS).tobytes()
+        assert arrivals[-1] - arrivals[sent] > 0.8 * sequence.duration / factor
     finally:
         assert lab.set('excitation', 'rate_factor', 1.0)[0]
+        assert lab.set('excitation', 'block_size', 100)[0]
     samples = str(sum(b.t.size for b in back))
     lab.wait(lambda: lab.diagnostics('stage').get('samples') == samples, 'count')
     # the guard saw nothing to alter
@@ -202,7 +206,8 @@ def test_stop_ramps_to_rest_and_goes_on_with_t(lab):
         ('rest', -1.0, 'outside the voltage limits'),
         ('ramp_slew', 0.0, ''),
         ('block_size', 1, ''),
-        ('in_flight', 100, ''),
+        ('rate_factor', 5.0, ''),
+        ('rate_factor', 0.0, ''),
         ('sample_rate', 1000.0, ''),
         ('block_size', 'many', ''),
     ],
@@ -246,25 +251,10 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         g.wait(lambda: state(g) == 'waiting', 'waiting')
         assert g.call('excitation/stop')[0]
         g.wait(lambda: state(g) == 'stopped', 'stopped')
-        # an answer is needed where answers set the pace
         assert g.set('excitation', 'wait_limit', 0.3)[0]
-        assert g.set('excitation', 'rate_factor', 0.0)[0]
-        assert g.set('excitation', 'in_flight', 7)[0]
-        voltage = g.collect('voltage')
+        g.collect('voltage')
         g.matched('voltage')
-        status = play(g)
-        assert 'nobody publishes displacement' in status['message']
-        # a stage that is there and stops answering
-        other = g.node.create_publisher(Float64MultiArray, 'displacement', 10)
-        said = 'no displacement for 0.3 s'
-        # it may take a moment to know of it
-        g.wait(lambda: said in play(g)['message'], said)
-        assert state(g) == 'failed'
-        g.forget(other)
-        g.wait(lambda: len(voltage) >= 7, 'the blocks in flight')
-        assert len(voltage) == 7
         # a second publisher
-        assert g.set('excitation', 'rate_factor', 1.0)[0]
         second = g.node.create_publisher(Float64MultiArray, 'voltage', 10)
         g.wait(lambda: g.node.count_publishers('voltage') == 2, 'the second publisher')
 

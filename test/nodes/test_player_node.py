@@ -138,15 +138,15 @@ def test_replay(lab, tmp_path):
     assert len(progress) > 2
 
     # from the beginning again, faster, with the model
-    assert lab.set('b/player', 'rate', 5.0)[0]
+    assert lab.set('b/player', 'rate', 4.0)[0]
     assert lab.set('b/player', 'topics', ['voltage', 'displacement', 'model'])[0]
 
-    def five_times_as_fast() -> None:
+    def four_times_as_fast() -> None:
         arrivals, slipped = all_of_it('401')
-        if arrivals[-1] - arrivals[0] >= 0.75 * want[-1] + slipped:
+        if arrivals[-1] - arrivals[0] >= 0.8 * want[-1] + slipped:
             raise Late(f'{arrivals[-1] - arrivals[0]:.3f} s')
 
-    best_of_three(five_times_as_fast)
+    best_of_three(four_times_as_fast)
     lab.wait(lambda: models, 'the recorded model')
     assert set(models) == {'a model of long ago'}
 
@@ -191,7 +191,7 @@ def test_refusals_and_waiting(lab, tmp_path):
     ok, reason = lab.set('c/player', 'topics', ['a b'])
     assert not ok
     assert 'no name of a topic' in reason
-    assert not lab.set('c/player', 'rate', 0.0)[0]
+    assert not lab.set('c/player', 'rate', 0.05)[0]
     assert lab.set('c/player', 'topics', ['voltage', 'displacement'])[0]
     # nobody listens
     assert lab.call('c/player/start')[0]

@@ -18,7 +18,6 @@ NAMES = {
     'prediction': 'expected',
     'residual': 'misfit',
     'preview': 'shown',
-    'captured': 'taken',
     'model': 'learnt',
     'report': 'findings',
 }

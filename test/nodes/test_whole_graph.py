@@ -1,17 +1,18 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The graph as it runs is the graph of the tables, from topics to parameters."""
+"""The graph as it runs is that of docs/graph.md and config/security/policy.xml."""
 
 import json
+import re
 import signal
 import time
 
 from course import HIGH, model_of, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, in_time
+from graph_page import DIAGNOSTICS, OPERATOR, rights, SERVICES, STATES, TOPICS
 import numpy as np
-from piezo_ident.nodes.interfaces import DIAGNOSTICS, SERVICES, STATES, TOPICS
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED
 from piezo_ident.record.bags.read import read_bag
@@ -34,7 +35,7 @@ def whole(tmp_path_factory):
             ('identifier', {**QUICK, 'program': PROGRAM}),
             ('model', {'window': 0.5}),
             ('recorder', {'output': str(folder / 'bag')}),
-            ('player', {'bag': str(folder / 'bag'), 'rate': 0.01}),
+            ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
         )
         g.output = folder
         yield g
@@ -79,13 +80,11 @@ def test_a_run_through_the_whole_graph(whole):
 
 
 def test_topics_are_those_of_the_table(whole):
-    of_one = [t for t in TOPICS if t.publishers != ('every node',)]
-    # a programme that waits for answers
-    assert whole.set('excitation', 'rate_factor', 2.0)[0]
+    of_one = [t for t in TOPICS if t.publishers != {'every node'}]
     assert whole.set('excitation', 'program', HIGH)[0]
     assert whole.call('excitation/start')[0]
     for t in of_one:
-        wanted = set(t.publishers) - {'player'}, set(t.subscribers) - {'player'}
+        wanted = t.publishers - {'player'}, t.subscribers - {'player'}
         whole.wait(
             lambda t=t, w=wanted: (
                 (set(publishers(whole, f'/{t.name}')), subscribers(whole, f'/{t.name}')) == w
@@ -108,7 +107,6 @@ def test_topics_are_those_of_the_table(whole):
     # some values are there only while a stream comes
     whole.wait(lambda: 'head_room' in whole.diagnostics('model'), 'the head-room')
     assert ended(whole, 'excitation', 'excitation/stop', ('stopped',))['state'] == 'stopped'
-    assert whole.set('excitation', 'rate_factor', 1.0)[0]
     # a replay on its way
     assert whole.call('player/start')[0]
     for t in of_one:
@@ -127,7 +125,7 @@ def test_topics_are_those_of_the_table(whole):
 def test_services_are_those_of_the_table(whole, node):
     found = whole.node.get_service_names_and_types_by_node(node, '/')
     triggers = {name for name, types in found if types == ['std_srvs/srv/Trigger']}
-    assert triggers == {f'/{node}/{s.name}' for s in SERVICES if s.node == node}
+    assert triggers == {f'/{n}/{name}' for n, name in SERVICES if n == node}
 
 
 def test_what_is_latched_is_heard_by_who_comes_late(whole):
@@ -139,7 +137,7 @@ def test_what_is_latched_is_heard_by_who_comes_late(whole):
     whole.wait(lambda: set(heard) == set(NODES), 'the last words')
     for node, message in heard.items():
         values = {pair.key: pair.value for pair in message.values}
-        assert values['state'] in {s.name for s in STATES if s.node == node}
+        assert values['state'] in {state for n, state in STATES if n == node}
         assert 0.0 <= float(values['progress']) <= 100.0
         assert message.message
         assert (message.name, message.hardware_id) == (f'/{node}', '/')
@@ -151,17 +149,14 @@ def test_diagnostics_are_those_of_the_table(whole):
         DiagnosticArray, '/diagnostics', arrays.append, 100
     )
     for node in NODES:
-        always = {v.name for v in DIAGNOSTICS if v.node == node and not v.when}
-        every = {v.name for v in DIAGNOSTICS if v.node == node}
+        always = {name for n, name, when in DIAGNOSTICS if n == node and not when}
+        every = {name for n, name, _ in DIAGNOSTICS if n == node}
         whole.wait(
             lambda n=node, e=every: e <= {k for d in whole.diagnoses(n) for k in d},
             f'all values of {node}',
         )
         for found in whole.diagnoses(node):
             assert always <= set(found) - OTHERS <= every, node
-            for value in DIAGNOSTICS:
-                if value.node == node and value.unit and value.name in found:
-                    assert float(found[value.name]) is not None
     # once a second, by their own stamps
     whole.wait(lambda: len(arrays) >= 4 * len(NODES), 'some more')
     stamps = {}
@@ -192,6 +187,36 @@ def test_parameters_are_those_of_the_table(whole, node):
         )
         value = whole.get(node, d.name)
         assert isinstance(value, list if isinstance(d.default, tuple) else type(d.default))
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_the_policy_allows_what_the_node_does_and_no_more(whole, node):
+    may = {
+        right: {re.sub(r'^(?!/)', '/', name.replace('~', f'/{node}')) for name in names}
+        for right, names in rights(node).items()
+    }
+    see = {
+        'publish': whole.node.get_publisher_names_and_types_by_node,
+        'subscribe': whole.node.get_subscriber_names_and_types_by_node,
+        'reply': whole.node.get_service_names_and_types_by_node,
+        'request': whole.node.get_client_names_and_types_by_node,
+    }
+    for right, ask in see.items():
+        does = {name for name, _ in ask(node, '/')}
+        assert does <= may[right], f'{node} may not {right}'
+        if right in ('publish', 'reply'):
+            assert may[right] <= does | {f'/{node}/get_type_description'}, f'{node}: {right}'
+
+
+def test_only_the_drive_and_the_operator_have_their_rights():
+    may = {node: rights(node) for node in (*NODES, OPERATOR)}
+    assert [n for n in may if 'voltage' in may[n]['publish']] == ['excitation', 'player']
+    assert [n for n in may if 'model' in may[n]['publish']] == ['identifier']
+    asks = [n for n in may if 'excitation/start' in may[n]['request']]
+    assert asks == ['identifier', OPERATOR]
+    assert [n for n in may if 'stage/set_parameters' in may[n]['request']] == [OPERATOR]
+    called = {f'{node}/{name}' for node, name in SERVICES}
+    assert called <= may[OPERATOR]['request']
 
 
 @pytest.mark.parametrize('node', NODES)

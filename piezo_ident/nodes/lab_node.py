@@ -25,7 +25,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.parameters import Declaration, NODES
-from piezo_ident.nodes.wire import LATCHED, PREVIEW, QUESTIONS
+from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -42,7 +42,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-__all__ = ['LabNode', 'run', 'run_together']
+__all__ = ['LabNode', 'run']
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
@@ -60,8 +60,6 @@ class LabNode(Node):
     """
 
     executable: str
-    #: whether it holds the voltage of an amplifier
-    drives: bool = False
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
@@ -221,7 +219,7 @@ class LabNode(Node):
                 response.message, response.success = f'failed: {error!r}', False
             return response
 
-        self.create_service(Trigger, f'~/{name}', answer, qos_profile=QUESTIONS)
+        self.create_service(Trigger, f'~/{name}', answer, qos_profile=SERVICE)
 
     def _said(self, error: Exception) -> str:
         """Return the reason why a thread ended; what nobody expected goes to the log too."""
@@ -252,30 +250,18 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     """
     Run a node until SIGINT or SIGTERM, and let it close before the context goes.
 
-    Returns
-    -------
-    int
-        Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
-        not start.
-    """
-    return run_together([make], argv)
-
-
-def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | None = None) -> int:
-    """
-    Run nodes in one process, on one executor, until SIGINT or SIGTERM.
-
     Parameters
     ----------
-    makes : sequence of callable
-        Make one node each; closed in the reverse order, what holds the drive first.
+    make : callable
+        Makes the node.
     argv : sequence of str, optional
         Arguments for ROS.
 
     Returns
     -------
     int
-        As `run`.
+        Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
+        not start.
     """
     stop = threading.Event()
     # a thread beside the executor, one that reads YAML say, must not hold a block up for long
@@ -285,38 +271,21 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
 
     def on_signal(*_: object) -> None:
         stop.set()
-        # a silent node would hear of it only at the end of its wait
+        # a silent node would otherwise notice it at the end of its wait
         executor.wake()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    nodes: list[LabNode] = []
-    code = 0
+    node, code = None, 0
     try:
-        for make in makes:
-            nodes.append(make())
-            executor.add_node(nodes[-1])
-        failures = 0
-        while rclpy.ok() and not stop.is_set():
-            try:
-                executor.spin_once(timeout_sec=0.2)
-                failures = 0
-            except ExternalShutdownException:
-                break
-            # what somebody sends must not end the node that holds the drive
-            except Exception as error:
-                failures += 1
-                if failures > MOST_FAILURES:
-                    # nothing works any more: better to end, at rest
-                    raise
-                _report(nodes[0], error)
+        node = make()
+        executor.add_node(node)
+        _spin(executor, node, stop)
     except (PiezoIdentError, ParameterException) as error:
         sys.stderr.write(f'piezo_ident: error: {error}\n')
         code = 2
     finally:
-        # nobody spins for the stage any more: it is not to wait at 9 V for the others to end
-        nodes.sort(key=lambda node: node.drives)
-        for node in reversed(nodes):
+        if node is not None:
             try:
                 node.close()
                 node.await_listeners()
@@ -328,3 +297,20 @@ def run_together(makes: Sequence[Callable[[], LabNode]], argv: Sequence[str] | N
         executor.shutdown(timeout_sec=0.5)
         rclpy.try_shutdown()
     return code
+
+
+def _spin(executor: SingleThreadedExecutor, node: LabNode, stop: threading.Event) -> None:
+    failures = 0
+    while rclpy.ok() and not stop.is_set():
+        try:
+            executor.spin_once(timeout_sec=0.2)
+            failures = 0
+        except ExternalShutdownException:
+            return
+        # a message from outside must not end the node that holds the drive
+        except Exception as error:
+            failures += 1
+            if failures > MOST_FAILURES:
+                # nothing works any more: better to end, at rest
+                raise
+            _report(node, error)
