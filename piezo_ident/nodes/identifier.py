@@ -77,11 +77,11 @@ class IdentifierNode(LabNode):
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
-        self._subscriptions = BlockSubscriptions(self, lambda *block: self._held.append(block))
+        self._inputs = BlockSubscriptions(self, lambda *block: self._held.append(block))
         for key in ('voltage', 'displacement', APPLIED):
-            self._subscriptions.add(key, key)
+            self._inputs.add(key, key)
         for topic in self.values['channels'].split():
-            self._subscriptions.add(topic, '')
+            self._inputs.add(topic, '')
         self._drive = Drive(self, self._streams, self._unheard)
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
@@ -107,7 +107,7 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        self._subscriptions.drain()
+        self._inputs.drain()
         # what was captured before a run is forgotten once it has begun, and kept if it does not
         if self._drive.is_starting or not self._held:
             return
@@ -147,9 +147,7 @@ class IdentifierNode(LabNode):
 
     def _unheard(self) -> str:
         # what is sent before publisher and subscription have met is lost
-        return ', '.join(
-            t for t in self._subscriptions.unpublished if t not in ('voltage', APPLIED)
-        )
+        return ', '.join(t for t in self._inputs.unpublished if t not in ('voltage', APPLIED))
 
     # state
 

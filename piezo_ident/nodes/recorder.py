@@ -65,7 +65,7 @@ class RecorderNode(LabNode):
     executable = 'recorder'
 
     def __init__(self, **kwargs: Any) -> None:
-        self._subscriptions: RawSubscriptions | None = None
+        self._inputs: RawSubscriptions | None = None
         self._recording: Recording | None = None
         self._thread: threading.Thread | None = None
         self._last_count = (time.monotonic(), 0)
@@ -100,7 +100,7 @@ class RecorderNode(LabNode):
             raise PiezoIdentError('recording already; call stop first')
         recording = Recording(self.values['output'])
         topics = dict.fromkeys(self.resolve_topic_name(t) for t in self.values['topics'])
-        subscriptions = self._subscriptions = RawSubscriptions(self, topics)
+        subscriptions = self._inputs = RawSubscriptions(self, topics)
         self._thread = threading.Thread(
             target=self._work, args=(recording, subscriptions), name='recording'
         )
@@ -153,7 +153,7 @@ class RecorderNode(LabNode):
 
     def _look(self) -> None:
         """Follow the publishers while a recording is on its way."""
-        recording, subscriptions = self._recording, self._subscriptions
+        recording, subscriptions = self._recording, self._inputs
         if recording is None or subscriptions is None or recording.end.is_set():
             return
         if subscriptions.look() or time.monotonic() - recording.started > MATCH_LIMIT:
@@ -240,7 +240,7 @@ class RecorderNode(LabNode):
         return self._recording is not None and not self._recording.over.is_set()
 
     def _lost(self) -> int:
-        return 0 if self._subscriptions is None else self._subscriptions.lost
+        return 0 if self._inputs is None else self._inputs.lost
 
     def _numbers(self) -> Mapping[str, object]:
         recording = self._recording or Recording('')
