@@ -140,25 +140,13 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
             (10, 60) if quick else (10, 30, 60, 120, 300, 600),
         ),
         'write': ('Writing a bag', (10, 60) if quick else (10, 60, 600, hour)),
-        'read': ('Reading a bag into a record', (10, 60) if quick else (10, 60, 600)),
-        'follow': (
-            'Reading a bag message by message, predicting meanwhile: constant memory',
-            (10, 60) if quick else (10, 60, 600, hour),
-        ),
+        'read': ('Reading a bag into a record', (10, 60) if quick else (10, 60, 600, hour)),
         'convert': (
-            'Converting a bag to a bag: constant memory',
-            (10, 60) if quick else (10, 60, 600, hour),
-        ),
-        'convert_csv': (
-            'Converting a bag to CSV: constant memory',
-            (10,) if quick else (10, 60, 600),
-        ),
-        'convert_npz': (
-            'Converting a bag to npz: constant memory',
+            'Converting a bag to npz, its samples in memory maps',
             (10,) if quick else (10, 60, 600, hour),
         ),
         'predict_bag': (
-            'Predicting a bag file, with the prediction as npz: constant memory',
+            'Predicting a bag to npz, its samples in memory maps',
             (10, 60) if quick else (10, 60, 600, hour),
         ),
         'identify': (

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What `bench_growth` measures of bags: writing, reading, following, converting and predicting them.
+What `bench_growth` measures of bags: writing, reading, converting and predicting them.
 
 Each function takes a length [s] and a folder, in which `writing` has left a bag of that length,
 and returns a time [s] and the number of samples.
@@ -14,16 +14,13 @@ from collections.abc import Callable
 import contextlib
 import io
 from pathlib import Path
-import shutil
 import time
 
 import numpy as np
 from piezo_ident.cli import main as piezo_ident
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.bags.read import read_bag, typestore, write_bag
-from piezo_ident.record.bags.recover import opened_bag
-from piezo_ident.record.blocks import decode
+from piezo_ident.record.bags.read import read_bag, write_bag
 from piezo_ident.record.record import Piece, Record
 
 RATE = 20_000.0
@@ -68,74 +65,36 @@ def reading(size: float, folder: Path) -> Measure:
     return time.perf_counter() - start, record.n
 
 
-def following(size: float, folder: Path) -> Measure:
-    """Read a bag message by message, predict, and forget."""
-    _follow(folder / 'short')
-    start = time.perf_counter()
-    n = _follow(folder / f'bag_{size:g}')
-    return time.perf_counter() - start, n
-
-
-def _follow(path: Path) -> int:
-    running, n = paper().stream(), 0
-    with opened_bag(path) as bag:
-        wanted = [c for c in bag.connections if c.topic.endswith('voltage')]
-        for connection, _, raw in bag.messages(wanted):
-            message = typestore().deserialize_cdr(raw, connection.msgtype)
-            samples = decode(message.data, message.layout.dim, message.layout.data_offset)
-            running.process(samples.values, samples.t)
-            n += samples.values.size
-    return n
-
-
-def converting(suffix: str) -> Callable[[float, Path], Measure]:
-    """Return what measures ``piezo_ident convert BAG OUT``, for OUT with a suffix."""
-
-    def measure(size: float, folder: Path) -> Measure:
-        return _command(size, folder, lambda bag, out: ['convert', bag, out], f'out{suffix}')
-
-    return measure
+def converting(size: float, folder: Path) -> Measure:
+    """Measure ``piezo_ident convert BAG OUT.npz``."""
+    return _command(size, folder, lambda bag, out: ['convert', bag, out])
 
 
 def predicting(size: float, folder: Path) -> Measure:
     """Measure ``piezo_ident predict MODEL BAG --out OUT.npz``."""
     model = folder / 'paper.yaml'
     paper().save(model)
-    return _command(
-        size, folder, lambda bag, out: ['predict', str(model), bag, '--out', out], 'out.npz'
-    )
+    return _command(size, folder, lambda bag, out: ['predict', str(model), bag, '--out', out])
 
 
-def _command(
-    size: float, folder: Path, arguments: Callable[[str, str], list[str]], name: str
-) -> Measure:
-    out = folder / name
+def _command(size: float, folder: Path, arguments: Callable[[str, str], list[str]]) -> Measure:
+    out = folder / 'out.npz'
     took = 0.0
     for bag in ('short', f'bag_{size:g}'):
         start = time.perf_counter()
-        with contextlib.redirect_stdout(io.StringIO()) as said:
+        with contextlib.redirect_stdout(io.StringIO()) as output:
             status = piezo_ident([*arguments(str(folder / bag), str(out))])
         took = time.perf_counter() - start
         if status:
-            raise RuntimeError(said.getvalue())
-        _remove(out)
+            raise RuntimeError(output.getvalue())
+        out.unlink()
     return took, round(size * RATE)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
 
 
 #: by the name with which `bench_growth` measures them
 BAG_MEASURES: dict[str, Callable[[float, Path], Measure]] = {
     'write': writing,
     'read': reading,
-    'follow': following,
-    'convert': converting(''),
-    'convert_csv': converting('.csv'),
-    'convert_npz': converting('.npz'),
+    'convert': converting,
     'predict_bag': predicting,
 }

@@ -33,8 +33,6 @@ from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import decode, Dimension, encode, Samples
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.join import join
-from piezo_ident.record.long_bag import read_long_bag
-from piezo_ident.record.long_record import LongRecord
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.record.stream import Stream
 
@@ -122,18 +120,7 @@ def _file(suffix: str, data: bytes, folder: Path | None) -> None:
     if suffix in ('.mcap', '.db3'):
         with suppress(PiezoIdentError):
             read_record(path)
-        with suppress(PiezoIdentError):
-            _look_through(path)
     read_record(path, recover=True)
-
-
-def _look_through(path: Path) -> None:
-    """Read a bag window by window, as a long one."""
-    found = read_long_bag(path, window=10)
-    if isinstance(found, LongRecord):
-        for _, parts in found.parts(lambda step, share: None):
-            for _ in parts:
-                pass
 
 
 def csv(data: bytes, folder: Path | None = None) -> None:

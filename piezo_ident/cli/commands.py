@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.cli.common import check_record_output, read, read_long, say_faults, story
+from piezo_ident.cli.common import check_record_output, read, say_faults, story
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
@@ -21,8 +21,6 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.io import write_record
-from piezo_ident.record.long_record import LongRecord
-from piezo_ident.record.record import Record
 
 __all__ = ['run']
 
@@ -85,20 +83,9 @@ def convert_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_apart(args.out, args.record)
     check_record_output(args)
-    with console.progress() as progress:
-        if args.out.suffix.lower() == '.mat':
-            # its variables are written at once, and hold 2 GB at most
-            record: Record | LongRecord = read(args.record, args)
-        else:
-            record = read_long(args.record, args, progress, to_write=True)
-        with interrupts.waiting():
-            losses = write_record(
-                record,
-                args.out,
-                overwrite=args.overwrite,
-                storage=args.storage,
-                progress=progress,
-            )
+    record = read(args.record, args)
+    with interrupts.waiting():
+        losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
         f'{record.duration:.6g} s'

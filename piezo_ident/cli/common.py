@@ -17,9 +17,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.many.run import MARK
-from piezo_ident.record import io as record_io
 from piezo_ident.record.io import read_record
-from piezo_ident.record.long_record import LongRecord, Progress
 from piezo_ident.record.record import Record
 
 __all__ = [
@@ -32,7 +30,6 @@ __all__ = [
     'naming',
     'read',
     'read_all',
-    'read_long',
     'say_faults',
     'story',
 ]
@@ -162,14 +159,6 @@ def read(path: Path, args: argparse.Namespace) -> Record:
     return read_record(path, **_reading(args))
 
 
-def read_long(
-    path: Path, args: argparse.Namespace, progress: Progress, *, to_write: bool = False
-) -> Record | LongRecord:
-    """Read one record as the options say; a long bag is only looked through."""
-    check_bag_options([path], args)
-    return record_io.read_long(path, progress=progress, to_write=to_write, **_reading(args))
-
-
 def _reading(args: argparse.Namespace) -> dict[str, Any]:
     return {
         'displacement_unit': args.displacement_unit,
@@ -208,7 +197,7 @@ def check_record_output(args: argparse.Namespace) -> None:
     check_file(args.out, overwrite=args.overwrite, folder_too=True)
 
 
-def say_faults(record: Record | LongRecord, losses: Sequence[str], console: Console) -> None:
+def say_faults(record: Record, losses: Sequence[str], console: Console) -> None:
     """Say what was met in a record, and what the file it was written to cannot keep."""
     for fault in record.faults:
         console.say(f'met: {fault}')
@@ -216,7 +205,7 @@ def say_faults(record: Record | LongRecord, losses: Sequence[str], console: Cons
         console.say(f'not kept: {loss}')
 
 
-def story(record: Record | LongRecord, losses: Sequence[str]) -> dict[str, Any]:
+def story(record: Record, losses: Sequence[str]) -> dict[str, Any]:
     """Return for programs what `say_faults` says, and what the record holds."""
     return {
         'record': record.name,

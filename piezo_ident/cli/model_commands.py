@@ -11,14 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.cli.common import (
     expand_apart,
     naming,
     read,
     read_all,
-    read_long,
     RECORD_FILES,
     say_faults,
     story,
@@ -33,13 +30,10 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun
-from piezo_ident.model.long_prediction import predict_long
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.long_record import LongRecord, NeedsWhole, Progress
-from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.table_parts import PART_WRITERS
-from piezo_ident.record.tables import Table, WRITERS
+from piezo_ident.record.record import Record
+from piezo_ident.record.tables import blocks_of, WRITERS
 
 __all__ = ['MODEL_FILES', 'check_order', 'identify_command', 'predict_command']
 
@@ -163,12 +157,18 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             check_distinct(path, [args.model, args.record])
     check_order(args.model, args.record, 'predict')
     model = load(args.model)
-    with console.progress() as progress:
-        try:
-            record, run = _predicted(model, args, progress)
-        except NeedsWhole:
-            record, run = _predicted_whole(model, args)
-    if args.plot is not None and isinstance(record, Record):
+    record = read(args.record, args)
+    with naming(str(args.model)):
+        run = free_run(model, record)
+    if args.out is not None:
+        with (
+            interrupts.waiting(),
+            temporary_output(args.out, overwrite=True) as target,
+            target.open('xb') as file,
+        ):
+            rows = blocks_of(record, y_hat=run.pieces)
+            WRITERS[args.out.suffix.lower()](file, rows, (), ())
+    if args.plot is not None:
         from piezo_ident.report.figures import write_prediction_plot
 
         with interrupts.waiting():
@@ -188,53 +188,6 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             'plot': None if args.plot is None else str(args.plot),
         }
     )
-
-
-def _predicted(
-    model: StageModel, args: argparse.Namespace, progress: Progress
-) -> tuple[Record | LongRecord, FreeRun]:
-    """Predict a record, and write the prediction where that is asked for."""
-    if args.plot is not None:
-        return _predicted_whole(model, args)
-    record = read_long(args.record, args, progress)
-    if isinstance(record, Record):
-        return _predicted_whole(model, args, record)
-    with naming(str(args.model)):
-        if args.out is None:
-            return record, predict_long(model, record, progress=progress)
-        with (
-            interrupts.waiting(),
-            temporary_output(args.out, overwrite=True) as target,
-            target.open('xb') as file,
-            PART_WRITERS[args.out.suffix.lower()](file, ('t', 'v', 'y', 'y_hat')) as add,
-        ):
-
-            def keep(part: Piece, y_hat: NDArray[np.float64]) -> None:
-                add({'t': part.t, 'v': part.v, 'y': part.y, 'y_hat': y_hat})
-
-            return record, predict_long(model, record, add=keep, progress=progress)
-
-
-def _predicted_whole(
-    model: StageModel, args: argparse.Namespace, record: Record | None = None
-) -> tuple[Record, FreeRun]:
-    record = read(args.record, args) if record is None else record
-    with naming(str(args.model)):
-        run = free_run(model, record)
-    if args.out is not None:
-        columns = {
-            't': np.concatenate([p.t for p in record]),
-            'v': np.concatenate([p.v for p in record]),
-            'y': np.concatenate([p.y for p in record]),
-            'y_hat': run.predicted,
-        }
-        with (
-            interrupts.waiting(),
-            temporary_output(args.out, overwrite=True) as target,
-            target.open('xb') as file,
-        ):
-            WRITERS[args.out.suffix.lower()](file, Table(columns))
-    return record, run
 
 
 def check_order(model: Path, record: Path, verb: str) -> None:

@@ -1,14 +1,21 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Arrays that cannot be changed."""
+"""Arrays that cannot be changed, and the range of numbers that single wild ones do not widen."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ['frozen_array']
+__all__ = ['frozen_array', 'robust_range']
+
+#: numbers taken together, so that temporaries stay small beside a long record
+_CHUNK = 1 << 20
+#: share of the range by which numbers may leave it without a neighbour
+_LONE = 0.25
 
 
 def frozen_array(values: ArrayLike) -> NDArray[np.float64]:
@@ -19,3 +26,55 @@ def frozen_array(values: ArrayLike) -> NDArray[np.float64]:
         array = array.copy()
         array.setflags(write=False)
     return array
+
+
+def robust_range(parts: Iterable[NDArray[np.float64]]) -> tuple[float, float]:
+    """
+    Return the smallest and largest of measured numbers, but for wild ones.
+
+    What three samples in a row reach belongs to the range; one or two alone may leave it by a
+    quarter of its width at most, and are left out beyond.  So the range of sound data is that from
+    their minimum to their maximum.
+
+    Parameters
+    ----------
+    parts : iterable of ndarray, shape (n,)
+        Samples in the order in which they were taken; empty parts do not count.
+
+    Returns
+    -------
+    tuple of float
+        Both zero when there are no samples.
+
+    Examples
+    --------
+    >>> robust_range([np.array([0.0, 1.0, 2.0, 3.0, 2.0, 90.0, 1.0, 0.0])])
+    (0.0, 3.0)
+    """
+    filled = [x for x in parts if x.size]
+    if not filled:
+        return 0.0, 0.0
+    low, high = np.inf, -np.inf
+    for x in _chunks(filled, overlap=2):
+        if x.size >= 3:
+            high = max(high, float(np.minimum(np.minimum(x[:-2], x[1:-1]), x[2:]).max()))
+            low = min(low, float(np.maximum(np.maximum(x[:-2], x[1:-1]), x[2:]).min()))
+    if low <= high:
+        slack = _LONE * (high - low)
+        low, high = low - slack, high + slack
+    else:  # fewer than three, or no three alike
+        low, high = -np.inf, np.inf
+    smallest, largest = np.inf, -np.inf
+    for x in _chunks(filled):
+        kept = x[(x >= low) & (x <= high)]
+        if kept.size:
+            smallest, largest = min(smallest, float(kept.min())), max(largest, float(kept.max()))
+    return smallest, largest
+
+
+def _chunks(
+    parts: Sequence[NDArray[np.float64]], overlap: int = 0
+) -> Iterator[NDArray[np.float64]]:
+    for x in parts:
+        for i in range(0, x.size, _CHUNK):
+            yield x[i : i + _CHUNK + overlap]

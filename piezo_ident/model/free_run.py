@@ -10,7 +10,7 @@ the run goes on along a straight line of voltage.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 import re
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
-from piezo_ident.model.metrics import fit_percent, percent_of_stroke
+from piezo_ident.model.metrics import nrmse_fit, percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 
@@ -38,6 +38,10 @@ __all__ = [
     'start_warning',
 ]
 
+Vector = NDArray[np.float64]
+
+#: samples that are judged together, so that temporaries stay small beside a long record
+BLOCK = 1 << 20
 DIVERGES = 'the model diverges on this record; identify it again'
 #: what is dropped at the start of a sine: this time and at least one period [s]
 SETTLING = 1.0
@@ -161,28 +165,30 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             raise ModelError(f'{record.name}: {error}') from None
     predicted: list[NDArray[np.float64]] = []
     estimated: list[bool] = []
-    late: list[NDArray[np.bool_]] = []
+    starts: list[int] = []  # the sample of each piece from which its start is forgotten
     for pieces in connected_pieces(record):
         memory = start_memory(model, pieces[0])
         predicted += run_pieces(model, pieces, memory)
         estimated += [memory is not None, *[False] * (len(pieces) - 1)]
-        mask = np.ones(sum(piece.n for piece in pieces), dtype=bool)
+        start = 0
         if memory is not None:
-            v = np.concatenate([piece.v for piece in pieces])
+            parts = [piece.v for piece in pieces]
+            v = parts[0] if len(parts) == 1 else np.concatenate(parts)
             # a voltage that rests forgets nothing
-            mask[: forgotten(v) if np.ptp(v) > 0.0 else v.size] = False
-        late.append(mask)
-    y, y_hat = np.concatenate([piece.y for piece in record]), np.concatenate(predicted)
-    if not np.all(np.isfinite(y_hat)):
+            start = forgotten(v) if v.min() < v.max() else v.size
+        for piece in pieces:
+            starts.append(min(start, piece.n))
+            start -= starts[-1]
+    if not all(np.isfinite(y_hat).all() for y_hat in predicted):
         raise ModelError(f'{record.name}: {DIVERGES}')
-    mask = np.concatenate(late)
+    has_more = sum(starts) < record.n
     warnings = [start_warning(model, record.name, estimated)] if any(estimated) else []
     return FreeRun(
         record=record,
         pieces=tuple(predicted),
         estimated=tuple(estimated),
-        errors=_errors(y, y_hat, record.stroke),
-        errors_after_start=_errors(y[mask], y_hat[mask], record.stroke) if mask.any() else None,
+        errors=_errors(record, predicted, [0] * len(starts)),
+        errors_after_start=_errors(record, predicted, starts) if has_more else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
 
@@ -219,14 +225,28 @@ def start_warning(model: StageModel, name: str, estimated: Sequence[bool]) -> st
     )
 
 
-def _errors(y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float) -> Errors:
-    offset = float(np.mean(y - y_hat))
+def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) -> Errors:
+    """Return the errors from a sample of each piece on, in blocks: a record may be long."""
+    pieces = list(zip(record, predicted, starts, strict=True))
+
+    def total(f: Callable[[Vector, Vector], Vector]) -> float:
+        return sum(
+            float(np.sum(f(piece.y[i : i + BLOCK], y_hat[i : i + BLOCK])))
+            for piece, y_hat, start in pieces
+            for i in range(start, piece.n, BLOCK)
+        )
+
+    n = record.n - sum(starts)
+    offset, mean = total(lambda y, y_hat: y - y_hat) / n, total(lambda y, y_hat: y) / n
+    square = total(lambda y, y_hat: (y - y_hat) ** 2)
+    centred = total(lambda y, y_hat: (y - y_hat - offset) ** 2)
+    spread = total(lambda y, y_hat: (y - mean) ** 2)
     return Errors(
-        n=y.size,
-        percent=percent_of_stroke(y, y_hat, stroke),
-        fit=fit_percent(y, y_hat),
+        n=n,
+        percent=percent(np.sqrt(square / n), record.stroke),
+        fit=nrmse_fit(np.sqrt(square), np.sqrt(spread)),
         offset=offset,
-        percent_without_offset=percent_of_stroke(y, y_hat + offset, stroke),
+        percent_without_offset=percent(np.sqrt(centred / n), record.stroke),
     )
 
 

@@ -14,14 +14,11 @@ squares on the early part of a record.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.record.gaps import follows
-from piezo_ident.record.long_record import Outline
 from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
 
@@ -33,7 +30,6 @@ __all__ = [
     'forgotten',
     'is_at_rest',
     'start_memory',
-    'sweeps_of',
 ]
 
 #: share of its range that a run must sweep to forget its start
@@ -91,30 +87,6 @@ def forgotten(u: NDArray[np.float64], share: float = SHARE, span: float | None =
     sweep = Sweep(share * (float(np.ptp(u)) if span is None else span))
     start = sweep.before(u)
     return start if sweep.is_done else 0
-
-
-def sweeps_of(
-    pieces: Sequence[Piece | Outline], ranges: Sequence[tuple[float, float]]
-) -> list[Sweep]:
-    """
-    Return for each piece how it, and those that follow it, forget its start.
-
-    Parameters
-    ----------
-    pieces : sequence of Piece or Outline
-    ranges : sequence of (float, float)
-        Smallest and largest voltage of each.
-    """
-    sweeps: list[Sweep] = []
-    low = high = 0.0
-    for i in range(len(pieces) - 1, -1, -1):
-        if i + 1 < len(pieces) and follows(pieces[i], pieces[i + 1]) is not None:
-            low, high = min(low, ranges[i][0]), max(high, ranges[i][1])
-        else:
-            low, high = ranges[i]
-        # a voltage that rests forgets nothing
-        sweeps.append(Sweep(SHARE * (high - low) if high > low else np.inf))
-    return sweeps[::-1]
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:

@@ -9,16 +9,29 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import robust_range
 
-__all__ = ['FORMULA', 'fit_percent', 'percent_of_stroke', 'strokes']
+__all__ = ['FORMULA', 'fit_percent', 'nrmse_fit', 'percent', 'percent_of_stroke', 'strokes']
 
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
 
+Vector = NDArray[np.float64]
 
-def percent_of_stroke(
-    y: NDArray[np.float64], y_hat: NDArray[np.float64], stroke: float | None = None
-) -> float:
+
+def percent(rms: float, stroke: float) -> float:
+    """
+    Return ``100 rms / stroke``; infinite when the stroke is zero and the error is not.
+
+    >>> percent(0.5e-6, 50e-6), percent(1e-9, 0.0)
+    (1.0, inf)
+    """
+    if stroke == 0.0:
+        return 0.0 if rms == 0.0 else float('inf')
+    return 100.0 * float(rms) / stroke
+
+
+def percent_of_stroke(y: Vector, y_hat: Vector, stroke: float | None = None) -> float:
     """
     Return ``100 rms(y - y_hat) / (max y - min y)``.
 
@@ -34,33 +47,38 @@ def percent_of_stroke(
     float
         Infinite when the stroke is zero and the error is not.
     """
-    span = float(np.ptp(y)) if stroke is None else stroke
-    rms = float(np.sqrt(np.mean((y - y_hat) ** 2)))
-    if span == 0.0:
-        return 0.0 if rms == 0.0 else float('inf')
-    return 100.0 * rms / span
+    span = strokes([('', y)])[''] if stroke is None else stroke
+    return percent(float(np.sqrt(np.mean((y - y_hat) ** 2))), span)
 
 
-def strokes(parts: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, float]:
+def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
     """
     Return ``max y - min y`` of each record over all its parts.
 
-    Between two records a sensor may be set to zero anew, so their strokes are no common one.
+    Single wild samples do not count; see `piezo_ident.common.arrays.robust_range`.  Between two
+    records a sensor may be set to zero anew, so their strokes are no common one.
 
     Parameters
     ----------
     parts : iterable of (str, ndarray)
         Name of a record, and displacement of a part of it; empty ones do not count.
     """
-    ends: dict[str, tuple[float, float]] = {}
+    of: dict[str, list[Vector]] = {}
     for record, y in parts:
         if y.size:
-            low, high = ends.get(record, (np.inf, -np.inf))
-            ends[record] = min(low, float(y.min())), max(high, float(y.max()))
-    return {record: high - low for record, (low, high) in ends.items()}
+            of.setdefault(record, []).append(y)
+    ranges = {record: robust_range(pieces) for record, pieces in of.items()}
+    return {record: high - low for record, (low, high) in ranges.items()}
 
 
-def fit_percent(y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> float:
+def nrmse_fit(error: float, spread: float) -> float:
+    """Return ``100 (1 - error / spread)`` of two norms; 100 for no error, whatever the spread."""
+    if spread == 0.0:
+        return 100.0 if error == 0.0 else float('-inf')
+    return 100.0 * (1.0 - float(error) / float(spread))
+
+
+def fit_percent(y: Vector, y_hat: Vector) -> float:
     """
     Return the NRMSE fit ``100 (1 - |y - y_hat| / |y - mean y|)``, as MATLAB's ``compare`` does.
 
@@ -69,8 +87,4 @@ def fit_percent(y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> float:
     y, y_hat : ndarray, shape (n,)
         Measured and simulated displacement, same unit.
     """
-    spread = float(np.linalg.norm(y - y.mean()))
-    error = float(np.linalg.norm(y - y_hat))
-    if spread == 0.0:
-        return 100.0 if error == 0.0 else float('-inf')
-    return 100.0 * (1.0 - error / spread)
+    return nrmse_fit(float(np.linalg.norm(y - y_hat)), float(np.linalg.norm(y - y.mean())))

@@ -21,7 +21,6 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.common.limits import PIECES
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.ordering import at_times, in_order, Rows
-from piezo_ident.record.overall import Overall
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 
 __all__ = ['UNITS', 'SegmentStarts', 'assemble', 'label_runs']
@@ -38,6 +37,16 @@ MAX_RATE = 1e9
 MANY = 10
 #: a stretch of fewer samples has no sampling rate
 MIN_PIECE = 2
+#: strokes of piezo stages [m]; anything else is the wrong unit
+STROKE = (1e-9, 10e-3)
+#: spans of a voltage [V]; the squares of others leave what a float64 can hold
+VOLTAGE = (1e-12, 1e12)
+#: share of a motion that a float64 may lose to an offset
+LOST = 1e-6
+#: share of samples without a number that can be cut out
+MAX_NOT_FINITE = 0.01
+#: later times [s] are counted in another unit than seconds
+MAX_TIME = 1e11
 
 
 def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
@@ -67,7 +76,6 @@ def assemble(
     voltage_limits: tuple[float, float] | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
-    overall: Overall | None = None,
 ) -> Record:
     """
     Make a record of raw columns.
@@ -93,9 +101,6 @@ def assemble(
         Rate that the file names [Hz]; the stamps must agree with it.
     faults : iterable of Fault
         Already met by the caller.
-    overall : Overall, optional
-        Where the columns are a part of a record: takes note of what the whole will be judged by,
-        voltage limits included, and nothing of that is judged here.
 
     Returns
     -------
@@ -113,19 +118,15 @@ def assemble(
         raise DataError(
             f'{name}: unknown displacement unit {displacement_unit!r}; use m, mm, um or nm'
         )
-    judged = Overall(voltage_limits) if overall is None else overall
-    table = _drop_not_finite(table, judged, met)
-    if overall is None:
-        judged.check_finite(name)
+    table = _drop_not_finite(table, name, met)
     if not table.t.size:
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
     if UNITS[displacement_unit] != 1.0:
         scaled = table.columns['y'] / UNITS[displacement_unit]
         table = replace(table, columns={**table.columns, 'y': scaled})
-    judged.see(table.t, table.columns['v'], table.columns['y'])
-    if overall is None:
-        judged.check_ranges(name, displacement_unit)
+    _check_limits(table, voltage_limits, name)
+    _check_ranges(table, displacement_unit, name)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
 
@@ -170,20 +171,63 @@ def _table(
     return Rows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
 
 
-def _drop_not_finite(table: Rows, judged: Overall, met: list[Fault]) -> Rows:
+def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
     finite = np.isfinite(table.t)
     for x in table.columns.values():
         finite &= np.isfinite(x)
     bad = finite.size - int(np.count_nonzero(finite))
-    judged.rows += finite.size
-    judged.bad += bad
     if not bad:
         return table
+    if bad > MAX_NOT_FINITE * finite.size:
+        raise DataError(
+            f'{name}: {bad} of {finite.size} samples are NaN or infinite, more than 1 %; '
+            'cut the bad stretch out of the file'
+        )
     rows = np.flatnonzero(finite)
     where = at_times(table.t[~finite][np.isfinite(table.t[~finite])])
     met.append(Fault('not_finite', where, bad, 'cut out, record split there'))
     torn = np.flatnonzero(np.diff(rows) > 1) + 1
     return replace(table.take(rows), torn=torn)
+
+
+def _check_limits(table: Rows, limits: tuple[float, float] | None, name: str) -> None:
+    v = table.columns['v']
+    if limits is None or (limits[0] <= v.min() and v.max() <= limits[1]):
+        return
+    low, high = limits
+    outside = np.flatnonzero((v < low) | (v > high))
+    worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (low + high)))]
+    raise DataError(
+        f'{name}: {outside.size} samples leave the voltage limits {low:g}..{high:g} V, worst '
+        f'{v[worst]:g} V at {table.t[worst]:.6g} s; check the limits or the unit of v'
+    )
+
+
+def _check_ranges(table: Rows, unit: str, name: str) -> None:
+    """Refuse times, voltages and strokes that no piezo stage has."""
+    ends = {'t': table.t, **table.columns}
+    ranges = {k: (float(ends[k].min()), float(ends[k].max())) for k in ('t', 'v', 'y')}
+    latest = max(map(abs, ranges['t']))
+    if latest > MAX_TIME:
+        raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
+    span, stroke = (ranges[k][1] - ranges[k][0] for k in ('v', 'y'))
+    idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
+    if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
+        raise DataError(f'{name}: v spans {span:.3g} V, which is no voltage; write v in volts')
+    if stroke == 0.0 and not idle:
+        raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
+    if stroke > STROKE[1] or (stroke < STROKE[0] and not idle):
+        raise DataError(
+            f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
+            '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
+        )
+    for key, moved in (('v', span), ('y', stroke)):
+        offset = max(map(abs, ranges[key]))
+        if moved and offset * np.finfo(np.float64).eps > LOST * moved:
+            raise DataError(
+                f'{name}: {key} lies at {offset:.3g} and moves by {moved:.3g}: its digits are '
+                'used up by the offset; subtract it where the numbers are made'
+            )
 
 
 def _pieces(

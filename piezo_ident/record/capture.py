@@ -24,7 +24,6 @@ from piezo_ident.record.assemble import assemble
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.join import join
 from piezo_ident.record.ordering import at_times
-from piezo_ident.record.overall import Overall
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import Stream
 
@@ -63,7 +62,6 @@ def record_of_streams(
     voltage_limits: tuple[float, float] | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
-    overall: Overall | None = None,
 ) -> Record:
     """
     Make a record of streams of blocks.
@@ -80,7 +78,7 @@ def record_of_streams(
     tolerance : float, optional
         Difference of command and applied voltage that counts as none [V]; a thousandth of the
         range when absent.
-    displacement_unit, voltage_limits, sample_rate, faults, overall
+    displacement_unit, voltage_limits, sample_rate, faults
         As for `piezo_ident.record.assemble.assemble`.
 
     Raises
@@ -102,8 +100,6 @@ def record_of_streams(
     )
     if APPLIED in columns and np.array_equal(columns['voltage'], columns[APPLIED]):
         del columns[APPLIED]
-    if overall is not None:
-        overall.see_command(columns['voltage'], APPLIED in columns)
     if APPLIED in columns:
         v, applied = columns['voltage'], columns.pop(APPLIED)
         wrong = _guarded(v, applied, tolerance)
@@ -136,7 +132,6 @@ def record_of_streams(
         voltage_limits=voltage_limits,
         sample_rate=sample_rate,
         faults=met,
-        overall=overall,
     )
 
 

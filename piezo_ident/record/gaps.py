@@ -17,7 +17,6 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.record.long_record import Outline
 from piezo_ident.record.record import Piece, Record, Segment
 
 __all__ = ['LONGEST', 'Bridged', 'bridged', 'follows']
@@ -48,7 +47,7 @@ class Bridged:
     filled: int = 0
 
 
-def follows(one: Piece | Outline, other: Piece | Outline) -> int | None:
+def follows(one: Piece, other: Piece) -> int | None:
     """Return how many samples are missing between two pieces, None where they do not connect."""
     if abs(other.sample_rate / one.sample_rate - 1.0) > 1e-6:
         return None

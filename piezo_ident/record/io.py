@@ -8,23 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 import re
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.common.limits import regular_file
 from piezo_ident.common.yaml_io import broken_link
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag, write_bag
-from piezo_ident.record.long_bag import read_long_bag
-from piezo_ident.record.long_record import LongRecord, NeedsWhole, Progress
-from piezo_ident.record.overall import Overall
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.table_parts import PART_WRITERS
-from piezo_ident.record.tables import READERS, Table, WRITERS
+from piezo_ident.record.tables import blocks_of, labels_of, READERS, WRITERS
 
-__all__ = ['read_long', 'read_record', 'write_record']
+__all__ = ['read_record', 'write_record']
 
 _FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 
@@ -104,64 +100,21 @@ def read_record(
     ).renamed(path.name)
 
 
-def read_long(
-    path: str | Path,
-    *,
-    progress: Progress = lambda step, share: None,
-    to_write: bool = False,
-    **options: Any,
-) -> Record | LongRecord:
-    """
-    Read a record as `read_record` does, but leave the samples of a long bag in it.
-
-    Parameters
-    ----------
-    path : path
-    progress : callable, optional
-        Called as ``progress(step, share)`` while a long bag is looked through.
-    to_write : bool, optional
-        Whether it is for `write_record`, which says what a file will not give back: the whole
-        record is then read where there is something to say.
-    **options
-        Of `read_record`.
-
-    Raises
-    ------
-    DataError
-        As `read_record` does.
-    """
-    path = Path(path)
-    is_bag = path.is_dir() or path.suffix.lower() in ('.mcap', '.db3')
-    if not is_bag or broken_link(path):
-        return read_record(path, **options)
-    inspect = _refuse_losses if to_write else None
-    return read_long_bag(path, progress=progress, inspect=inspect, **options)
-
-
-def _refuse_losses(record: Record) -> None:
-    _check_labels(record, Path(record.name))
-    losses = _losses(record, _flatten(record), Overall())
-    if losses:
-        raise NeedsWhole(losses[0])
-
-
 def write_record(
-    record: Record | LongRecord,
+    record: Record,
     path: str | Path,
     *,
     overwrite: bool = False,
     storage: str | None = None,
     custom_data: Mapping[str, str] | None = None,
-    progress: Progress = lambda step, share: None,
 ) -> tuple[str, ...]:
     """
     Write a record; the suffix names the format, no suffix a bag folder.
 
     Parameters
     ----------
-    record : Record or LongRecord
-        What to write; its faults are no part of any file.  A long one must have been read for
-        this, and is not written as .mat.
+    record : Record
+        What to write; its faults are no part of any file.
     path : path
         Where to; nothing is left there when writing fails.
     overwrite : bool
@@ -170,8 +123,6 @@ def write_record(
         Storage of a bag folder.
     custom_data : mapping of str to str, optional
         For a bag's metadata: seed, programme.
-    progress : callable, optional
-        Called as ``progress(step, share)`` while a long record is read.
 
     Returns
     -------
@@ -198,34 +149,15 @@ def write_record(
             storage=storage,
             overwrite=overwrite,
             custom_data=custom_data,
-            progress=progress,
         )
-    elif isinstance(record, Record):
-        with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
-            WRITERS[suffix](file, _flatten(record))
-    elif suffix in PART_WRITERS:
-        _write_parts(record, path, overwrite, progress)
     else:
-        raise DataError(f'{path}: a long bag is not written as {suffix}; choose .csv or .npz')
+        with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
+            WRITERS[suffix](file, blocks_of(record), *labels_of(record))
     notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
-    return notes + (_losses(record, _flatten(record)) if isinstance(record, Record) else ())
+    return notes + _losses(record)
 
 
-def _write_parts(record: LongRecord, path: Path, overwrite: bool, progress: Progress) -> None:
-    columns = ['t', 'v', 'y', *(f'x_{name}' for name in record.pieces[0].channels)]
-    names, starts = _labels(record)
-    with (
-        temporary_output(path, overwrite=overwrite) as target,
-        target.open('xb') as file,
-        PART_WRITERS[path.suffix.lower()](file, columns, names, starts) as add,
-    ):
-        for _, parts in record.parts(progress):
-            for part in parts:
-                channels = {f'x_{name}': x for name, x in part.channels.items()}
-                add({'t': part.t, 'v': part.v, 'y': part.y, **channels})
-
-
-def _check_labels(record: Record | LongRecord, path: Path) -> None:
+def _check_labels(record: Record, path: Path) -> None:
     for label in record.labels:
         if label != label.strip() or not label.isprintable():
             raise DataError(
@@ -243,52 +175,20 @@ def _check_labels(record: Record | LongRecord, path: Path) -> None:
             )
 
 
-def _flatten(record: Record) -> Table:
-    """Return all pieces below each other; time alone tells them apart."""
-    columns = {
-        't': np.concatenate([p.t for p in record]),
-        'v': np.concatenate([p.v for p in record]),
-        'y': np.concatenate([p.y for p in record]),
-    }
-    for name in record.pieces[0].channels:
-        columns[f'x_{name}'] = np.concatenate([p.channels[name] for p in record])
-    return Table(columns, *_labels(record))
-
-
-def _labels(record: Record | LongRecord) -> tuple[list[str], list[int]]:
-    """Return the label of each stretch and its first row, nothing for unlabelled records."""
-    names: list[str] = []
-    starts: list[int] = []
-    offset = 0
-    for piece in record:
-        end = offset
-        for s in piece.segments:
-            if offset + s.start > end:
-                names.append('')
-                starts.append(end)
-            names.append(s.label)
-            starts.append(offset + s.start)
-            end = offset + s.stop
-        offset += piece.n
-        if end < offset:
-            names.append('')
-            starts.append(end)
-    return (names, starts) if any(names) else ([], [])
-
-
-def _losses(record: Record, table: Table, overall: Overall | None = None) -> tuple[str, ...]:
+def _losses(record: Record) -> tuple[str, ...]:
     """Read the columns as a reader would, and say what differs."""
-    columns = dict(table.columns)
+
+    def whole(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    t, v, y = (
+        whole([p.t for p in record]),
+        whole([p.v for p in record]),
+        whole([p.y for p in record]),
+    )
+    channels = {k: whole([p.channels[k] for p in record]) for k in record.pieces[0].channels}
     try:
-        back = assemble(
-            columns.pop('t'),
-            columns.pop('v'),
-            columns.pop('y'),
-            (table.names, table.starts),
-            columns,
-            name='the file',
-            overall=overall,
-        )
+        back = assemble(t, v, y, labels_of(record), channels, name='the file')
     except DataError as error:
         return (f'reading refuses it: {error}',)
     losses = []

@@ -16,7 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.arrays import frozen_array, robust_range
 from piezo_ident.common.errors import DataError
 
 __all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment']
@@ -150,10 +150,15 @@ class Piece:
     def time(self, start: int, stop: int) -> NDArray[np.float64]:
         """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
         first = round(self.start_time * self.sample_rate)
-        ticks = np.arange(start, min(stop, self.n), dtype=np.float64)
+        t = np.arange(start, min(stop, self.n), dtype=np.float64)
+        # in place: an hour has 72 million samples
         if first / self.sample_rate == self.start_time:
-            return (first + ticks) / self.sample_rate
-        return self.start_time + ticks / self.sample_rate
+            t += first
+            t /= self.sample_rate
+        else:
+            t /= self.sample_rate
+            t += self.start_time
+        return t
 
     def find(self, kind: str) -> list[Segment]:
         """Return the segments of a kind (``sine``) or with a full label (``sine:50Hz``)."""
@@ -220,8 +225,9 @@ class Record:
 
     @property
     def stroke(self) -> float:
-        """Largest minus smallest displacement [m]."""
-        return float(max(p.y.max() for p in self) - min(p.y.min() for p in self))
+        """Largest minus smallest displacement [m], single wild samples left out."""
+        low, high = robust_range(p.y for p in self)
+        return high - low
 
     @property
     def voltage_range(self) -> tuple[float, float]:

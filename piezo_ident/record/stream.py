@@ -1,26 +1,51 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The blocks of one topic as they come, in buffers that a copy shares."""
+"""
+The blocks of one topic as they come, in buffers that a copy shares.
+
+The samples of a long bag are spooled to temporary files, and read back as memory maps: a record of
+an hour then needs no memory of its own, and every part of the package takes it as any other.
+"""
 
 from __future__ import annotations
 
 from array import array
+import tempfile
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Stream']
+__all__ = ['SPOOLED', 'Stream']
 
 #: numbers in a chunk of a stream
 CHUNK = 1 << 17
+#: samples that a spooled stream keeps in memory
+SPOOLED = 1 << 21
 
 
 class Stream:
-    """All blocks of one topic so far, in flat buffers that grow chunk by chunk."""
+    """
+    All blocks of one topic so far, in flat buffers that grow chunk by chunk.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    spooled : bool, optional
+        Move the samples to temporary files whenever there are more than `SPOOLED`.  Such a stream
+        can be neither copied nor shortened.
+
+    Raises
+    ------
+    DataError
+        When there is no room for the temporary files.
+    """
+
+    def __init__(self, *, spooled: bool = False) -> None:
+        self._files: list[BinaryIO] = []
+        self._spooled, self._in_files = spooled, 0
         self._chunks = [array('d')]  # only the last one grows, so that copies share the others
         self._sizes = array('q')
         self._arrivals = array('q')
@@ -30,7 +55,10 @@ class Stream:
         """Add a block that arrived at a time [ns] of a clock that all streams share."""
         rows = np.column_stack([samples.t, samples.values])
         if len(self._chunks[-1]) >= CHUNK:
-            self._chunks.append(array('d'))
+            if self._spooled and len(self._chunks) * CHUNK >= 2 * SPOOLED:
+                self._spool()
+            else:
+                self._chunks.append(array('d'))
         self._chunks[-1].frombytes(rows.tobytes())
         self._sizes.append(samples.t.size)
         self._arrivals.append(arrival)
@@ -57,19 +85,41 @@ class Stream:
     @property
     def n(self) -> int:
         """Number of samples."""
-        return sum(len(chunk) for chunk in self._chunks) // 2
+        return self._in_files + sum(len(chunk) for chunk in self._chunks) // 2
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """Time of each sample [s], a copy of shape (n,)."""
+        """Time of each sample [s], shape (n,): a copy, or a read-only memory map."""
         return self._column(0)
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Value of each sample, a copy of shape (n,)."""
+        """Value of each sample, shape (n,): a copy, or a read-only memory map."""
         return self._column(1)
 
+    def _spool(self) -> None:
+        try:
+            if not self._files:
+                self._files = [tempfile.TemporaryFile(prefix='piezo_ident_') for _ in range(2)]
+            for chunk in self._chunks:
+                rows = np.frombuffer(chunk).reshape(-1, 2)
+                for file, column in zip(self._files, rows.T, strict=True):
+                    file.write(np.ascontiguousarray(column).data)
+                    file.flush()
+        except OSError as error:
+            raise DataError(
+                f'no room for a long record in {tempfile.gettempdir()} ({error.strerror}); make '
+                'room, or set TMPDIR to a place with room'
+            ) from None
+        self._in_files = self.n
+        self._chunks = [array('d')]
+
     def _column(self, k: int) -> NDArray[np.float64]:
+        if self._files:
+            if self._chunks[0]:
+                self._spool()
+            # the map keeps the file, which has no name, until nobody holds the column
+            return np.asarray(np.memmap(self._files[k], np.float64, 'r', shape=(self.n,)))
         column, at = np.empty(self.n), 0
         for chunk in self._chunks:
             part = np.frombuffer(chunk, dtype=np.float64)[k::2]

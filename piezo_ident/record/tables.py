@@ -13,10 +13,11 @@ begins.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import csv
 from dataclasses import dataclass, field
+import io
 import itertools
 from pathlib import Path
 import re
@@ -29,12 +30,16 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.common.limits import COLUMNS, unpacked
 from piezo_ident.record.assemble import label_runs
 from piezo_ident.record.mat_read import read_variables
-from piezo_ident.record.table_parts import csv_parts
+from piezo_ident.record.record import Record
 import scipy.io
 
-__all__ = ['READERS', 'WRITERS', 'Table']
+__all__ = ['READERS', 'WRITERS', 'Blocks', 'Table', 'blocks_of', 'labels_of']
 
-#: rows of a CSV file taken together
+Vector = NDArray[np.float64]
+#: yields the columns block by block, each time it is called
+Blocks = Callable[[], Iterator[Mapping[str, Vector]]]
+
+#: rows that are read and written together
 _ROWS = 65536
 _REQUIRED = ('t', 'v', 'y')
 _POINTS = (
@@ -51,6 +56,54 @@ class Table:
     names: list[str] = field(default_factory=list)
     starts: ArrayLike = ()
     ignored: tuple[str, ...] = ()
+
+
+def blocks_of(record: Record, **further: Sequence[Vector]) -> Blocks:
+    """
+    Return the columns of a record, its pieces below each other, as the writers take them.
+
+    Parameters
+    ----------
+    record : Record
+    **further : sequence of ndarray
+        Columns in place of the channels, one array a piece.
+    """
+
+    def blocks() -> Iterator[Mapping[str, Vector]]:
+        for i, piece in enumerate(record):
+            columns = {'v': piece.v, 'y': piece.y}
+            if further:
+                columns |= {name: parts[i] for name, parts in further.items()}
+            else:
+                columns |= {f'x_{name}': x for name, x in piece.channels.items()}
+            for a in range(0, piece.n, _ROWS):
+                cut = slice(a, min(a + _ROWS, piece.n))
+                yield {'t': piece.time(cut.start, cut.stop)} | {
+                    name: x[cut] for name, x in columns.items()
+                }
+
+    return blocks
+
+
+def labels_of(record: Record) -> tuple[list[str], list[int]]:
+    """Return the label of each stretch and its first row, nothing for unlabelled records."""
+    names: list[str] = []
+    starts: list[int] = []
+    offset = 0
+    for piece in record:
+        end = offset
+        for s in piece.segments:
+            if offset + s.start > end:
+                names.append('')
+                starts.append(end)
+            names.append(s.label)
+            starts.append(offset + s.start)
+            end = offset + s.stop
+        offset += piece.n
+        if end < offset:
+            names.append('')
+            starts.append(end)
+    return (names, starts) if any(names) else ([], [])
 
 
 def _wanted(name: str) -> bool:
@@ -210,10 +263,26 @@ def _torn_at_commas(row: list[str], header: list[str]) -> bool:
     return len(header) < len(row) <= 2 * len(header) and len(row) - whole <= texts
 
 
-def write_csv(file: BinaryIO, table: Table) -> None:
+def write_csv(
+    file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
+) -> None:
     """Write a CSV file whose numbers read back exactly."""
-    with csv_parts(file, tuple(table.columns), table.names, table.starts) as add:
-        add(table.columns)
+    labels, n = [_quoted(name) for name in names], 0
+    for block in blocks():
+        if not n:
+            file.write((','.join([*block, *(['segment'] if labels else [])]) + '\n').encode())
+        texts: list[Iterable[str]] = [map(repr, x.tolist()) for x in block.values()]
+        rows = np.arange(n, n + block['t'].size)
+        if labels:
+            texts.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
+        file.write(('\n'.join(map(','.join, zip(*texts, strict=True))) + '\n').encode())
+        n += rows.size
+
+
+def _quoted(text: str) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator='').writerow([text, ''])
+    return line.getvalue()[:-1]
 
 
 # --- npz ------------------------------------------------------------------------------------
@@ -294,12 +363,24 @@ def _text(value: object, path: Path) -> str:
     return value.strip()
 
 
-def write_npz(file: BinaryIO, table: Table) -> None:
-    """Write a NumPy archive."""
-    arrays: dict[str, Any] = dict(table.columns)
-    if table.names:
-        arrays |= {'segment_name': np.array(table.names), 'segment_start': table.starts}
-    np.savez(file, **arrays)
+def write_npz(
+    file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
+) -> None:
+    """Write a NumPy archive, one column after the other."""
+    size = sum(block['t'].size for block in blocks())
+    head = {'descr': '<f8', 'fortran_order': False, 'shape': (size,)}
+    with zipfile.ZipFile(file, 'w', allowZip64=True) as archive:
+        for name in next(blocks()):
+            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
+                to: Any = member  # the stubs know other files only
+                np.lib.format.write_array_header_1_0(to, head)
+                for block in blocks():
+                    member.write(np.ascontiguousarray(block[name], dtype='<f8').data)
+        labels = {'segment_name': np.array(names), 'segment_start': np.array(starts)}
+        for name, x in labels.items() if names else ():
+            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
+                to = member
+                np.lib.format.write_array(to, x, allow_pickle=False)
 
 
 # --- MATLAB ---------------------------------------------------------------------------------
@@ -316,14 +397,16 @@ def read_mat(path: Path) -> Table:
         return _from_arrays(arrays, names, path)
 
 
-def write_mat(file: BinaryIO, table: Table) -> None:
+def write_mat(
+    file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
+) -> None:
     """Write a MATLAB 5 file of column vectors."""
-    arrays: dict[str, Any] = dict(table.columns)
-    if table.names:
-        names = np.empty(len(table.names), dtype=object)
-        names[:] = table.names
-        starts = np.asarray(table.starts, dtype=np.float64)
-        arrays |= {'segment_name': names, 'segment_start': starts}
+    parts = list(blocks())
+    arrays: dict[str, Any] = {k: np.concatenate([block[k] for block in parts]) for k in parts[0]}
+    if names:
+        cells = np.empty(len(names), dtype=object)
+        cells[:] = names
+        arrays |= {'segment_name': cells, 'segment_start': np.asarray(starts, dtype=np.float64)}
     to: Any = file  # the stubs know paths only
     scipy.io.savemat(to, arrays, oned_as='column', long_field_names=True)
 
@@ -348,7 +431,7 @@ READERS: Mapping[str, Callable[[Path], Table]] = {
     '.npz': read_npz,
     '.mat': read_mat,
 }
-WRITERS: Mapping[str, Callable[[BinaryIO, Table], None]] = {
+WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]], None]] = {
     '.csv': write_csv,
     '.npz': write_npz,
     '.mat': write_mat,

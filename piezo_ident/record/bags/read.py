@@ -12,12 +12,10 @@ A bag whose recorder was killed is refused, or read as far as it goes when that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.record.bags.samples import BagSamples, MESSAGE_TYPE, opened_samples, typestore
@@ -28,8 +26,7 @@ from piezo_ident.record.blocks import (
     Samples,
 )
 from piezo_ident.record.capture import record_of_streams
-from piezo_ident.record.long_record import LongRecord, Outline, parts_of, Progress
-from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.record import Record
 from piezo_ident.record.stream import Stream
 from rosbags.interfaces import (
     Qos,
@@ -109,7 +106,7 @@ def read_bag(
         displacement_topic=displacement_topic,
         recover=recover,
     ) as source:
-        streams = {quantity: Stream() for quantity in source.topics}
+        streams = {quantity: Stream(spooled=True) for quantity in source.topics}
         for quantity, samples, stamp in source.blocks():
             streams[quantity].append(samples, stamp)
     return record_in(source, streams, displacement_unit, voltage_limits)
@@ -139,14 +136,13 @@ def record_in(
 
 
 def write_bag(
-    record: Record | LongRecord,
+    record: Record,
     path: str | Path,
     *,
     storage: str | None = None,
     overwrite: bool = False,
     custom_data: Mapping[str, str] | None = None,
     block_size: int = BLOCK_SIZE,
-    progress: Progress = lambda step, share: None,
 ) -> None:
     """
     Write a record as a rosbag2 folder, or as a single file when `path` ends so.
@@ -157,7 +153,7 @@ def write_bag(
 
     Parameters
     ----------
-    record : Record or LongRecord
+    record : Record
         What to write.
     path : path
         The folder, or a file name that ends in .mcap or .db3.
@@ -169,8 +165,6 @@ def write_bag(
         For the bag's metadata beside ``sample_rate``: seed, programme.
     block_size : int
         Samples a block.
-    progress : callable, optional
-        Called as ``progress(step, share)`` while a long record is read.
 
     Raises
     ------
@@ -197,25 +191,25 @@ def write_bag(
         with Writer(folder, version=9, storage_plugin=plugin) as writer:
             for key, value in custom.items():
                 writer.set_custom_data(key, value)
-            _write_pieces(writer, record, block_size, progress)
+            _write_pieces(writer, record, block_size)
         if suffix:
             next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
 
 
-def _write_pieces(
-    writer: Writer, record: Record | LongRecord, block_size: int, progress: Progress
-) -> None:
+def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
     quantities = ['voltage', 'displacement']
     quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
     senders = {q: _sender(writer, q) for q in quantities}
     shift, latest = 0, 0.0
-    for piece, parts in parts_of(record, progress):
+    for piece in record:
+        columns = {'voltage': piece.v, 'displacement': piece.y}
+        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
         first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
         # later by whole seconds, until nothing is before what was written already
         while first + shift < latest:
             shift += 1 + int(latest - first - shift)
         latest = last + shift
-        for start, stop, label, columns in _cut_parts(piece, parts, block_size):
+        for start, stop, label in cut_blocks(piece.n, piece.segments, block_size):
             t = piece.time(start, stop)
             stamp = round(t[0] * 1e9) + shift * 1_000_000_000
             if stamp >= 2**63:
@@ -224,24 +218,7 @@ def _write_pieces(
                     f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
                 )
             for quantity, x in columns.items():
-                senders[quantity](Samples(t, x, label, quantity), stamp)
-
-
-def _cut_parts(
-    piece: Piece | Outline, parts: Iterator[Piece], size: int
-) -> Iterator[tuple[int, int, str, dict[str, NDArray[np.float64]]]]:
-    """Yield the blocks of a piece, whatever parts it comes in."""
-    held: dict[str, NDArray[np.float64]] = {}
-    at = end = 0  # samples that are held
-    for start, stop, label in cut_blocks(piece.n, piece.segments, size):
-        while stop > end:
-            more = next(parts)
-            new = {'voltage': more.v, 'displacement': more.y}
-            new |= {f'x_{name}': x for name, x in more.channels.items()}
-            if start < end:
-                new = {q: np.concatenate([held[q][start - at :], x]) for q, x in new.items()}
-            held, at, end = new, start, end + more.n
-        yield start, stop, label, {q: x[start - at : stop - at] for q, x in held.items()}
+                senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
 
 
 def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
