@@ -23,15 +23,16 @@ from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Predictor', 'TurningPoints', 'expected_error', 'memory_after', 'warm_up']
+__all__ = ['Predictor', 'TurningPoints', 'expected_error', 'warm_up']
 
 #: voltage that is kept sample by sample, for G and delay of a new model to catch up with [s]
 RECENT = 5.0
 #: longest gap that is bridged by a straight line; behind a longer one a new run begins [s]
 BRIDGE = 0.5
+#: time before each turning point of which the samples are kept [s]
+APPROACH = 0.05
 #: time that jumps back by more samples than this is a restart, not a late block
 JUMP_BACK = 1000
 #: fastest sample clock [s], and most blocks that are kept, whatever the times say
@@ -59,13 +60,13 @@ def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
 
 
 @kernel
-def _turns(v: NDArray[np.float64], out: NDArray[np.float64]) -> int:
+def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
     # first and last sample, and every one at which the direction changes
     n, before = 0, 0.0
     for k in range(v.size):
         after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
         if k == 0 or after != before:
-            out[n] = v[k]
+            out[n] = k
             n += 1
         before = after
     return n
@@ -81,51 +82,74 @@ class TurningPoints:
     Examples
     --------
     >>> points = TurningPoints()
-    >>> points.add(np.array([0.0, 4.0, 1.0, 3.0, 2.0, 5.0]))
+    >>> points.add(np.arange(6.0), np.array([0.0, 4.0, 1.0, 3.0, 2.0, 5.0]))
     >>> points.values.tolist()
     [0.0, 5.0]
     """
 
     def __init__(self) -> None:
-        self._points: list[float] = []
+        # value of each point, and the samples that lead to it
+        self._points: list[tuple[float, Samples]] = []
+        self._tail = Samples(np.empty(0), np.empty(0))
 
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """Start, turning points and last sample."""
-        return np.array(self._points)
+    def __len__(self) -> int:
+        return len(self._points)
 
-    def add(self, v: NDArray[np.float64]) -> None:
-        """Add a stretch of voltage."""
-        # most samples of a block are on their way somewhere
-        turns = np.empty(v.size)
-        count = _turns(np.array(v, dtype=np.float64), turns)
+    def add(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+        """Add the next samples: time [s] and voltage [V]."""
+        # most samples of a block lie between two turning points
+        turns = np.empty(v.size, dtype=np.int64)
+        turns = turns[: _turns(np.array(v, dtype=np.float64), turns)]
+        before = self._tail.t.size
+        t, v = np.concatenate([self._tail.t, t]), np.concatenate([self._tail.values, v])
+        first = np.searchsorted(t, t - APPROACH)
         points = self._points
-        for x in turns[:count].tolist():
-            if points and x == points[-1]:
+        for k in (before + turns).tolist():
+            x, lead = float(v[k]), Samples(t[first[k] : k + 1], v[first[k] : k + 1])
+            if points and x == points[-1][0]:
                 continue
-            if len(points) > 1 and (points[-1] - points[-2]) * (x - points[-1]) > 0.0:
+            if len(points) > 1 and (points[-1][0] - points[-2][0]) * (x - points[-1][0]) > 0.0:
                 points.pop()
-            points.append(x)
+            points.append((x, lead))
             while len(points) > 3:
-                a, b, c, d = points[-4:]
+                a, b, c, d = (value for value, _ in points[-4:])
                 if not min(a, d) <= min(b, c) <= max(b, c) <= max(a, d):
                     break
                 del points[-3:-1]
+        self._tail = Samples(t[first[-1] :], v[first[-1] :])
 
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Start, turning points and last sample [V]."""
+        return np.array([x for x, _ in self._points])
 
-def memory_after(model: StageModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """
-    Return the play outputs of a model behind a history of voltage, shape (m,).
+    def path(self, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """
+        Return time [s] and voltage [V] of a way through the turning points, sampled.
 
-    Parameters
-    ----------
-    model : StageModel
-    points : ndarray, shape (n,)
-        The voltage, or its turning points; the stage was at rest before the first.
-    """
-    h, u = model.hysteresis, model.scaling.u(points)
-    start = h.initial_memory(float(u[0]))
-    return weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, start)[1]
+        For operators that depend on the speed: before each point stand the last samples that led
+        to it, and between them short straight lines.
+
+        Parameters
+        ----------
+        period : float
+            Sampling period [s].
+        """
+        parts_t: list[NDArray[np.float64]] = []
+        parts_v: list[NDArray[np.float64]] = []
+        for _, lead in self._points:
+            t, v = lead.t, lead.values
+            if parts_t:
+                end, level = float(parts_t[-1][-1]), float(parts_v[-1][-1])
+                t, v = t[t > end], v[t > end]
+                missing = min(float(t[0]) - end, APPROACH) / period
+                if missing > 1.5:
+                    share = np.linspace(0.0, 1.0, round(missing), endpoint=False)[1:]
+                    parts_t.append(end + (t[0] - end) * share)
+                    parts_v.append(level + (v[0] - level) * share)
+            parts_t.append(t)
+            parts_v.append(v)
+        return np.concatenate(parts_t), np.concatenate(parts_v)
 
 
 def expected_error(model: StageModel) -> float | None:
@@ -215,9 +239,16 @@ class Predictor:
         )
 
     def _caught_up(self, model: StageModel) -> Stream:
-        old = self._old.values
+        stream = model.stream()
         # without older samples the run is here in full, start and all
-        stream = model.stream(memory_after(model, old) if old.size else None)
+        if len(self._old):
+            if model.effects_in('input') or model.effects_in('hysteresis'):
+                t, v = self._old.path(self._period)
+            else:
+                # plays alone do not depend on time
+                v = self._old.values
+                t = np.zeros(v.size)
+            stream.recall(v, t)
         t, v = (np.concatenate(x) for x in zip(*self._recent, strict=True))
         stream.process(v, t)
         return stream
@@ -327,7 +358,7 @@ class Predictor:
         self._recent.append((t, v))
         recent = self._recent
         while t[-1] - recent[0][0][-1] > RECENT or len(recent) > MOST_BLOCKS:
-            self._old.add(self._recent.popleft()[1])
+            self._old.add(*self._recent.popleft())
 
 
 def warm_up() -> None:
@@ -344,5 +375,4 @@ def warm_up() -> None:
     t = np.arange(100) / 1000.0
     predictor.process(Samples(t, t))
     predictor.set_model(model)
-    TurningPoints().add(t)
-    memory_after(model, t)
+    TurningPoints().add(t, t)

@@ -7,16 +7,11 @@
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.monitor import LiveError, Matcher, Preview
-from piezo_ident.live.predictor import (
-    expected_error,
-    memory_after,
-    Predictor,
-    TurningPoints,
-    warm_up,
-)
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.live.predictor import expected_error, Predictor, TurningPoints, warm_up
+from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 import pytest
@@ -55,23 +50,38 @@ def predicted(predictor, blocks):
     return np.concatenate([m.values for m in made if m is not None])
 
 
+def memory(m, v):
+    h, u = m.hysteresis, m.scaling.u(v)
+    return weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, h.initial_memory(u[0]))[1]
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_turning_points_hold_the_memory_of_any_model_exactly(seed):
     v = drive(20_000, seed)
-    points = TurningPoints()
-    for block in np.split(v, [7, 100, 5000, 5001, 12_345]):
-        points.add(block)
-    assert points.values.size < 30
+    t, points = np.arange(v.size) / RATE, TurningPoints()
+    for rows in np.split(np.arange(v.size), [7, 100, 5000, 5001, 12_345]):
+        points.add(t[rows], v[rows])
+    assert len(points) < 30
     for m in (model(seed), model(seed + 1, v0=-2.0), model(seed, v0=3.0)):
-        np.testing.assert_array_equal(memory_after(m, points.values), memory_after(m, v))
+        np.testing.assert_array_equal(memory(m, points.values), memory(m, v))
 
 
 def test_turning_points_of_constant_and_monotone_voltage_are_its_ends():
     points = TurningPoints()
-    points.add(np.full(10, 2.0))
+    points.add(np.arange(10.0), np.full(10, 2.0))
     assert points.values.tolist() == [2.0]
-    points.add(np.array([2.0, 3.0, 3.0, 4.0]))
+    points.add(np.arange(10.0, 14.0), np.array([2.0, 3.0, 3.0, 4.0]))
     assert points.values.tolist() == [2.0, 4.0]
+
+
+def test_the_path_through_turning_points_holds_the_samples_before_them():
+    t, points = np.arange(3001) / RATE, TurningPoints()
+    v = np.interp(t, [0.0, 0.2, 0.21, 0.3], [0.0, 9.0, 3.0, 5.0])
+    points.add(t, v)
+    at, way = points.path(1 / RATE)
+    # the rise takes as long as is kept, and what follows is there in full
+    np.testing.assert_allclose(way[at > 0.15], v[t > 0.15], atol=1e-9)
+    assert np.all(np.diff(at) > 0) and np.sum(at < 0.149999) == 500
 
 
 def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
@@ -105,6 +115,30 @@ def test_a_new_model_is_where_it_would_be_had_it_run_all_along(n):
     whole = new.predict_piece(Piece(v, np.zeros_like(v), RATE))[n:]
     np.testing.assert_allclose(made, whole, rtol=0, atol=1e-12 * 75e-6)
     assert predictor.memory_known
+
+
+EFFECTS = {
+    'saturation': {'low': 0.1, 'high': 0.8},
+    'amplifier_lag': {'time_constant': 2e-4},
+    'slew_limit': {'limit': 25.0},
+    'rate_dependent_hysteresis': {'gain': 0.01, 'exponent': 0.6, 'cutoff': 400.0},
+}
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_plays_of_a_new_model_followed_the_voltage_that_arrives_at_them(name):
+    # 20 s over the whole range, the last 6 s on a small part of it
+    v = drive(260_000)
+    v[200_000:] = np.interp(np.arange(60_000), [0, 3000], [v[199_999], 6.0])
+    v[203_000:] += 0.3 * np.sin(2 * np.pi * 5.0 * np.arange(57_000) / RATE)
+    m = model(effects=(EffectSetting(name, EFFECTS[name]),))
+    predictor = Predictor()
+    for block in cut(v[:259_000]):
+        predictor.process(block)
+    predictor.set_model(m)
+    made = predicted(predictor, cut(v[259_000:], start=259_000))
+    whole = m.simulate(v)[259_000:]
+    assert np.abs(made - whole).max() < 2e-3 * 75e-6
 
 
 def test_history_is_kept_without_a_model():

@@ -3,10 +3,13 @@
 
 """Free runs over records, and the steady-state error of sines against sums done by hand."""
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import ModelError
-from piezo_ident.model.free_run import piece_runs, sine_errors, sine_frequency
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.free_run import free_run, piece_runs, sine_errors, sine_frequency
+from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record, Segment
@@ -101,3 +104,40 @@ def test_free_run_of_a_piece_from_an_unknown_start():
     y = model.predict_piece(Piece(v, v, RATE), memory=np.array([0.4, 0.1]))
     (run,) = piece_runs(model, Record((Piece(v, y, RATE),), 'r'))
     assert np.abs(run.y_hat - y).max() < 1e-8
+
+
+EFFECTS = {
+    'saturation': {'low': 0.1, 'high': 0.8},
+    'slew_limit': {'limit': 40.0},
+    'amplifier_lag': {'time_constant': 2e-3},
+    'rate_dependent_hysteresis': {'gain': 0.002, 'exponent': 1.0, 'cutoff': 400.0},
+    'creep': {'gain': [0.05], 'time_constant': [0.5]},
+    'thermal_drift': {'rate': 0.01},
+}
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_state_of_a_model_passes_a_short_gap(name):
+    model = replace(
+        linear_stage(delay=2, weights=(0.3, 0.3, 0.2)),
+        effects=(EffectSetting(name, EFFECTS[name]),),
+    )
+    t = np.arange(4000) / RATE
+    v = 4.5 * (1 - np.cos(2 * np.pi * t)) * np.exp(-t / 6)
+    y = model.simulate(v)
+    # three samples are missing at the top and two on the way down
+    parts = [(0, 500), (503, 1300), (1302, 4000)]
+    pieces = tuple(Piece(v[a:b], y[a:b], RATE, a / RATE) for a, b in parts)
+    run = free_run(model, Record(pieces))
+    assert run.errors.percent < 0.02
+    assert run.estimated == (False, False, False)
+    (first, *_) = piece_runs(model, Record(pieces))
+    assert_array_equal(first.y_hat, run.pieces[0])
+
+
+def test_a_free_run_shows_itself():
+    model, v = linear_stage(), sine(1.0, 1.0)
+    run = free_run(model, record(v, 7.5e-6 * v + 1e-8))
+    assert_array_equal(run.measured, 7.5e-6 * v + 1e-8)
+    assert run.errors.offset == pytest.approx(1e-8)
+    assert '% of stroke' in run._repr_html_()
