@@ -1,7 +1,16 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The catalogue of effects: those that come with the package, and a lab's own as entry points."""
+"""
+The catalogue of effects: those of the package, and a lab's own.
+
+An effect is what a stage does beyond H, G and z^-d.  `catalogue` holds all of them by name; a lab
+adds its own as an entry point in the group ``piezo_ident.effects``.
+
+    >>> from piezo_ident import effects
+    >>> effects.find_effect('slew_limit').slot
+    'input'
+"""
 
 from __future__ import annotations
 
@@ -10,6 +19,7 @@ from functools import cache
 from importlib.metadata import entry_points
 import reprlib
 from types import MappingProxyType
+import warnings
 
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.amplifier_lag import AmplifierLag
@@ -60,34 +70,47 @@ def catalogue() -> Mapping[str, type[Effect]]:
     """
     Return every known effect by name.
 
-    Raises
-    ------
-    ModelError
-        When an entry point of the group ``piezo_ident.effects`` does not give an `Effect`, or
-        takes a name that is already there.
+    A plug-in that cannot be imported, is no `Effect`, or takes a name that is already there is
+    skipped with a warning.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.effects.catalogue()['creep'].slot
+    'hidden'
     """
-    found: dict[str, type[Effect]] = {effect.name: effect for effect in _OWN}
+    effects: dict[str, type[Effect]] = {effect.name: effect for effect in _OWN}
     for entry in entry_points(group='piezo_ident.effects'):
         try:
             effect = entry.load()
-        except Exception as error:
-            raise ModelError(f'effect plug-in {entry.value!r} does not load: {error}') from error
-        if not (isinstance(effect, type) and issubclass(effect, Effect)):
-            raise ModelError(f'effect plug-in {entry.value!r} is not a subclass of Effect')
-        if effect.name in found:
-            raise ModelError(f'effect plug-in {entry.value!r}: the name {effect.name!r} is taken')
-        found[effect.name] = effect
-    return MappingProxyType(found)
+            problem = ''
+        except Exception as error:  # noqa: BLE001 - the code is not ours
+            effect, problem = None, f'cannot be imported ({error})'
+        if not problem and not (isinstance(effect, type) and issubclass(effect, Effect)):
+            problem = 'is not a subclass of Effect'
+        elif not problem and effect.name in effects:
+            problem = f'takes the name {effect.name!r}, which exists'
+        if problem:
+            warnings.warn(f'effect plug-in {entry.value!r} {problem}; it is skipped', stacklevel=2)
+        else:
+            effects[effect.name] = effect
+    return MappingProxyType(effects)
 
 
 def find_effect(name: str) -> type[Effect]:
     """
-    Return one effect.
+    Return the class of an effect.
 
     Raises
     ------
     ModelError
         When the name is not in the catalogue.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> [p.name for p in pi.effects.find_effect('creep').parameters]
+    ['gain', 'time_constant']
     """
     try:
         return catalogue()[name]
