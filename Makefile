@@ -11,7 +11,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 
 .PHONY: attack netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash fuzz numbers study table-one clean distclean
+.PHONY: crash numbers study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -84,11 +84,6 @@ soak: .venv/.test
 table-one: .venv/.demo
 	.venv/bin/python benchmarks/table_one.py docs/table_one.md
 
-# hostile files, more than a million inputs: about a quarter of an hour
-fuzz: .venv/.fuzz
-	.venv/bin/python benchmarks/reliability/fuzz.py
-	$(RUN_STUDY)/build.py
-
 # every command killed while it works, on full and on read-only disks: some minutes, best as root
 crash: .venv/.test
 	.venv/bin/python benchmarks/reliability/crash.py
@@ -112,7 +107,6 @@ colcon: .venv/.colcon
 .venv/.demo: EXTRAS := [ros]
 .venv/.test: EXTRAS := [ros,test]
 .venv/.colcon: EXTRAS := [colcon,ros]
-.venv/.fuzz: EXTRAS := [ros,test,fuzz]
 .venv-jazzy/.test: EXTRAS := [test]
 .venv-bench/.bench: EXTRAS := [bench]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
@@ -123,7 +117,7 @@ colcon: .venv/.colcon
 	$(PYTHON) -m venv --clear $(@D)
 	touch $@
 
-.venv/.demo .venv/.test .venv/.fuzz .venv/.colcon: .venv/.made $(DECLARED)
+.venv/.demo .venv/.test .venv/.colcon: .venv/.made $(DECLARED)
 	.venv/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
 	touch $@
 

@@ -73,10 +73,6 @@ setup(
             'sippy_unipi>=1.0.1,<2',
             'sysidentpy>=0.9,<0.10',
         ],
-        # has no wheels for other machines, nor for Python 3.10
-        'fuzz': [
-            'atheris>=3,<4; python_version >= "3.11" and platform_machine == "x86_64"',
-        ],
         'colcon': [
             'colcon-common-extensions>=0.3,<0.4',
             'colcon-ros>=0.5,<0.6',

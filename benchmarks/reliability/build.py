@@ -23,7 +23,7 @@ __all__ = ['ORDER', 'main', 'page']
 PAGE = ROWS.parents[1] / 'reliability.md'
 KEYS = ('what', 'how_often', 'result', 'command')
 #: studies in the order of the table; any other comes behind
-ORDER = ('safety', 'attack', 'fuzz', 'netns', 'crash', 'soak', 'untrusted', 'numbers', 'versions')
+ORDER = ('safety', 'attack', 'netns', 'crash', 'soak', 'untrusted', 'numbers', 'versions')
 
 
 def _cell(value: Any) -> str:
@@ -40,11 +40,10 @@ HEAD = """# What it stands
 
 *Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
 its own rows. Every row can be run again with its command, from the root of the sources, after
-`make test` (for `make fuzz` and `make crash` nothing before), with `.venv` active
-(`. .venv/bin/activate`); the rows of `fuzz.py` need what `make .venv/.fuzz` installs.*
+`make test` (for `make crash` nothing before), with `.venv` active (`. .venv/bin/activate`).*
 
 `make test` and `make test-graph` keep a fast subset of each row; `make attack`, `make netns`,
-`make soak`, `make fuzz` and `make crash` run the whole.
+`make soak` and `make crash` run the whole.
 
 ## The table
 
@@ -53,22 +52,17 @@ its own rows. Every row can be run again with its command, from the root of the 
 TAIL = """
 ## Files from strangers
 
-Every reader compares what a file announces with the file itself before it takes memory for it;
-the limits stand in `piezo_ident/common/limits.py`. What a file unpacks to must stay below 100
-times its size (64 MiB for small ones). YAML is read by the safe loader, without merge keys, with
-at most 50,000 entries; aliases count as what they stand for. No pickle is loaded from a file: npz
-archives with Python objects are refused, MATLAB files are read by the package itself, since
-SciPy's reader takes memory for what an array announces and ends the process on some damaged
-files. Bags are looked at before rosbags opens them: links out of the folder, indexes that lead
-elsewhere, views, triggers and computed columns are refused, and so is a journal that names
-another file, which SQLite would delete. Labels and names are escaped in reports and cleaned of
-control characters before they reach a terminal.
+A file is opened by the reader of its library: the csv module, NumPy, SciPy, rosbags, mcap, SQLite
+and PyYAML. What these refuse ends in one line that names the file. SciPy reads MATLAB files in a
+process of its own, since some damage ends it. No pickle is loaded from a file. YAML is read by the
+safe loader, up to 500,000 characters and as many values; samples may unpack to 8 GiB
+(`piezo_ident/common/files.py`). [SECURITY.md](../SECURITY.md) says what is not kept off.
 
 An effect plug-in is code that somebody installed; it can do what any program can.
 
 ## What a kill leaves behind
 
-An output is written under the name `.NAME.RANDOM.tmp` beside its place (`.report.RANDOM.tmp` in a
+An output is written under the name `.NAME.RANDOM.tmp` beside its place (`.new.RANDOM.tmp` in a
 report folder) and renamed when it is whole; a bag that replaces another changes places with it in
 one step. A process that is killed leaves such a name, which can be deleted, and what stood there
 before. A report is several files: they are put in place one by one, the page last, so that a kill

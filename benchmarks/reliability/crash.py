@@ -78,7 +78,8 @@ class Job:
     outputs: tuple[str, ...]
 
 
-def _record(n: int, seed: int) -> Record:
+def record(n: int, seed: int = 1) -> Record:
+    """Return a record of a sine."""
     rng = np.random.default_rng(seed)
     v = 5.0 + 4.0 * np.sin(np.arange(n) / 700.0)
     return Record((Piece(v, 7.5e-6 * v + 1e-9 * rng.standard_normal(n), RATE),))
@@ -117,9 +118,9 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
     slow : bool
         Whether identifications and diagnoses are among it.
     """
-    stage, record = inputs / 'model.yaml', inputs / 'record.npz'
+    stage, samples = inputs / 'model.yaml', inputs / 'record.npz'
     SimulatedStage.load('stage_paper').model.save(stage)
-    write_record(_record(60_000, 1), record, overwrite=True)
+    write_record(record(60_000), samples, overwrite=True)
 
     def command(*words: object) -> Callable[[Path], int]:
         return lambda folder: piezo_ident([str(w).replace('OUT', str(folder)) for w in words])
@@ -131,12 +132,12 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
         Job('report', 'report', _report(stage),
             ('report.html', 'identification.json', 'model.yaml', 'loops.png')),
         *(
-            Job('convert', f'convert to {x}', command('convert', record, f'OUT/{x}',
+            Job('convert', f'convert to {x}', command('convert', samples, f'OUT/{x}',
                 '--overwrite'), (x,)) for x in FORMATS
         ),
         Job('simulate', 'simulate', command('simulate', '--program', programme, 'OUT/r.npz',
             '--overwrite'), ('r.npz',)),
-        Job('predict', 'predict', command('predict', stage, record, '--out', 'OUT/p.csv',
+        Job('predict', 'predict', command('predict', stage, samples, '--out', 'OUT/p.csv',
             '--plot', 'OUT/p.png'), ('p.csv', 'p.png')),
     ]  # fmt: skip
     if slow:
@@ -281,7 +282,7 @@ def kill(tried: Tried, folder: Path, old: Path, rng: random.Random, *, writing: 
 def old_outputs(folder: Path, works: list[Job]) -> None:
     """Write what the work will replace."""
     folder.mkdir()
-    old = _record(500, 2)
+    old = record(500, 2)
     for job in works:
         for name in job.outputs:
             path = folder / name

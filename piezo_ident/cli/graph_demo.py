@@ -24,10 +24,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.common.files import parse_yaml
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
-from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.files import model_from_dict
 from piezo_ident.model.free_run import PieceRun, SineError, sines_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.starter import Nodes

@@ -11,8 +11,7 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.files import check_replaceable
-from piezo_ident.common.yaml_io import broken_link
+from piezo_ident.common.files import broken_link, check_replaceable
 
 __all__ = [
     'check_apart',

@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Outputs appear whole or not at all: written under a temporary name beside, then renamed.
+Files: outputs that appear whole or not at all, and YAML by the safe loader.
 
-What a process that was killed leaves behind is called ``.<name>.<random>.tmp`` and can be deleted.
+An output is written under a temporary name beside its place and renamed.  What a killed process
+leaves behind is called ``.<name>.<random>.tmp`` and can be deleted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 import ctypes
 import os
@@ -18,14 +19,145 @@ import re
 import shutil
 import sqlite3
 import tempfile
+from typing import Any
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.yaml_io import load_yaml
+import yaml
 
-__all__ = ['check_replaceable', 'temporary_output']
+__all__ = [
+    'UNPACKED_SIZE',
+    'YAML_SIZE',
+    'broken_link',
+    'check_regular',
+    'check_replaceable',
+    'load_yaml',
+    'parse_yaml',
+    'temporary_output',
+    'write_text',
+    'write_together',
+]
 
-#: what a bag is made of
-_PART = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd|-wal|-shm|-journal)?')
+#: the largest YAML text [characters, 20 us each], and values in it with aliases written out
+YAML_SIZE = 500_000
+#: what the samples of one file may unpack to [bytes]: four hours of three columns at 20 kHz
+UNPACKED_SIZE = 8 << 30
+
+#: files that a bag consists of
+_BAG_FILE = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd|-wal|-shm|-journal)?')
+#: merge keys double a mapping with every line
+_MERGE_KEY = re.compile(r'(^|[{,])\s*<<\s*:', re.MULTILINE)
+
+
+# --- inputs ---------------------------------------------------------------------------------
+
+
+def broken_link(path: str | os.PathLike[str]) -> str | None:
+    """Return what is wrong with a symbolic link that leads nowhere, else None."""
+    if os.path.islink(path) and not os.path.exists(path):
+        return f'is a link to {os.readlink(path)}, which cannot be reached; mend the link'
+    return None
+
+
+def check_regular(path: Path) -> None:
+    """
+    Refuse folders, and devices and pipes, which have no end.
+
+    Raises
+    ------
+    DataError
+    """
+    if not path.is_file():
+        kind = 'a folder' if path.is_dir() else 'a device or a pipe'
+        raise DataError(f'{path}: is {kind}, no file; copy the data into a file')
+
+
+def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """
+    Read a YAML mapping with the safe loader.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read, or `parse_yaml` refuses its text.
+    """
+    file = Path(path)
+    try:
+        broken = broken_link(file)
+        if broken:
+            raise ConfigError(f'{path}: {broken}')
+        if file.exists():
+            check_regular(file)
+        with file.open(encoding='utf-8') as stream:
+            text = stream.read(YAML_SIZE + 1)
+    except FileNotFoundError:
+        raise ConfigError(f'{path}: no such file; check the name') from None
+    except DataError as error:
+        raise ConfigError(str(error)) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or type(error).__name__
+        raise ConfigError(f'{path}: cannot be read as text ({reason})') from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, name: str) -> dict[str, Any]:
+    """
+    Parse a YAML mapping with the safe loader.
+
+    Parameters
+    ----------
+    text : str
+        At most `YAML_SIZE` characters.
+    name : str
+        What error messages call it.
+
+    Raises
+    ------
+    ConfigError
+        When the text is not YAML, not a mapping, or too large.
+
+    Examples
+    --------
+    >>> parse_yaml('limits: [0, 10]', 'program')
+    {'limits': [0, 10]}
+    """
+    if len(text) > YAML_SIZE:
+        raise ConfigError(f'{name}: too large, {YAML_SIZE} characters at most; check the name')
+    if _MERGE_KEY.search(text):
+        raise ConfigError(f'{name}: merge keys (<<) are not read; write the values out')
+    try:
+        data = yaml.safe_load(text)
+        _count(data, 0, name)
+    except (
+        # the loader lets through what its own constructors trip over
+        yaml.YAMLError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' at line {mark.line + 1}' if mark is not None else ''
+        raise ConfigError(f'{name}: not valid YAML{where}; correct it or write it again') from None
+    if not isinstance(data, dict):
+        raise ConfigError(
+            f'{name}: expected a YAML mapping, got {type(data).__name__}; check the name'
+        )
+    return data
+
+
+def _count(node: object, count: int, name: str) -> int:
+    """Count the values in nested data; few lines with aliases can stand for any number."""
+    inner = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    for value in inner:
+        count = _count(value, count + 1, name)
+        if count > YAML_SIZE:
+            raise ConfigError(f'{name}: too large, {YAML_SIZE} values at most; check the name')
+    return count
+
+
+# --- outputs --------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -33,17 +165,20 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     """
     Yield a path of the same file name in a new folder beside `path`; rename it on success.
 
+    A new output gets the rights that the umask gives it, a replaced one keeps its own.  Where
+    `path` is a symbolic link, the file that it leads to is written.
+
     Parameters
     ----------
     path : path
-        Where the finished file or folder will stand.
+        Where the finished file or folder will be.
     overwrite : bool
-        Replace what stands there.  A folder is only replaced when it is a bag and nothing else.
+        Replace what is there.  A folder is only replaced when it is a bag and nothing else.
 
     Raises
     ------
     DataError
-        When the place is taken or cannot be written to.
+        When the place is taken or cannot be written to; then nothing is left there.
 
     Examples
     --------
@@ -53,40 +188,59 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     path = Path(path)
     if path.name in ('', '..'):
         raise DataError(f'{path}: names no file; add one')
-    taken = path.exists() or path.is_symlink()
-    if taken and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise DataError(f'{path}: exists already; choose another name or ask to overwrite it')
-    if path.is_dir():
-        check_replaceable(path)
-    # a folder of our own keeps the name, which rosbag2 repeats inside, and takes the old output
-    try:
-        work = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent))
-        try:
-            yield work / path.name
-            if not (path.is_dir() and _exchanged(work / path.name, path)):
-                if path.is_dir():
-                    path.rename(work / 'replaced')
-                (work / path.name).replace(path)
-        except BaseException:
-            old = work / 'replaced'
-            if old.exists() and not path.exists():
-                with suppress(OSError):
-                    old.rename(path)
-            raise
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    # a full disk is an error of its own to SQLite
-    except (OSError, sqlite3.Error) as error:
-        reason = getattr(error, 'strerror', None) or str(error)
-        raise DataError(
-            f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
-            'the right to write'
-        ) from None
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if target.is_dir():
+        check_replaceable(target)
+    # in a folder of its own the output keeps its name, which rosbag2 repeats inside
+    with _work_folder(path, target.parent, target.name) as work:
+        yield work / target.name
+        _put_in_place(work / target.name, target, work / 'replaced')
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """
+    Write a text file, or replace it, in one step; see `temporary_output`.
+
+    Raises
+    ------
+    DataError
+        When the file cannot be written.
+    """
+    with temporary_output(Path(path), overwrite=True) as file:
+        # file names and labels need not be Unicode
+        file.write_text(text, encoding='utf-8', errors='replace')
+
+
+def write_together(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> None:
+    """
+    Write several files into a folder: all of them, or none where there is no room.
+
+    Parameters
+    ----------
+    folder : path
+        Made when it does not exist.
+    files : mapping of str to bytes
+        Contents by file name; put in place in this order.
+
+    Raises
+    ------
+    DataError
+        When the folder cannot be written.
+    """
+    folder = Path(folder)
+    with _work_folder(folder, folder, 'new') as work:
+        for name, content in files.items():
+            (work / name).write_bytes(content)
+        for name in files:
+            target = Path(os.path.realpath(folder / name))
+            _put_in_place(work / name, target, work / 'replaced')
 
 
 def check_replaceable(folder: Path) -> None:
     """
-    Refuse a folder that is no bag, or holds what is no part of it: replacing it deletes all.
+    Refuse a folder that is no bag, or holds other files: replacing it would delete them.
 
     Raises
     ------
@@ -98,11 +252,60 @@ def check_replaceable(folder: Path) -> None:
         is_bag = False
     if not is_bag:
         raise DataError(f'{folder}: is a folder and no bag; choose another name')
-    others = [p for p in folder.iterdir() if p.is_dir() or not _PART.fullmatch(p.name)]
+    others = [p for p in folder.iterdir() if p.is_dir() or not _BAG_FILE.fullmatch(p.name)]
     if others:
         raise DataError(
             f'{folder}: holds {min(others).name}, which is no part of a bag; choose another name'
         )
+
+
+@contextmanager
+def _work_folder(path: Path, parent: Path, name: str) -> Iterator[Path]:
+    """Yield a temporary folder in `parent`; an error of the disk is one about `path`."""
+    try:
+        if path == parent:
+            parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f'.{name}.', suffix='.tmp', dir=parent))
+        try:
+            yield work
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    # a full disk is an error of its own to SQLite
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
+        raise DataError(
+            f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
+            'the right to write'
+        ) from None
+
+
+def _put_in_place(new: Path, target: Path, replaced: Path) -> None:
+    """Bring a finished output to its place, the old one of a folder to `replaced`."""
+    for path in (new, *(new.rglob('*') if new.is_dir() else ())):
+        _sync(path)
+    if target.exists():
+        shutil.copymode(target, new)
+    if not target.is_dir():
+        new.replace(target)
+    elif not _exchanged(new, target):
+        target.rename(replaced)
+        try:
+            new.replace(target)
+        except BaseException:
+            replaced.rename(target)
+            raise
+    # not every file system knows it
+    with suppress(OSError):
+        _sync(target.parent)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _exchanged(new: Path, old: Path) -> bool:

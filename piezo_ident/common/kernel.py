@@ -1,7 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a numerical loop becomes a compiled kernel: cached on disk, without the interpreter lock."""
+"""
+How a numerical loop becomes a compiled kernel: cached on disk, without the interpreter lock.
+
+Where neither the installation nor the home of the user can be written, nothing is cached, and each
+process compiles its kernels anew.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +31,7 @@ def kernel(function: F) -> F:
     given up.  The order of a sum is fixed when the kernel is compiled, so a stream gives the same
     bits wherever it is cut.
     """
-    return cast(F, njit(cache=True, nogil=True, fastmath={'reassoc'})(function))
+    return _compiled(function, fastmath={'reassoc'})
 
 
 def ordered_kernel(function: F) -> F:
@@ -35,7 +40,14 @@ def ordered_kernel(function: F) -> F:
 
     For sums that run in vector lanes side by side, or that several loops must form alike.
     """
-    return cast(F, njit(cache=True, nogil=True)(function))
+    return _compiled(function)
+
+
+def _compiled(function: F, **options: Any) -> F:
+    try:
+        return cast(F, njit(cache=True, nogil=True, **options)(function))
+    except RuntimeError:  # no folder for the cache
+        return cast(F, njit(nogil=True, **options)(function))
 
 
 @ordered_kernel

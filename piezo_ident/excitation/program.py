@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import frozen_array
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.common.yaml_io import load_yaml, parse_yaml
+from piezo_ident.common.files import load_yaml, parse_yaml
 from piezo_ident.excitation import signals as excitation
 from piezo_ident.excitation.catalogue import Option, Part, REQUIRED, Setting, SIGNALS
 from piezo_ident.record.record import Segment

@@ -20,6 +20,7 @@ from typing import Any
 
 from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.files import write_text
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis.procedure import diagnose
 from piezo_ident.diagnosis.results import DiagnosisSettings
@@ -27,7 +28,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.many.table import diagnosed, identified, natural, Row
 from piezo_ident.many.workers import completed, dask, processes
-from piezo_ident.model.files import load, write_text
+from piezo_ident.model.files import load
 from piezo_ident.record.io import read_record
 
 __all__ = ['Diagnose', 'Identify', 'Task', 'run_many']

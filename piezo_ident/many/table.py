@@ -14,10 +14,10 @@ from pathlib import Path
 import re
 from typing import Any
 
+from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.many.figures_of_merit import figures_of_merit
-from piezo_ident.model.files import write_text
 from piezo_ident.record.record import Record
 
 __all__ = [

@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 import difflib
 import os
-from pathlib import Path
 import reprlib
-import tempfile
 from typing import Any
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.common.limits import EFFECTS, ORDER
-from piezo_ident.common.yaml_io import endless, load_yaml, parse_yaml
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.files import load_yaml
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -26,16 +23,15 @@ import yaml
 __all__ = [
     'SCHEMA_VERSION',
     'load',
-    'load_yaml',
     'model_from_dict',
     'model_to_dict',
     'model_to_yaml',
-    'parse_yaml',
     'plain',
-    'write_text',
 ]
 
 SCHEMA_VERSION = 1
+#: effects of a model, and coefficients of G, whose roots cost their third power
+EFFECTS, ORDER = 50, 200
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
@@ -72,10 +68,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return value
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, 'strerror', None) or type(error).__name__
 
 
 def _mapping(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
@@ -142,9 +134,6 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     ModelError
         When the schema is later than this package knows, or a part is missing or wrong.
     """
-    found = endless(data)
-    if found is not None:
-        raise ModelError(f'{name}: {found} is nested too deeply, or too large')
     version = data.get('schema_version', SCHEMA_VERSION)
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         raise ModelError(
@@ -276,33 +265,3 @@ def load(path: str | os.PathLike[str]) -> StageModel:
     (20000.0, 9)
     """
     return model_from_dict(load_yaml(path), str(path))
-
-
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """
-    Write a text file under a temporary name and rename it.
-
-    Raises
-    ------
-    DataError
-        When the file cannot be written.
-    """
-    target = Path(path)
-    try:
-        handle, temporary = tempfile.mkstemp(
-            dir=target.parent, prefix=f'.{target.name}.', suffix='.tmp'
-        )
-        try:
-            with os.fdopen(handle, 'w', encoding='utf-8') as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise DataError(
-            f'{path}: cannot be written ({_reason(error)}); choose another place'
-        ) from None

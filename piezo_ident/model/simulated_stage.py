@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import load_yaml
 from piezo_ident.excitation.program import Program, Sequence
-from piezo_ident.model.files import load_yaml, model_from_dict
+from piezo_ident.model.files import model_from_dict
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.record.record import Fault, Piece, Record

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.chain import Block, Chain, Operator, Slot
@@ -315,7 +316,7 @@ class StageModel:
         >>> pi.load('model.yaml').delay.samples
         3
         """
-        from piezo_ident.model.files import model_to_yaml, write_text
+        from piezo_ident.model.files import model_to_yaml
 
         write_text(path, model_to_yaml(self))
 

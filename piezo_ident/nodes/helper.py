@@ -33,7 +33,6 @@ from typing import Any
 
 import piezo_ident
 from piezo_ident.common.errors import Cancelled, PiezoIdentError
-from piezo_ident.common.heap import keep_freed
 
 __all__ = ['Helper', 'serve']
 
@@ -281,7 +280,6 @@ def serve(reading: int, writing: int) -> None:
 
     nice, warm_up = channel.receive()
     _give_way(nice)
-    keep_freed()
     threading.Thread(target=listen, daemon=True).start()
     if warm_up is not None:
         # it only saves time

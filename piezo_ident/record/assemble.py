@@ -18,7 +18,6 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.limits import PIECES
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.ordering import at_times, in_order, Rows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
@@ -33,6 +32,8 @@ UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm':
 
 #: higher rates [Hz] are counted in another unit than seconds
 MAX_RATE = 1e9
+#: pieces of a record at most
+PIECES = 10_000
 #: more pieces than this, with fewer samples than this in each, are no uniform sampling
 MANY = 10
 #: a stretch of fewer samples has no sampling rate

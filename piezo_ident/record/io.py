@@ -12,9 +12,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output
-from piezo_ident.common.limits import regular_file
-from piezo_ident.common.yaml_io import broken_link
+from piezo_ident.common.files import broken_link, check_regular, temporary_output
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag, write_bag
 from piezo_ident.record.record import Fault, Record
@@ -78,7 +76,7 @@ def read_record(
         )
     if not path.exists():
         raise DataError(f'{path}: does not exist; check the name')
-    regular_file(path)
+    check_regular(path)
     if suffix not in READERS:
         raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_FORMATS}')
     try:

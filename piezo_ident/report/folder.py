@@ -6,16 +6,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 import io
 import json
 import os
 from pathlib import Path
-import shutil
-import tempfile
 from typing import TYPE_CHECKING
 
 from piezo_ident.common.errors import DataError
+from piezo_ident.common.files import write_together
 from piezo_ident.identification.results import Identification, Progress, silent
+from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs, sines_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
@@ -186,26 +187,13 @@ def put_in_place(
     """
     target = Path(folder)
     check_own(target, texts, names)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(dir=target, prefix='.report.', suffix='.tmp'))
-        try:
-            for name, _, _, png in pictures:
-                (work / f'{name}.png').write_bytes(png)
-            for name, text in texts.items():
-                # file names need not be Unicode
-                (work / name).write_bytes(text.encode('utf-8', 'replace'))
-            model.save(work / MODEL)
-            # the numbers first: they tell that what comes after them is of a report
-            for name in sorted(os.listdir(work), key=lambda n: (n == PAGE, n not in texts)):
-                os.replace(work / name, target / name)
-            for name in set(names) - {name for name, *_ in pictures}:
-                (target / f'{name}.png').unlink(missing_ok=True)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except OSError as error:
-        raise DataError(
-            f'{folder}: the report cannot be written ({error.strerror or error}); choose a folder '
-            'with room and the right to write'
-        ) from None
+    # the numbers first: they tell that the files after them belong to a report
+    # file names need not be Unicode
+    files = {name: text.encode('utf-8', 'replace') for name, text in texts.items()}
+    html = files.pop(PAGE)
+    files |= {f'{name}.png': png for name, _, _, png in pictures}
+    write_together(target, {**files, MODEL: model_to_yaml(model).encode(), PAGE: html})
+    for name in set(names) - {name for name, *_ in pictures}:
+        with suppress(OSError):
+            (target / f'{name}.png').unlink()
     return target / PAGE

@@ -19,7 +19,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 from reliability import crash  # noqa: E402
-from reliability.targets import example  # noqa: E402
 
 sys.path.remove(str(ROOT / 'benchmarks'))
 
@@ -53,7 +52,7 @@ def test_no_room_and_no_right(tmp_path, works, options):
 @pytest.mark.parametrize('swaps', [True, False])
 def test_a_bag_is_replaced_at_once(tmp_path, monkeypatch, swaps):
     bag = tmp_path / 'bag'
-    write_record(example(50), bag)
+    write_record(crash.record(50), bag)
     there = []
 
     def watched(new, old):
@@ -64,7 +63,7 @@ def test_a_bag_is_replaced_at_once(tmp_path, monkeypatch, swaps):
 
     exchanged = output._exchanged
     monkeypatch.setattr(output, '_exchanged', watched)
-    write_record(example(60), bag, overwrite=True)
+    write_record(crash.record(60), bag, overwrite=True)
     assert there == [True, True]
     assert read_record(bag).n == 60
     assert os.listdir(tmp_path) == ['bag']
@@ -87,5 +86,5 @@ def test_a_full_disk_is_said_for_databases_too(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Sqlite3Writer, 'close', full)
     with pytest.raises(DataError, match=r'cannot be written \(database or disk is full\)'):
-        write_record(example(), tmp_path / 'r.db3')
+        write_record(crash.record(40), tmp_path / 'r.db3')
     assert os.listdir(tmp_path) == []

@@ -5,23 +5,20 @@
 
 import copy
 from dataclasses import replace
-import os
 from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_array_equal
-from piezo_ident.common.errors import ConfigError, DataError, ModelError
+from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.model.files import (
     load,
-    load_yaml,
     model_from_dict,
     model_to_dict,
     model_to_yaml,
     plain,
     SCHEMA_VERSION,
-    write_text,
 )
 from piezo_ident.model.simulated_stage import SimulatedStage, stage_from_dict
 from piezo_ident.model.stage_model import EffectSetting
@@ -277,26 +274,6 @@ def test_hostile_yaml_gives_an_error_of_ours(tmp_path, text):
 BOMB = 'a0: &a0 [1, 1]\n' + ''.join(f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n' for i in range(1, 40))
 
 
-@pytest.mark.parametrize(
-    'where', ['sample_rate', 'schema_version', 'identification', 'effects', 'input', 'dynamics']
-)
-def test_anchors_that_multiply_do_not_explode(tmp_path, where):
-    # 2^40 numbers behind 40 lines
-    bomb = yaml.safe_load(BOMB)['a39']
-    d = data()
-    if where in ('input', 'dynamics'):
-        d[where] = {**d[where], 'V': bomb, 'a': bomb}
-    elif where == 'identification':
-        d[where] = {'warnings': bomb}
-    elif where == 'effects':
-        d[where] = [{'name': 'creep', 'parameters': {'gain': bomb, 'time_constant': bomb}}]
-    else:
-        d[where] = bomb
-    with pytest.raises(ModelError) as caught:
-        model_from_dict(d, 'm.yaml')
-    assert len(str(caught.value)) < 1000
-
-
 def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
     path = tmp_path / 'model.yaml'
     path.write_text(BOMB, encoding='utf-8')
@@ -308,57 +285,8 @@ def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
         ),
         encoding='utf-8',
     )
-    with pytest.raises(ConfigError, match='identification'):
+    with pytest.raises(ConfigError, match='not valid YAML'):
         load(path)
-
-
-def test_unreadable_files_are_named(tmp_path):
-    looped = tmp_path / 'loop.yaml'
-    looped.symlink_to('loop.yaml')
-    with pytest.raises(ConfigError, match='leads back to itself; mend the link'):
-        load_yaml(looped)
-    with pytest.raises(ConfigError, match='no such file'):
-        load_yaml(tmp_path / 'nothing.yaml')
-    with pytest.raises(ConfigError, match='cannot be read'):
-        load_yaml(tmp_path)
-    (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x80')
-    with pytest.raises(ConfigError, match='cannot be read'):
-        load_yaml(tmp_path / 'binary.yaml')
-
-
-def test_old_file_stays_whole_when_writing_fails(tmp_path, monkeypatch):
-    path = tmp_path / 'model.yaml'
-    PAPER.save(path)
-    before = path.read_bytes()
-
-    def full(*_):
-        raise OSError(28, 'No space left on device')
-
-    for name in ('fsync', 'replace'):
-        with monkeypatch.context() as patch:
-            patch.setattr(os, name, full)
-            with pytest.raises(DataError, match='No space left'):
-                replace(PAPER, sample_rate=1.0).save(path)
-        assert path.read_bytes() == before
-        assert os.listdir(tmp_path) == ['model.yaml']
-
-
-def test_interrupt_leaves_no_rubbish(tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, 'fsync', interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_text(tmp_path / 'a.txt', 'text')
-    assert os.listdir(tmp_path) == []
-
-
-def test_impossible_places_are_named(tmp_path):
-    with pytest.raises(DataError, match='cannot be written'):
-        PAPER.save(tmp_path / 'no folder' / 'model.yaml')
-    (tmp_path / 'folder').mkdir()
-    with pytest.raises(DataError, match='cannot be written'):
-        write_text(tmp_path / 'folder', 'x')
 
 
 def test_plain_data_are_plain():

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ConfigError, ModelError, PiezoIdentError
+from piezo_ident.common.files import load_yaml
 from piezo_ident.excitation.program import parse_program, Program
-from piezo_ident.model.files import load_yaml
 from piezo_ident.model.simulated_stage import Converter, Sensor, SimulatedStage, stage_from_dict
 import pytest
 

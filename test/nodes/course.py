@@ -17,8 +17,9 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.config import find_config
+from piezo_ident.common.files import parse_yaml
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.files import model_from_dict, parse_yaml
+from piezo_ident.model.files import model_from_dict
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import cut_blocks, Samples

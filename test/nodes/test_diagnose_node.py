@@ -20,8 +20,9 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph
 from piezo_ident.common.config import find_config
+from piezo_ident.common.files import parse_yaml
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.files import load, model_from_dict, parse_yaml
+from piezo_ident.model.files import load, model_from_dict
 import yaml
 
 TRUTHS = ('creep', 'rate_dependent_hysteresis')

@@ -338,7 +338,7 @@ def test_bad_arrays(tmp_path, name, change, words):
 def test_pickled_objects_are_refused(tmp_path):
     path = tmp_path / 'r.npz'
     np.savez(path, **{**table(), 'v': np.array([{}] * 300)})
-    refuse(path, 'Python objects')
+    refuse(path, 'save it again')
 
 
 def test_array_that_announces_too_much(tmp_path):
@@ -351,7 +351,7 @@ def test_array_that_announces_too_much(tmp_path):
     with zipfile.ZipFile(path, 'w') as archive:
         for name, data in members.items():
             archive.writestr(name, data)
-    refuse(path, 'does not hold the size that it announces')
+    refuse(path, 'damaged')
 
 
 @pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3'])
@@ -388,10 +388,10 @@ def test_what_is_not_there_or_unknown(tmp_path):
 def test_links_that_lead_nowhere(tmp_path, name):
     path = tmp_path / name
     path.symlink_to('gone')
-    refuse(path, 'is a link to gone, which does not exist', 'mend')
+    refuse(path, 'is a link to gone', 'mend')
     path.unlink()
     path.symlink_to(name)
-    refuse(path, 'leads back to itself', 'mend')
+    refuse(path, 'is a link', 'mend')
     (tmp_path / 'there.csv').write_text(csv_text())
     path = tmp_path / 'link.csv'
     path.symlink_to('there.csv')

@@ -20,9 +20,8 @@ from typing import Any
 from urllib.parse import quote
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.limits import regular_file, unpacked
-from piezo_ident.common.yaml_io import load_yaml
-from piezo_ident.record.bags.mcap_scan import McapScan
+from piezo_ident.common.files import check_regular, load_yaml
+from piezo_ident.record.bags.mcap_scan import McapScan, unpacked
 from rosbags.rosbag2 import storage_mcap
 
 __all__ = [
@@ -68,7 +67,7 @@ def check_inside(folder: Path, files: Sequence[Path]) -> None:
     for file in files:
         if not file.resolve().is_relative_to(home):
             raise DataError(f'{file}: is a link out of the bag; copy the file into it')
-        regular_file(file)
+        check_regular(file)
     if len(set(files)) < len(files):
         raise DataError(f'{folder}: metadata.yaml names a file twice; mend it')
 
@@ -86,7 +85,7 @@ def check_storage(file: Path) -> set[tuple[int, str, int, int]]:
     ------
     DataError
     """
-    regular_file(file)
+    check_regular(file)
     if file.suffix == '.mcap':
         return McapScan(file).chunks()
     if file.suffix == '.db3':

@@ -19,7 +19,6 @@ import struct
 from typing import Any, BinaryIO, NamedTuple
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.limits import unpacked
 from rosbags.rosbag2 import storage_mcap
 
 __all__ = ['MAGIC', 'Channel', 'McapScan', 'Message']
@@ -29,6 +28,13 @@ _zstd: Any = storage_mcap.__dict__['zstd']
 _lz4_decompress: Any = storage_mcap.__dict__['lz4_decompress']
 
 MAGIC = b'\x89MCAP0\r\n'
+
+
+def unpacked(size: int) -> int:
+    """Return how many bytes a packed file of a size [bytes] may unpack to."""
+    return max(64 * 1024 * 1024, 100 * size)
+
+
 #: no chunk of ours passes 1 MiB by more than a message; others write some MiB
 LARGEST = 256 * 1024 * 1024
 

@@ -22,7 +22,7 @@ import tempfile
 from typing import Any, NamedTuple
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.limits import regular_file
+from piezo_ident.common.files import check_regular
 from piezo_ident.record.bags.check import (
     check_index,
     check_inside,
@@ -194,7 +194,7 @@ def _listed(path: Path) -> list[Path]:
 def _storage_files(path: Path) -> list[Path]:
     """Return the files of a folder that belong to one recording, in order."""
     if not path.is_dir():
-        regular_file(path)
+        check_regular(path)
         return [path]
     if (path / 'metadata.yaml').is_file():
         listed = _listed(path)
@@ -304,7 +304,7 @@ def _applied(file: Path, stack: ExitStack) -> Path:
             f'{2 * need / 1e6:.0f} MB; make room, or set TMPDIR to a place with room'
         )
     for sidecar in parts[1:]:
-        regular_file(sidecar)
+        check_regular(sidecar)
         check_journal(sidecar)
     for part in parts:
         shutil.copyfile(part, folder / part.name)
