@@ -35,8 +35,7 @@ import numpy as np
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.starter import Nodes
-from piezo_ident.record.bags.read import typestore
-from piezo_ident.record.bags.recover import opened_bag
+from piezo_ident.record.bags.read import opened_bag, typestore
 
 RATE, BLOCK = 20_000, 100
 STREAMS = ('voltage', 'displacement', 'applied_voltage', 'prediction', 'residual')

@@ -20,7 +20,8 @@ import numpy as np
 from piezo_ident.cli import main as piezo_ident
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.record import Piece, Record
 
 RATE = 20_000.0

@@ -36,7 +36,7 @@ sys.path.insert(0, str(HERE.parent))
 
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.starter import Nodes
-from piezo_ident.record.bags.recover import opened_bag
+from piezo_ident.record.bags.read import opened_bag
 from rows import processors, shares, write_rows
 
 __all__ = ['Observer', 'Soak', 'soak']

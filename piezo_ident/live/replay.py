@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from piezo_ident.common.errors import DataError
+from piezo_ident.record.bags.read import carried_quantities, is_computed
 from piezo_ident.record.bags.recover import Bag
-from piezo_ident.record.bags.samples import carried_quantities, is_computed
 
 __all__ = ['ReplayClock', 'chosen_topics']
 

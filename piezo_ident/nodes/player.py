@@ -25,7 +25,8 @@ from piezo_ident.live.replay import chosen_topics, ReplayClock
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.record.bags.recover import Bag, opened_bag, Stored
+from piezo_ident.record.bags.read import opened_bag
+from piezo_ident.record.bags.recover import Bag, Stored
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 

@@ -27,7 +27,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
-from piezo_ident.record.bags.write import PartWriter
+from piezo_ident.record.bags.write import BagWriter
 
 __all__ = ['RecorderNode', 'main']
 
@@ -163,7 +163,7 @@ class RecorderNode(LabNode):
 
     def _work(self, recording: Recording, subscriptions: RawSubscriptions) -> None:
         try:
-            writer = PartWriter(
+            writer = BagWriter(
                 recording.output,
                 self.values['storage'],
                 {
@@ -209,7 +209,7 @@ class RecorderNode(LabNode):
             self._report('failed', reason, ERROR)
 
     def _record(
-        self, recording: Recording, subscriptions: RawSubscriptions, writer: PartWriter
+        self, recording: Recording, subscriptions: RawSubscriptions, writer: BagWriter
     ) -> None:
         flushed = time.monotonic()
         last = told = False

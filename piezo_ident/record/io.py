@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
 from piezo_ident.record.assemble import assemble
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.tables import blocks_of, labels_of, READERS, WRITERS
 

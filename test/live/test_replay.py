@@ -9,7 +9,8 @@ from bag_data import blocks, write
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.replay import chosen_topics, ReplayClock
-from piezo_ident.record.bags.recover import Bag, opened_bag
+from piezo_ident.record.bags.read import opened_bag
+from piezo_ident.record.bags.recover import Bag
 import pytest
 
 A, B = '/a', '/b'

@@ -9,8 +9,9 @@ import time
 from course import block, column, FS, HIGH, level, pairs_of, paper, SETTINGS, simulated
 from graph import alive, best_of_three, Graph, in_time
 import numpy as np
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.recover import is_unfinished
+from piezo_ident.record.bags.write import write_bag
 import pytest
 
 #: how soon a node has to be gone [s]

@@ -23,7 +23,8 @@ import numpy as np
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.nodes.wire import LATCHED, to_message
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.blocks import Samples
 import pytest
 from std_msgs.msg import String

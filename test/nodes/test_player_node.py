@@ -12,8 +12,8 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import best_of_three, Graph, Late
 from piezo_ident.nodes.wire import to_message
-from piezo_ident.record.bags.read import MESSAGE_TYPE, SAMPLE_QOS, typestore
-from piezo_ident.record.bags.write import BagWriter
+from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.bags.write import BagWriter, SAMPLE_QOS
 from piezo_ident.record.blocks import Samples
 from rclpy.serialization import serialize_message
 from rosbags.interfaces import QosDurability

@@ -17,8 +17,8 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from graph import best_of_three, Graph, Late
 from piezo_ident.cli import main
 from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
-from piezo_ident.record.bags.read import read_bag
-from piezo_ident.record.bags.recover import is_unfinished, opened_bag
+from piezo_ident.record.bags.read import opened_bag, read_bag
+from piezo_ident.record.bags.recover import is_unfinished
 from piezo_ident.record.blocks import Samples
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy

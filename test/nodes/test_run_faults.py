@@ -9,7 +9,7 @@ import signal
 from course import column, FS, HIGH, model_of, PROGRAM, QUICK, simulated
 from graph import Graph
 import numpy as np
-from piezo_ident.record.bags.read import write_bag
+from piezo_ident.record.bags.write import write_bag
 import pytest
 
 RESTING = ('idle', 'done', 'failed', 'cancelled', 'stopped', '')

@@ -8,7 +8,7 @@ import json
 from course import column, FS, HIGH, model_of, numbers, PROGRAM, QUICK, voltage_of
 from graph import Graph
 import numpy as np
-from piezo_ident.record.bags.recover import opened_bag
+from piezo_ident.record.bags.read import opened_bag
 
 #: of every topic of the graph
 NAMES = {

@@ -6,7 +6,8 @@
 
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.capture import APPLIED, Capture, refuse_incomplete
 from piezo_ident.record.record import Piece, Record, Segment

@@ -8,7 +8,8 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record import stream
-from piezo_ident.record.bags.read import read_bag, write_bag
+from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest

@@ -4,62 +4,110 @@
 """
 Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
 
-A bag is read message by message into flat buffers, so its length is limited by the samples
-alone.  Topics are found by what their blocks say they carry, so remapped names are no obstacle.
-The streams become a record by the way that a live capture takes, so that both are the same.
-A bag whose recorder was killed is refused, or read as far as it goes when that is asked for.
+Topics are found by the quantity that their blocks carry, so remapped names are no obstacle, and a
+bag of several stages is told apart by their namespaces.  The blocks become a record in the way of
+a live capture, so that both are the same.  A bag whose recorder was killed is refused, or read as
+far as it goes when that is asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, ExitStack
+import functools
 from pathlib import Path
 from typing import Any
 
-from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output
-from piezo_ident.record.bags.samples import BagSamples, MESSAGE_TYPE, opened_samples, typestore
-from piezo_ident.record.blocks import (
-    BLOCK_SIZE,
-    cut_blocks,
-    encode,
-    Samples,
+from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.record.bags.recover import (
+    Bag,
+    damage_as_data_error,
+    is_unfinished,
+    metadata,
+    recovered_bag,
+    Stored,
 )
-from piezo_ident.record.capture import record_of_streams
+from piezo_ident.record.blocks import decode, quantity_of, Samples
+from piezo_ident.record.capture import APPLIED, record_of_streams
 from piezo_ident.record.record import Record
 from piezo_ident.record.stream import Stream
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 __all__ = [
     'MESSAGE_TYPE',
-    'SAMPLE_QOS',
+    'carried_quantities',
+    'is_computed',
+    'opened_bag',
     'read_bag',
-    'record_in',
     'typestore',
-    'write_bag',
 ]
 
-_FOREVER = QosTime(9223372036, 854775807)
-#: reliable, volatile, keep last 100: the contract of every topic that carries samples
-SAMPLE_QOS = Qos(
-    history=QosHistory.KEEP_LAST,
-    depth=100,
-    reliability=QosReliability.RELIABLE,
-    durability=QosDurability.VOLATILE,
-    deadline=_FOREVER,
-    lifespan=_FOREVER,
-    liveliness=QosLiveliness.AUTOMATIC,
-    liveliness_lease_duration=_FOREVER,
-    avoid_ros_namespace_conventions=False,
-)
+MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return the message types of Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@contextmanager
+def opened_bag(path: str | Path) -> Iterator[Bag]:
+    """
+    Open a rosbag2 folder, or a single .mcap or .db3 file.
+
+    Parameters
+    ----------
+    path : path
+        The folder or file; one that was not finished is read as far as it goes.
+
+    Raises
+    ------
+    DataError
+        When it is no bag, or damaged beyond what a killed recorder leaves; its messages raise
+        it too, for damage that shows itself later.
+    """
+    path = Path(path)
+    try:
+        is_there = path.exists()
+    except OSError as error:
+        raise DataError(f'{path}: cannot be read ({error.strerror or error})') from None
+    if not is_there:
+        raise DataError(f'{path}: does not exist; check the name')
+    if path.is_file() and path.suffix != path.suffix.lower():
+        raise DataError(f'{path}: a bag is known by .mcap or .db3 in small letters; rename it')
+    if path.suffix == '.db3' and any(c in str(path) for c in '?#%'):
+        raise DataError(f'{path}: rosbags cannot open names with ?, # or %; rename it')
+    with ExitStack() as stack:
+        with damage_as_data_error(path):
+            unfinished = is_unfinished(path)
+            bag = recovered_bag(path, stack) if unfinished else _finished(path, stack)
+        yield bag
+
+
+def _finished(path: Path, stack: ExitStack) -> Bag:
+    if path.is_dir():
+        metadata(path)
+    reader = stack.enter_context(Reader(path))
+    empty = reader.message_count == 0
+    start = 0 if empty else reader.start_time
+    end = 0 if empty else reader.end_time - 1
+    # rosbags takes over from metadata.yaml whatever is there
+    texts = [text for c in reader.connections for text in (c.topic, c.msgtype)]
+    numbers = [start, end, *(c.msgcount for c in reader.connections)]
+    if not all(isinstance(x, str) for x in texts) or {type(x) for x in numbers} != {int}:
+        raise DataError(f'{path}: damaged or unfinished bag (metadata of wrong types); mend it')
+
+    def messages(connections: Collection[Connection]) -> Iterator[Stored]:
+        if connections:  # rosbags takes none for all
+            with damage_as_data_error(path):
+                for connection, stamp, raw in reader.messages(list(connections)):
+                    yield Stored(connection, stamp, raw)
+
+    return Bag(path, reader.connections, messages, start, end)
 
 
 def read_bag(
@@ -99,140 +147,160 @@ def read_bag(
         carries the voltage or the displacement, and for all that `assemble` refuses.
     """
     path = Path(path)
-    with opened_samples(
-        path,
-        namespace=namespace,
-        voltage_topic=voltage_topic,
-        displacement_topic=displacement_topic,
-        recover=recover,
-    ) as source:
-        streams = {quantity: Stream(spooled=True) for quantity in source.topics}
-        for quantity, samples, stamp in source.blocks():
+    with opened_bag(path) as bag:
+        if bag.faults and not recover:
+            raise DataError(
+                f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
+                f"'piezo_ident convert {path} OUT' saves what is whole of it"
+            )
+        asked = {'voltage': voltage_topic, 'displacement': displacement_topic}
+        topics = _choose(carried_quantities(bag), asked, namespace, path)
+        streams = {quantity: Stream(spooled=True) for quantity in topics}
+        for quantity, samples, stamp in _blocks(bag, topics):
             streams[quantity].append(samples, stamp)
-    return record_in(source, streams, displacement_unit, voltage_limits)
-
-
-def record_in(
-    source: BagSamples,
-    streams: Mapping[str, Stream],
-    displacement_unit: str = 'm',
-    voltage_limits: tuple[float, float] | None = None,
-) -> Record:
-    """
-    Return the record of all samples of a bag; parameters are those of `read_bag`.
-
-    Raises
-    ------
-    DataError
-    """
     return record_of_streams(
         streams,
-        name=str(source.path),
+        name=str(path),
         displacement_unit=displacement_unit,
         voltage_limits=voltage_limits,
-        sample_rate=source.sample_rate,
-        faults=source.faults,
-    ).renamed(source.path.name)
+        sample_rate=_sample_rate(path),
+        faults=bag.faults,
+    ).renamed(path.name)
 
 
-def write_bag(
-    record: Record,
-    path: str | Path,
-    *,
-    storage: str | None = None,
-    overwrite: bool = False,
-    custom_data: Mapping[str, str] | None = None,
-    block_size: int = BLOCK_SIZE,
-) -> None:
+def _sample_rate(path: Path) -> float | None:
+    """Return the sampling rate [Hz] in a bag's custom data, None without a sensible one."""
+    try:
+        info = metadata(path if path.is_dir() else path.parent)
+        if path.is_file() and path.name not in info['relative_file_paths']:
+            return None
+        rate = float(info['custom_data']['sample_rate'])
+    except (ConfigError, ValueError, TypeError, KeyError, OverflowError):
+        return None  # the stamps tell it as well
+    return rate if 0 < rate < float('inf') else None
+
+
+def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
+    for connection, stamp, raw in bag.messages(connections):
+        if stamp >= 2**63:
+            raise DataError(f'{bag.path}: damaged, a message on {connection.topic} has no time')
+        with damage_as_data_error(bag.path):
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+        yield connection.topic, stamp, message
+
+
+def carried_quantities(bag: Bag) -> dict[str, str]:
     """
-    Write a record as a rosbag2 folder, or as a single file when `path` ends so.
-
-    A block's log time is the time of its first sample.  Where the record starts before zero, or
-    its clock restarts, log times are moved later by whole seconds, so that they stay positive
-    and in the order of the messages; the samples keep their own times.
-
-    Parameters
-    ----------
-    record : Record
-        What to write.
-    path : path
-        The folder, or a file name that ends in .mcap or .db3.
-    storage : {'mcap', 'sqlite3'}, optional
-        Storage of a folder; mcap unless told.
-    overwrite : bool
-        Replace an existing bag.
-    custom_data : mapping of str to str, optional
-        For the bag's metadata beside ``sample_rate``: seed, programme.
-    block_size : int
-        Samples a block.
+    Return what each topic carries, as its first message says.
 
     Raises
     ------
     DataError
-        When the place is taken or cannot be written to.
+        When no topic carries samples.
     """
-    path = Path(path)
-    plugins = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-    suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
-    if suffix and path.suffix != path.suffix.lower():
-        raise DataError(f'{path}: no reader of bags takes {path.suffix}; write small letters')
-    if storage is not None and (storage not in plugins or (suffix or storage) != storage):
+    found = {}
+    for connection in bag.connections:
+        if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
+            continue
+        for topic, _, message in _messages(bag, [connection]):
+            base = topic.rpartition('/')[2]
+            # a damaged layout must not hide a topic that is ours by name
+            ours = base if base in ('voltage', 'displacement') else None
+            quantity = quantity_of(message.layout.dim) or ours
+            if quantity:
+                found[topic] = quantity
+            break
+    if not found:
+        topics = ', '.join(sorted({c.topic for c in bag.connections})) or 'none'
         raise DataError(
-            f'{path}: storage {storage!r} is not possible; use mcap or sqlite3, and a file name '
-            'that agrees'
+            f"{bag.path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
+            f"(topics: {topics}); record the stage's voltage and displacement"
         )
-    rates = {p.sample_rate for p in record}
-    custom = dict(custom_data or {})
-    if len(rates) == 1:
-        custom.setdefault('sample_rate', repr(float(next(iter(rates)))))
-    with temporary_output(path, overwrite=overwrite) as target:
-        folder = target.with_name('bag') if suffix else target
-        plugin = plugins[suffix or storage or 'mcap']
-        with Writer(folder, version=9, storage_plugin=plugin) as writer:
-            for key, value in custom.items():
-                writer.set_custom_data(key, value)
-            _write_pieces(writer, record, block_size)
-        if suffix:
-            next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
+    return found
 
 
-def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
-    quantities = ['voltage', 'displacement']
-    quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
-    senders = {q: _sender(writer, q) for q in quantities}
-    shift, latest = 0, 0.0
-    for piece in record:
-        columns = {'voltage': piece.v, 'displacement': piece.y}
-        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
-        first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
-        # later by whole seconds, until nothing is before what was written already
-        while first + shift < latest:
-            shift += 1 + int(latest - first - shift)
-        latest = last + shift
-        for start, stop, label in cut_blocks(piece.n, piece.segments, block_size):
-            t = piece.time(start, stop)
-            stamp = round(t[0] * 1e9) + shift * 1_000_000_000
-            if stamp >= 2**63:
+def is_computed(topic: str) -> bool:
+    """Return whether a topic is one of a model's, which nobody has measured."""
+    return topic.rpartition('/')[2] in ('prediction', 'residual')
+
+
+def _choose(
+    carried: Mapping[str, str],
+    asked: Mapping[str, str | None],
+    namespace: str | None,
+    path: Path,
+) -> dict[str, str]:
+    """Return the topic of each quantity, and of the applied voltage where it is there."""
+    prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
+    chosen = {}
+    for quantity, wish in asked.items():
+        if wish is not None:
+            topic = f'/{wish.lstrip("/")}'
+            if topic not in carried:
                 raise DataError(
-                    f't = {t[0]:.10g} s cannot be the stamp of a message, which ends at '
-                    f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
+                    f'{path}: no samples on topic {topic}; topics with samples: '
+                    + ', '.join(sorted(carried))
                 )
-            for quantity, x in columns.items():
-                senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
+            if carried[topic] != quantity:
+                fit = sorted(t for t, q in carried.items() if q == quantity)
+                raise DataError(
+                    f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
+                    f'{quantity}: {", ".join(fit) or "none"}'
+                )
+            chosen[quantity] = topic
+            continue
+        there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
+        # a model fitted to the prediction of another would look perfect
+        measured = [t for t in there if not is_computed(t)]
+        if there and not measured:
+            raise DataError(
+                f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
+                f'measured {quantity}; record that, or name the topic to take'
+            )
+        # applied_voltage carries the same quantity under another name
+        commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured
+        named = [t for t in commanded if t.rpartition('/')[2] == quantity]
+        fit = named if len(commanded) > 1 and named else commanded
+        if not fit:
+            raise DataError(
+                f"{path}: no topic carries 't,{quantity}'"
+                f'{"" if namespace is None else f" below {prefix}"}; topics with samples: '
+                + ', '.join(sorted(carried))
+            )
+        if len(fit) > 1:
+            raise DataError(
+                f'{path}: several topics carry {quantity}: {", ".join(sorted(fit))}; '
+                'name the stage with a namespace, or the topics'
+            )
+        chosen[quantity] = fit[0]
+    home = chosen['voltage'].rpartition('/')[0] + '/'
+    applied = f'{home}{APPLIED}'
+    if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
+        chosen[APPLIED] = applied
+    for topic, quantity in sorted(carried.items(), key=lambda item: item[::-1]):
+        if quantity.startswith('x_') and topic.startswith(home):
+            if quantity in chosen:
+                raise DataError(
+                    f'{path}: {chosen[quantity]} and {topic} both carry {quantity}; '
+                    'record only one of them'
+                )
+            chosen[quantity] = topic
+    return chosen
 
 
-def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
-    store = typestore()
-    types: Any = store.types
-    dimension = types['std_msgs/msg/MultiArrayDimension']
-    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
-    connection = writer.add_connection(
-        f'/{quantity}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
-    )
-
-    def send(samples: Samples, stamp: int) -> None:
-        data, dims = encode(samples)
-        filled = message(layout([dimension(*d) for d in dims], 0), data)
-        writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
-
-    return send
+def _blocks(bag: Bag, topics: Mapping[str, str]) -> Iterator[tuple[str, Samples, int]]:
+    """Yield quantity, samples and log time [ns] of every block, in the order of the bag."""
+    quantities = {topic: quantity for quantity, topic in topics.items()}
+    index = dict.fromkeys(quantities, 0)
+    wanted = [c for c in bag.connections if c.topic in quantities and c.msgtype == MESSAGE_TYPE]
+    for topic, stamp, message in _messages(bag, wanted):
+        layout = message.layout
+        try:
+            samples = decode(message.data, layout.dim, layout.data_offset)
+        except DataError as error:
+            raise DataError(
+                f'{bag.path}: topic {topic}, message {index[topic]}: {error}; record it again '
+                'with a publisher that keeps to the layout'
+            ) from None
+        index[topic] += 1
+        yield quantities[topic], samples, stamp

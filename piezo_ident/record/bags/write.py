@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bag that is written as messages arrive, and is on disk soon after, whatever ends the writer.
+Bags: a whole record, or messages as they arrive, which are on disk soon after.
 
 rosbags itself keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until
 it is closed.  The two calls that end a chunk and a transaction early are internals of it, so they
@@ -11,7 +11,7 @@ are looked for before the first message, and `setup.py` bounds the version.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -19,12 +19,23 @@ import sqlite3
 from typing import Any
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.bags.read import SAMPLE_QOS, typestore
-from rosbags.interfaces import Connection, Qos
+from piezo_ident.common.files import temporary_output
+from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
+from piezo_ident.record.record import Record
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
-__all__ = ['STORAGES', 'BagWriter', 'LossCount', 'PartWriter', 'knows_type']
+__all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'LossCount', 'knows_type', 'write_bag']
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 #: what `flush` uses inside of rosbags: storage -> attribute -> what that must have
@@ -35,6 +46,20 @@ INTERNALS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 #: how many numbered names are tried
 NAMES = 10_000
 
+_FOREVER = QosTime(9223372036, 854775807)
+#: reliable, volatile, keep last 100: the contract of every topic that carries samples
+SAMPLE_QOS = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=100,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.VOLATILE,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+
 
 def knows_type(name: str) -> bool:
     """Return whether a message type can be described in a bag."""
@@ -43,7 +68,11 @@ def knows_type(name: str) -> bool:
 
 class BagWriter:
     """
-    An open bag; all calls must come from one thread.
+    An open bag, or several one after the other; all calls must come from one thread.
+
+    Where a size is given, a bag that is large enough is closed and the next one begun.  The parts
+    have the name of the first with a number behind it; each is a whole bag with all topics, and
+    its custom data say which ``part`` of which ``recording`` it is.
 
     Parameters
     ----------
@@ -53,22 +82,21 @@ class BagWriter:
         Format.
     custom_data : mapping of str to str, optional
         For the bag's metadata.
-    number : int, optional
-        The first one that is tried behind the name; 0: the name itself.
+    max_size : int, optional
+        Bytes on disk from which the next part is begun, looked at when the bag is flushed; 0 for
+        one bag without end.
 
     Attributes
     ----------
-    number : int
-        The one behind the name, 0 where there is none.
-    path, file : Path
-        The folder that was made, and the file in it.
+    parts : list of Path
+        The folders so far; the last one is being written.
     messages : int
-        How many were written.
+        How many were written, all parts together.
 
     Raises
     ------
     DataError
-        When the bag cannot be made.
+        When a bag cannot be made.
 
     Examples
     --------
@@ -83,36 +111,50 @@ class BagWriter:
         path: str | Path,
         storage: str = 'mcap',
         custom_data: Mapping[str, str] | None = None,
-        number: int = 0,
+        max_size: int = 0,
     ) -> None:
+        self.max_size = max_size
         self.messages = 0
-        self.number = number
+        self.parts: list[Path] = []
+        # made whole, so that a later change of the working directory changes nothing
+        self._path = Path(os.path.abspath(Path(path).expanduser()))
         self._storage = storage
-        self._topics: dict[str, Connection] = {}
-        self._writer = self._opened(Path(path).expanduser())
-        self.path = self._writer.path
-        inside: Any = self._writer.storage
-        self._inside = inside
-        self.file: Path = inside.path
-        for key, value in (custom_data or {}).items():
-            self._writer.set_custom_data(key, value)
-        for name, parts in INTERNALS[storage].items():
-            if not all(
-                hasattr(getattr(inside, name, None), part) for part in parts or ('__call__',)
-            ):
+        self._custom_data = dict(custom_data or {})
+        self._topics: dict[str, tuple[str, Sequence[Qos]]] = {}
+        self._number = self._closed_size = self._closed_messages = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Open the next bag."""
+        self._writer = self._opened()
+        self._inside: Any = self._writer.storage
+        self._connections: dict[str, Connection] = {}
+        for name, parts in INTERNALS[self._storage].items():
+            inner = getattr(self._inside, name, None)
+            if not all(hasattr(inner, part) for part in parts or ('__call__',)):
                 self.abort()
                 raise DataError(
                     f'{self.path}: this version of rosbags cannot be told to put messages on '
                     'disk; install one that setup.py names'
                 )
+        custom = dict(self._custom_data)
+        if self.max_size:
+            name = self.parts[0].name if self.parts else ''
+            custom |= {'part': str(len(self.parts)), 'recording': name}
+        for key, value in custom.items():
+            self._writer.set_custom_data(key, value)
+        self.parts.append(self.path)
+        for topic in self._topics:
+            self._connect(topic)
 
-    def _opened(self, path: Path) -> Writer:
-        # made whole, so that a later change of the working directory changes nothing
-        path = Path(os.path.abspath(path))
-        for number in range(self.number, self.number + NAMES):
+    def _opened(self) -> Writer:
+        path = self._path
+        # a week has more parts than names are tried
+        begin = self._number + 1 if self.parts else 0
+        for number in range(begin, begin + NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
             try:
-                if place.exists() or place.is_symlink():
+                if os.path.lexists(place):
                     continue
                 writer = Writer(place, version=9, storage_plugin=STORAGES[self._storage])
                 writer.open()
@@ -121,14 +163,35 @@ class BagWriter:
             except (OSError, sqlite3.Error) as error:
                 with suppress(OSError):
                     place.rmdir()
-                reason = getattr(error, 'strerror', None) or str(error)
                 raise DataError(
-                    f'{place}: cannot be written ({reason}); choose a place with room and the '
-                    'right to write'
+                    f'{place}: cannot be written ({_reason(error)}); choose a place with room and '
+                    'the right to write'
                 ) from None
-            self.number = number
+            self._number = number
             return writer
         raise DataError(f'{path}: this name and {NAMES} numbered ones are taken; choose another')
+
+    @property
+    def path(self) -> Path:
+        """The folder that is being written."""
+        return self._writer.path
+
+    @property
+    def file(self) -> Path:
+        """The file that is being written."""
+        file: Path = self._inside.path
+        return file
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk, all parts together."""
+        return self._closed_size + self._size_here()
+
+    def _size_here(self) -> int:
+        try:
+            return self.file.stat().st_size
+        except OSError:
+            return 0
 
     def __contains__(self, topic: str) -> bool:
         """Return whether a topic was added."""
@@ -154,8 +217,13 @@ class BagWriter:
         """
         if not knows_type(message_type):
             raise DataError(f'{topic}: type {message_type} is not known here; leave the topic out')
+        self._topics[topic] = (message_type, tuple(qos))
+        self._connect(topic)
+
+    def _connect(self, topic: str) -> None:
+        message_type, qos = self._topics[topic]
         try:
-            self._topics[topic] = self._writer.add_connection(
+            self._connections[topic] = self._writer.add_connection(
                 topic, message_type, typestore=typestore(), offered_qos_profiles=list(qos)
             )
         except (OSError, sqlite3.Error) as error:
@@ -180,37 +248,40 @@ class BagWriter:
             When the bag cannot be written any more.
         """
         try:
-            self._writer.write(self._topics[topic], stamp, raw)
+            self._writer.write(self._connections[topic], stamp, raw)
         except (OSError, sqlite3.Error) as error:
             raise self._failure(error) from None
         self.messages += 1
 
     def flush(self) -> None:
         """
-        Hand all that was written to the system: no end of this process loses it.
+        Hand all that was written to the system, so that no end of this process loses it.
+
+        The next part is begun when it is time.
 
         Raises
         ------
         DataError
-            When the bag cannot be written any more.
+            When the bag cannot be written any more, or the next one not be made.
         """
         try:
-            if self._storage == 'sqlite3':
-                self._inside.conn.commit()
-                return
-            if self._inside.chunk.bio.tell():
-                self._inside.close_chunk()
-            self._inside.bio.flush()
+            self._hand_over()
         except (OSError, sqlite3.Error) as error:
             raise self._failure(error) from None
+        is_full = self.max_size and self._size_here() >= self.max_size
+        if is_full and self.messages > self._closed_messages:
+            self.close()
+            size = self.size
+            self._begin()
+            self._closed_size, self._closed_messages = size, self.messages
 
-    @property
-    def size(self) -> int:
-        """Bytes of the file on disk."""
-        try:
-            return self.file.stat().st_size
-        except OSError:
-            return 0
+    def _hand_over(self) -> None:
+        if self._storage == 'sqlite3':
+            self._inside.conn.commit()
+            return
+        if self._inside.chunk.bio.tell():
+            self._inside.close_chunk()
+        self._inside.bio.flush()
 
     def close(self) -> None:
         """
@@ -230,123 +301,121 @@ class BagWriter:
     def abort(self) -> None:
         """Let go of the file as it is."""
         with suppress(Exception):
-            self.flush()
+            self._hand_over()
         with suppress(Exception):
             self._writer.abort()
 
     def _failure(self, error: Exception) -> DataError:
-        reason = getattr(error, 'strerror', None) or str(error)
         return DataError(
-            f'{self.path}: cannot be written any more ({reason}); make room, and convert it: what '
-            'was written can be recovered'
+            f'{self.path}: cannot be written any more ({_reason(error)}); make room, and convert '
+            'it: what was written can be recovered'
         )
 
 
-class PartWriter:
-    """
-    Bags one after the other: when one is large enough, it is closed and the next one begun.
+def _reason(error: Exception) -> str:
+    return getattr(error, 'strerror', None) or str(error)
 
-    The parts have the name of the first with a number behind it; each is a whole bag with all
-    topics, and its custom data say which ``part`` of which ``recording`` it is.  All calls must
-    come from one thread.
+
+def write_bag(
+    record: Record,
+    path: str | Path,
+    *,
+    storage: str | None = None,
+    overwrite: bool = False,
+    custom_data: Mapping[str, str] | None = None,
+    block_size: int = BLOCK_SIZE,
+) -> None:
+    """
+    Write a record as a rosbag2 folder, or as a single file when `path` ends so.
+
+    A block's log time is the time of its first sample.  Where the record starts before zero, or
+    its clock restarts, log times are moved later by whole seconds, so that they stay positive
+    and in the order of the messages; the samples keep their own times.
 
     Parameters
     ----------
-    path, storage, custom_data
-        As for `BagWriter`.
-    max_size : int, optional
-        Bytes on disk from which the next part is begun, looked at when the bag is flushed; 0 for
-        one bag without end.
-
-    Attributes
-    ----------
-    parts : list of Path
-        The folders so far; the last one is being written.
+    record : Record
+        What to write.
+    path : path
+        The folder, or a file name that ends in .mcap or .db3.
+    storage : {'mcap', 'sqlite3'}, optional
+        Storage of a folder; mcap unless told.
+    overwrite : bool
+        Replace an existing bag.
+    custom_data : mapping of str to str, optional
+        For the bag's metadata beside ``sample_rate``: seed, programme.
+    block_size : int
+        Samples a block.
 
     Raises
     ------
     DataError
-        When a bag cannot be made.
+        When the place is taken or cannot be written to.
     """
+    path = Path(path)
+    suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
+    if suffix and path.suffix != path.suffix.lower():
+        raise DataError(f'{path}: no reader of bags takes {path.suffix}; write small letters')
+    if storage is not None and (storage not in STORAGES or (suffix or storage) != storage):
+        raise DataError(
+            f'{path}: storage {storage!r} is not possible; use mcap or sqlite3, and a file name '
+            'that agrees'
+        )
+    rates = {p.sample_rate for p in record}
+    custom = dict(custom_data or {})
+    if len(rates) == 1:
+        custom.setdefault('sample_rate', repr(float(next(iter(rates)))))
+    with temporary_output(path, overwrite=overwrite) as target:
+        folder = target.with_name('bag') if suffix else target
+        plugin = STORAGES[suffix or storage or 'mcap']
+        with Writer(folder, version=9, storage_plugin=plugin) as writer:
+            for key, value in custom.items():
+                writer.set_custom_data(key, value)
+            _write_pieces(writer, record, block_size)
+        if suffix:
+            next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
 
-    def __init__(
-        self,
-        path: str | Path,
-        storage: str = 'mcap',
-        custom_data: Mapping[str, str] | None = None,
-        max_size: int = 0,
-    ) -> None:
-        self.max_size = max_size
-        self._make = (Path(path), storage, dict(custom_data or {}))
-        self._topics: dict[str, tuple[str, Sequence[Qos]]] = {}
-        self._messages = self._size = 0
-        self.parts: list[Path] = []
-        self._bag = self._next()
 
-    def _next(self) -> BagWriter:
-        path, storage, custom = self._make
-        number = self._bag.number + 1 if self.parts else 0
-        if self.max_size:
-            name = self.parts[0].name if self.parts else ''
-            custom = {**custom, 'part': str(len(self.parts)), 'recording': name}
-        # a week has more parts than names are tried
-        bag = BagWriter(path, storage, custom, number)
-        self.parts.append(bag.path)
-        for topic, (message_type, qos) in self._topics.items():
-            bag.add_topic(topic, message_type, qos)
-        return bag
+def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
+    quantities = ['voltage', 'displacement']
+    quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
+    senders = {q: _sender(writer, q) for q in quantities}
+    shift, latest = 0, 0.0
+    for piece in record:
+        columns = {'voltage': piece.v, 'displacement': piece.y}
+        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
+        first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
+        # later by whole seconds, until nothing is before what was written already
+        while first + shift < latest:
+            shift += 1 + int(latest - first - shift)
+        latest = last + shift
+        for start, stop, label in cut_blocks(piece.n, piece.segments, block_size):
+            t = piece.time(start, stop)
+            stamp = round(t[0] * 1e9) + shift * 1_000_000_000
+            if stamp >= 2**63:
+                raise DataError(
+                    f't = {t[0]:.10g} s cannot be the stamp of a message, which ends at '
+                    f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
+                )
+            for quantity, x in columns.items():
+                senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
 
-    @property
-    def path(self) -> Path:
-        """The folder that is being written."""
-        return self._bag.path
 
-    @property
-    def messages(self) -> int:
-        """How many were written, all parts together."""
-        return self._messages + self._bag.messages
+def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
+    store = typestore()
+    types: Any = store.types
+    dimension = types['std_msgs/msg/MultiArrayDimension']
+    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
+    connection = writer.add_connection(
+        f'/{quantity}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
+    )
 
-    @property
-    def size(self) -> int:
-        """Bytes on disk, all parts together."""
-        return self._size + self._bag.size
+    def send(samples: Samples, stamp: int) -> None:
+        data, dims = encode(samples)
+        filled = message(layout([dimension(*d) for d in dims], 0), data)
+        writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
 
-    def __contains__(self, topic: str) -> bool:
-        """Return whether a topic was added."""
-        return topic in self._topics
-
-    def add_topic(self, topic: str, message_type: str, qos: Sequence[Qos] = (SAMPLE_QOS,)) -> None:
-        """Add a topic, once; see `BagWriter.add_topic`."""
-        self._bag.add_topic(topic, message_type, qos)
-        self._topics[topic] = (message_type, tuple(qos))
-
-    def write(self, topic: str, stamp: int, raw: bytes) -> None:
-        """Write a message as it is; see `BagWriter.write`."""
-        self._bag.write(topic, stamp, raw)
-
-    def flush(self) -> None:
-        """
-        Hand all that was written to the system, and begin the next part when it is time.
-
-        Raises
-        ------
-        DataError
-            When a bag cannot be written any more, or the next one not be made.
-        """
-        self._bag.flush()
-        if self.max_size and self._bag.size >= self.max_size and self._bag.messages:
-            self._bag.close()
-            messages, size = self.messages, self.size
-            self._bag = self._next()
-            self._messages, self._size = messages, size
-
-    def close(self) -> None:
-        """Finish the last bag; see `BagWriter.close`."""
-        self._bag.close()
-
-    def abort(self) -> None:
-        """Let go of the file as it is."""
-        self._bag.abort()
+    return send
 
 
 class LossCount:

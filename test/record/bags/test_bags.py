@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from bag_data import blocks, write
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag, SAMPLE_QOS, write_bag
+from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
+from piezo_ident.record.bags.write import SAMPLE_QOS, write_bag
 from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples
 from piezo_ident.record.capture import APPLIED, Capture
 from piezo_ident.record.join import join

@@ -6,11 +6,9 @@
 import json
 import os
 from pathlib import Path
-import random
 import shutil
 import signal
 import sqlite3
-import struct
 import subprocess
 import sys
 
@@ -18,12 +16,11 @@ from bag_data import raw_blocks
 import numpy as np
 from piezo_ident.cli import main
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.bags.mcap_scan import MAGIC, McapScan, Message
-from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag, SAMPLE_QOS, typestore, write_bag
-from piezo_ident.record.bags.recover import is_unfinished, opened_bag
-from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount
+from piezo_ident.record.bags.read import MESSAGE_TYPE, opened_bag, read_bag, typestore
+from piezo_ident.record.bags.recover import is_unfinished
+from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount, SAMPLE_QOS, write_bag
 from piezo_ident.record.io import read_record
-from piezo_ident.record.record import Piece, Record, Segment
+from piezo_ident.record.record import Piece, Record
 import pytest
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
@@ -78,6 +75,11 @@ def killed(path: Path, **options) -> Path:
     (path / writer.file.name).rename(path / f'{path.name}{writer.file.suffix}')
     writer.abort()
     return path
+
+
+def refused(path: Path) -> None:
+    with pytest.raises(DataError, match=f'{path.name}: damaged or unfinished bag'):
+        read_bag(path, recover=True)
 
 
 def truncation(record: Record) -> str:
@@ -293,48 +295,39 @@ def test_a_stray_file_is_no_part_of_a_bag(tmp_path):
     assert read_bag(tmp_path / 'bag').faults == ()
 
 
-def test_cut_anywhere(tmp_path):
-    # each message that is whole comes back, and nothing else
-    path = killed(tmp_path / 'bag', n=12)
-    file = path / 'bag.mcap'
-    data = file.read_bytes()
-    all_of_it = [(e.stamp, e.data) for e in McapScan(file) if isinstance(e, Message)]
-    assert len(all_of_it) == 24
-    # where each message ends in the file
-    ends = [data.index(raw_) + len(raw_) for _, raw_ in all_of_it]
-    rng = random.Random(0)
-    for cut in sorted({*rng.sample(range(len(data)), 150), *ends, *(e - 1 for e in ends)}):
-        file.write_bytes(data[:cut])
-        want = all_of_it[: sum(e <= cut for e in ends)]
-        if not want:
-            with pytest.raises(DataError, match='damaged or unfinished'), opened_bag(path):
-                pass
-            continue
-        with opened_bag(path) as bag:
-            assert [(m.stamp, m.raw) for m in bag.messages(bag.connections)] == want
-
-
-@pytest.mark.parametrize('storage', STORAGES)
-@pytest.mark.parametrize('share', [0.0, 0.3, 0.9])
+@pytest.mark.parametrize('share', [0.0, 0.2, 0.5, 0.9])
 @pytest.mark.parametrize('metadata', [True, False])
-def test_truncated_file(tmp_path, storage, share, metadata):
-    segments = (Segment('noise', 0, 20000),)
-    v = np.random.default_rng(0).normal(size=20000)
-    write_bag(Record((Piece(v, 1e-6 * v, RATE, 0.0, segments),)), tmp_path / 'b', storage=storage)
-    (file,) = (f for f in (tmp_path / 'b').iterdir() if f.suffix in ('.mcap', '.db3'))
-    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+def test_truncated_mcap_file(tmp_path, share, metadata):
+    # a chunk holds 1 MiB
+    v = np.random.default_rng(0).normal(size=100_000)
+    write_bag(Record((Piece(v, 1e-6 * v, RATE),)), tmp_path / 'b')
+    file = tmp_path / 'b' / 'b.mcap'
+    size = file.stat().st_size
+    file.write_bytes(file.read_bytes()[: int(share * size)])
     if not metadata:
         (tmp_path / 'b' / 'metadata.yaml').unlink()
-    try:
-        record = read_bag(tmp_path / 'b', recover=True)
-    except DataError as error:
-        assert 'damaged or unfinished bag' in str(error)
-        assert '\n' not in str(error)
-        assert share == 0.0 or storage == 'sqlite3'
+    if share < 0.3:
+        refused(tmp_path / 'b')
         return
-    assert 0 < record.n < 20000
+    record = read_bag(tmp_path / 'b', recover=True)
+    # all but the chunk that is cut
+    assert share - 1.3 * 2**20 / size <= record.n / v.size <= share
     assert truncation(record)
-    np.testing.assert_array_equal(record.pieces[0].v, v[: record.pieces[0].n])
+    np.testing.assert_array_equal(record.pieces[0].v, v[: record.n])
+
+
+def test_truncated_database(tmp_path):
+    write(tmp_path / 'b', 'sqlite3').close()
+    file = tmp_path / 'b' / 'b.db3'
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    refused(tmp_path / 'b')
+
+
+def test_recovery_without_the_package_mcap(tmp_path, monkeypatch):
+    path = killed(tmp_path / 'bag')
+    monkeypatch.setitem(sys.modules, 'mcap.stream_reader', None)
+    with pytest.raises(DataError, match='pip install mcap'):
+        read_bag(path, recover=True)
 
 
 @pytest.mark.parametrize('compression', ['NONE', 'ZSTD', 'LZ4'])
@@ -360,77 +353,12 @@ def test_compressed_bags_of_other_writers(tmp_path, compression, crc):
     file.write_bytes(data[: len(data) // 2])
     record = read_record(tmp_path / 'bag', recover=True)
     assert 1000 < record.n < 5000
-    # a byte within the first chunk
+    # a byte within a later chunk
     broken = bytearray(data[: len(data) // 2])
-    broken[2000] ^= 0xFF
+    broken[-len(data) // 4] ^= 0xFF
     file.write_bytes(broken)
     if crc:
-        with pytest.raises(DataError, match='makes no sense'):
-            read_record(tmp_path / 'bag', recover=True)
-
-
-def chunk(raw_size: int, compression: bytes, packed: bytes, declared: int | None = None) -> bytes:
-    declared = len(packed) if declared is None else declared
-    body = struct.pack('<QQQI', 0, 0, raw_size, 0)
-    body += struct.pack('<I', len(compression)) + compression
-    body += struct.pack('<Q', declared) + packed
-    return struct.pack('<BQ', 6, len(body)) + body
-
-
-HEADER = struct.pack('<BQ', 1, 8) + bytes(8)
-
-
-@pytest.mark.parametrize(
-    'records',
-    [
-        chunk(2**62, b'', b''),
-        chunk(2**62, b'zstd', b''),
-        chunk(10, b'', b'', declared=2**62),
-        chunk(10, b'zstd', b'garbage garbage garbage'),
-        chunk(10, b'lz4', b'\x04\x22\x4d\x18\x6c\x40' + struct.pack('<Q', 2**40) + bytes(9)),
-        chunk(10, b'zip', bytes(10)),
-        chunk(30, b'', struct.pack('<BQ', 5, 2**62) + bytes(21)),
-        struct.pack('<BQ', 5, 2**62) + bytes(100),
-        struct.pack('<BQ', 5, 3) + bytes(3),
-        struct.pack('<BQ', 3, 10) + b'\xff' * 10,
-        struct.pack('<BQ', 4, 30) + b'\x01\x00\x01\x00\xff\xff\xff\x7f' + bytes(22),
-        bytes(1000),
-    ],
-)
-def test_garbage_takes_no_memory(tmp_path, records):
-    file = tmp_path / 'bag.mcap'
-    file.write_bytes(MAGIC + HEADER + records)
-    with pytest.raises(DataError, match='damaged or unfinished') as caught:
-        read_record(file, recover=True)
-    assert '\n' not in str(caught.value)
-
-
-def test_a_zstd_bomb_is_not_unpacked(tmp_path):
-    from piezo_ident.record.bags import mcap_scan
-
-    packed = mcap_scan._zstd.compress(bytes(50_000_000))
-    file = tmp_path / 'bag.mcap'
-    file.write_bytes(MAGIC + HEADER + chunk(1000, b'zstd', packed))
-    with pytest.raises(DataError, match='checksum or size is wrong'):
-        read_record(file, recover=True)
-
-
-@pytest.mark.parametrize('storage', STORAGES)
-def test_flipped_bytes_never_crash(tmp_path, storage):
-    path = killed(tmp_path / 'bag', storage=storage, n=6)
-    (file,) = path.iterdir()
-    data = file.read_bytes()
-    rng = random.Random(1)
-    for _ in range(150):
-        broken = bytearray(data)
-        for _ in range(rng.randint(1, 4)):
-            broken[rng.randrange(len(data))] = rng.randrange(256)
-        file.write_bytes(broken[: rng.randint(len(data) // 2, len(data))])
-        try:
-            record = read_record(path, recover=True)
-        except DataError:
-            continue
-        assert truncation(record)
+        assert 0 < read_record(tmp_path / 'bag', recover=True).n < record.n
 
 
 def test_a_database_that_is_no_bag(tmp_path):
@@ -449,7 +377,7 @@ def test_write_ahead_log(tmp_path):
     file = tmp_path / 'bag' / 'bag.db3'
     database = sqlite3.connect(file)
     database.execute('PRAGMA journal_mode=WAL').fetchone()
-    (topic,) = database.execute("SELECT id FROM topics WTEST name = '/voltage'").fetchone()
+    (topic,) = database.execute("SELECT id FROM topics WHERE name = '/voltage'").fetchone()
     database.execute('INSERT INTO messages VALUES(?, ?, ?, ?)', (999, topic, 2 * 10**18, b'new'))
     database.commit()
     shutil.copytree(tmp_path / 'bag', tmp_path / 'killed')

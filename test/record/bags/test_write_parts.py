@@ -7,9 +7,8 @@
 from bag_data import raw
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.bags.read import read_bag
-from piezo_ident.record.bags.recover import opened_bag
-from piezo_ident.record.bags.write import PartWriter
+from piezo_ident.record.bags.read import opened_bag, read_bag
+from piezo_ident.record.bags.write import BagWriter
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.io import read_record
 import pytest
@@ -20,7 +19,7 @@ RATE, SIZE = 20_000.0, 100
 
 def recorded(path, storage, parts_of, blocks=60):
     """Write pairs of blocks, flushed after every fifth but the last."""
-    writer = PartWriter(path, storage, {'sample_rate': repr(RATE)}, parts_of)
+    writer = BagWriter(path, storage, {'sample_rate': repr(RATE)}, parts_of)
     for topic in ('/voltage', '/displacement'):
         writer.add_topic(topic, 'std_msgs/msg/Float64MultiArray')
     for k in range(blocks):
@@ -85,7 +84,7 @@ def test_a_part_that_cannot_be_made_leaves_those_before_it(tmp_path):
     writer = recorded(tmp_path / 'bag', 'mcap', 10**9, blocks=20)
     (tmp_path / 'file').write_text('')
     writer.max_size = 1
-    writer._make = (tmp_path / 'file' / 'bag', *writer._make[1:])
+    writer._path = tmp_path / 'file' / 'bag'
     with pytest.raises(DataError, match='cannot be written'):
         writer.flush()
     writer.abort()
