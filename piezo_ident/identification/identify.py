@@ -37,6 +37,7 @@ from piezo_ident.identification.segment_errors import (
     Memories,
     validation_errors,
 )
+from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     Excerpt,
@@ -61,6 +62,8 @@ __all__ = ['identify']
 
 #: plays of the paper, where the data cannot choose their number
 PAPER_COUNT = 10
+#: samples at the end of an unlabelled record that an error needs at least
+MIN_HELD = 10
 
 
 def identify(
@@ -97,7 +100,17 @@ def identify(
     IdentificationError
         When the data do not carry a model; the message says what they lack.
     """
-    settings = settings or Settings()
+    with singular_is_ours():
+        return _identify(records, settings or Settings(), validation, progress, steps)
+
+
+def _identify(
+    records: Sequence[Record] | Record,
+    settings: Settings,
+    validation: Sequence[Record] | Record,
+    progress: Progress,
+    steps: Steps | None,
+) -> Identification:
     records = [records] if isinstance(records, Record) else list(records)
     further = [validation] if isinstance(validation, Record) else list(validation)
     data = prepare(records)
@@ -278,7 +291,13 @@ def _unlabelled(
     piece = run.piece
     share = max(1.5, 0.2 * piece.duration)
     held_time = settings.hold_out or min(share, 0.25 * piece.duration)
-    n_fit = piece.n - round(held_time * rate)
+    n_held = round(held_time * rate)
+    if n_held < MIN_HELD:
+        raise IdentificationError(
+            f'{run.record}: holding out {held_time:.3g} s leaves {n_held} samples to judge by; '
+            f'hold out at least {MIN_HELD / rate:.3g} s (--hold-out)'
+        )
+    n_fit = piece.n - n_held
     if n_fit < 100:
         raise IdentificationError(
             f'{run.record}: {piece.n} samples, of which {max(n_fit, 0)} are left to fit after '

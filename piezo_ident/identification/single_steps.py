@@ -13,6 +13,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import prepare
 from piezo_ident.identification.results import Identification, Progress, Settings, silent, Steps
+from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.three_steps import first_step, second_step
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.record.record import Record
@@ -45,7 +46,8 @@ def find_delay(
             'delay: no segment is labelled step or noise; drive the stage with the programme '
             'identification, or identify unlabelled data in one go'
         )
-    return Steps(delay=first_step(data.runs, settings or Settings(), progress))
+    with singular_is_ours():
+        return Steps(delay=first_step(data.runs, settings or Settings(), progress))
 
 
 def find_dynamics(
@@ -79,8 +81,9 @@ def find_dynamics(
             'dynamics: segments labelled noise and triangle are needed, since the hysteresis is '
             'undone; drive the stage with the programme identification'
         )
-    delay = steps.delay or first_step(data.runs, settings, progress)
-    found = second_step(data.runs, Delay(delay.samples), settings, progress)
+    with singular_is_ours():
+        delay = steps.delay or first_step(data.runs, settings, progress)
+        found = second_step(data.runs, Delay(delay.samples), settings, progress)
     return replace(steps, delay=delay, dynamics=found)
 
 

@@ -14,6 +14,7 @@ from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdent
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import three_steps
 from piezo_ident.identification.identify import identify
+from piezo_ident.identification.prepare import refuse_undriven
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
@@ -315,6 +316,13 @@ def test_measured_closed_loop_is_refused():
     assert 'creep of 0.31 V a decade' in str(caught.value)
 
 
+def test_measured_closed_loop_is_refused_by_its_ramps_alone():
+    record = measured('afm_hold.csv')
+    for piece in (record.pieces[1], record.pieces[3]):
+        with pytest.raises(IdentificationError, match='straight line'):
+            identify(Record((piece,), 'ramp'))
+
+
 def test_measured_open_loop_is_identified_with_a_warning():
     result = identify(measured('afm_open_loop.csv'))
     assert result.warnings
@@ -532,3 +540,45 @@ def test_creep_does_not_become_dynamics():
     f = np.array([10.0, 80.0, 300.0])
     true = np.abs(PAPER.model.dynamics.normalised().response(f, 20_000.0))
     np.testing.assert_allclose(np.abs(G.response(f, 20_000.0)), true, rtol=0.01)
+
+
+@pytest.mark.parametrize('n', [2000, 40_000])
+@pytest.mark.parametrize('quantum', [0.0, 1e-3])
+@pytest.mark.parametrize('drift', ['line', 'exponential', 'with the voltage'])
+def test_a_voltage_that_only_carries_its_noise_is_refused(n, quantum, drift):
+    rng, t = np.random.default_rng(1), np.linspace(0.0, 1.0, n)
+    v = 5.0 + 1e-3 * rng.standard_normal(n)
+    if quantum:
+        v = quantum * np.round(v / quantum)
+    y = t
+    if drift == 'exponential':
+        y = 1.0 - np.exp(-5.0 * t)
+    elif drift == 'with the voltage':
+        v = v + 2e-3 * t
+    y = 1e-6 * y + 1e-9 * rng.standard_normal(n)
+    with pytest.raises(IdentificationError, match='does not answer the voltage'):
+        identify(Record((Piece(v, y, 5000.0),), 'resting'), Settings(max_order=4))
+
+
+def test_small_noise_at_a_bias_drives_the_stage():
+    piece = short(noise=1e-4).pieces[0]
+    (noise,) = piece.find('noise')
+    refuse_undriven([Record((piece.cut(noise.start, noise.stop),), 'noise')])
+
+
+@pytest.mark.parametrize('hold_out', [1e-4, 1e-3])
+def test_a_hold_out_of_no_sample_is_one_line(hold_out):
+    v = 5.0 - 5.0 * np.cos(np.linspace(0.0, 8.0 * np.pi, 2000))
+    record = Record((Piece(v, 1e-6 * v, 1000.0),), 'brief')
+    with pytest.raises(IdentificationError, match='--hold-out') as caught:
+        identify(record, Settings(hold_out=hold_out))
+    assert '\n' not in str(caught.value)
+
+
+def test_a_singular_fit_is_an_error_of_ours(monkeypatch):
+    def first_step(*args):
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    monkeypatch.setattr('piezo_ident.identification.identify.first_step', first_step)
+    with pytest.raises(IdentificationError, match='tell the parameters apart'):
+        identify(short(), QUICK)

@@ -5,16 +5,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear
 
-__all__ = ['bounded_least_squares', 'residual_inflation', 'triangular_factor']
+__all__ = ['bounded_least_squares', 'residual_inflation', 'singular_is_ours', 'triangular_factor']
 
 #: rows that are factorised at once: a block of some dozen columns stays in the cache
 ROWS = 1024
+
+
+@contextmanager
+def singular_is_ours() -> Iterator[None]:
+    """
+    Turn a singular fit into an error that says what the data lack.
+
+    Raises
+    ------
+    IdentificationError
+        In place of `numpy.linalg.LinAlgError`.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise IdentificationError(
+            f'the data do not tell the parameters apart ({error}); drive the stage over its '
+            'range, by steps, noise and a triangle'
+        ) from error
 
 
 def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDArray[np.float64]:
