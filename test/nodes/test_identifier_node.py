@@ -122,7 +122,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(empty):
     for step in ('identify', 'identify_delay', 'identify_dynamics', 'identify_hysteresis'):
         ok, reason = empty.call(f'identifier/{step}')
         assert not ok and 'nothing has been captured' in reason
-    assert empty.call('identifier/cancel') == (False, 'nothing is at work')
+    assert empty.call('identifier/cancel') == (False, 'there is no work to cancel')
     ok, reason = empty.call('identifier/save')
     assert not ok and ('no model to save' in reason or "'output' is empty" in reason)
 
@@ -385,9 +385,10 @@ def test_settings_reach_the_work(fed):
 
 @pytest.mark.skipif(not Path('/proc/self/stat').exists(), reason='no /proc here')
 def test_the_work_gives_way(fed):
-    (helper,) = fed.handle('identifier').children()
-    stat = Path(f'/proc/{helper}/stat').read_text().rpartition(')')[2].split()
-    assert stat[16] == '7'
+    children = fed.handle('identifier').children()
+    stats = [Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split() for pid in children]
+    # the other child only watches over the resources of multiprocessing
+    assert '7' in [stat[16] for stat in stats]
 
 
 def test_a_further_channel_is_captured(empty, blocks):
@@ -441,7 +442,7 @@ def test_run_without_an_excitation_fails_with_the_reason(course):
 
 def test_run_without_a_stage_fails_with_the_reason(course):
     course.start('excitation', {'rate_factor': 4.0, 'subscribers': 2})
-    said = 'nobody publishes displacement within 1 s'
+    said = 'no publisher of displacement within 1 s'
     # it may take a moment to know of the excitation
     course.wait(lambda: said in finish(course, 'identifier/run')['message'], said)
     assert state(course) == 'failed' and course.status('identifier')['level'] == '2'
@@ -452,7 +453,7 @@ def test_run_drives_the_excitation_and_identifies(course):
     assert course.set('identifier', 'excitation_limit', 20.0)[0]
     assert course.set('identifier', 'program', 'nonsense')[0]
     end = finish(course, 'identifier/run')
-    assert end['state'] == 'failed' and 'the excitation refuses the programme' in end['message']
+    assert end['state'] == 'failed' and 'the excitation refuses the program' in end['message']
     assert course.set('identifier', 'program', PROGRAM)[0]
     end = finish(course, 'identifier/run')
     assert (end['state'], end['level']) == ('done', '0'), end

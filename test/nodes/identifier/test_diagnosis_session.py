@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""The course of a diagnosis on the graph, without a graph: judge, ask, judge again, conclude."""
+"""A diagnosis session without a graph: diagnose, request, diagnose again, conclude."""
 
 import itertools
 
@@ -12,9 +12,9 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.next_experiment import Experiment
 from piezo_ident.model.files import model_to_yaml
-from piezo_ident.nodes import inquiry as module
-from piezo_ident.nodes.diagnosis_jobs import diagnose_job, Judgement, records_of_runs
-from piezo_ident.nodes.inquiry import Inquiry
+from piezo_ident.nodes.identifier import diagnosis_session as module
+from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
+from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome, records_of_runs
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.capture import Capture
 from piezo_ident.record.record import Piece, Record
@@ -34,7 +34,7 @@ def feed(capture, record, at=0):
 
 
 class Lab:
-    """A host that plays what is asked for, and writes down what it is told."""
+    """A host that plays what is requested and keeps a log."""
 
     def __init__(self, requests=2, there=True, refusal=None):
         self.values = {
@@ -45,23 +45,23 @@ class Lab:
         }
         self.there, self.refusal = there, refusal
         self.capture = Capture()
-        self.inquiry = Inquiry(self, self.capture)
-        self.said, self.end, self.clock = [], None, itertools.count()
+        self.session = DiagnosisSession(self, self.capture)
+        self.log, self.end, self.clock = [], None, itertools.count()
         self.jobs, self.answers = [], []
 
-    def may_ask(self):
+    def can_excite(self):
         return self.there
 
-    def ask(self, program, why, ended):
-        self.said.append(why)
+    def excite(self, program, why, ended):
+        self.log.append(why)
         self.answers.append((program, ended))
 
-    def judge(self, job, seconds):
-        self.said.append('judging')
+    def start_diagnosis(self, job, seconds):
+        self.log.append('diagnosing')
         self.jobs.append((job, seconds))
 
-    def give_verdict(self, found, notes):
-        self.end = (found, notes)
+    def conclude(self, outcome, notes):
+        self.end = (outcome, notes)
 
     def fail(self, reason):
         self.end = reason
@@ -76,36 +76,36 @@ class Lab:
 
 @pytest.fixture
 def lab(monkeypatch):
-    """Return a lab whose diagnoses are not worked out; each job is the data it would judge."""
+    """Return a lab whose jobs are the arguments of the diagnosis."""
     monkeypatch.setattr(module, 'diagnose_job', lambda *arguments: arguments)
-    found = Lab()
-    found.inquiry.take(base_model(), {})
-    return found
+    lab = Lab()
+    lab.session.take(base_model(), {})
+    return lab
 
 
-def judged(verdict, wanted=None):
+def outcome_of(verdict, wanted=None):
     found = example(verdict)
-    return Judgement(found, found.sentence, json_text(found), model_to_yaml(found.model), wanted)
+    return DiagnosisOutcome(
+        found, found.sentence, json_text(found), model_to_yaml(found.model), wanted
+    )
 
 
 def test_without_a_model_or_data_and_an_excitation_it_refuses(lab):
-    with pytest.raises(PiezoIdentError, match='no model to judge; call ~/run'):
-        Lab().inquiry.begin()
+    with pytest.raises(PiezoIdentError, match='no model'):
+        Lab().session.begin()
     lab.there = False
-    with pytest.raises(
-        DataError, match=r'nothing was captured.*no excitation and stage are there'
-    ):
-        lab.inquiry.begin()
+    with pytest.raises(DataError, match='no excitation and no stage'):
+        lab.session.begin()
     lab.there, lab.values['requests'] = True, 0
-    with pytest.raises(DataError, match=r'nothing was captured.*no more than 0 requests'):
-        lab.inquiry.begin()
-    assert not lab.said
+    with pytest.raises(DataError, match='no more than 0 requests'):
+        lab.session.begin()
+    assert not lab.log
 
 
 def test_what_the_model_was_made_from_does_not_judge_it(lab):
     feed(lab.capture, measured())
-    lab.inquiry.take(base_model(), lab.capture.mark())
-    assert lab.inquiry.begin().startswith('asking for sweeps: no motion was captured beside')
+    lab.session.take(base_model(), lab.capture.mark())
+    assert lab.session.begin().startswith('asking for sweeps')
     lab.play()
     (snapshot, given, asked, _), seconds = lab.jobs[-1]
     assert given is base_model() and asked == ('sweeps',)
@@ -115,60 +115,59 @@ def test_what_the_model_was_made_from_does_not_judge_it(lab):
 
 def test_it_judges_asks_judges_everything_and_concludes(lab):
     feed(lab.capture, measured())
-    assert lab.inquiry.begin() == 'diagnosis has begun'
-    lab.inquiry.weigh(judged('class', HOLDS))
-    assert lab.said == ['judging', 'asking for holds: this and that cannot be told apart']
+    assert lab.session.begin() == 'diagnosis has begun'
+    lab.session.take_outcome(outcome_of('class', HOLDS))
+    assert lab.log == ['diagnosing', 'asking for holds: this and that cannot be told apart']
     assert lab.end is None and lab.answers[-1][0] == 'holds'
     lab.play()
     (snapshot, given, asked, _), _ = lab.jobs[-1]
     assert given is base_model() and asked == ('holds',)
     assert snapshot.record().n == 2 * measured().n
-    last = judged('named')
-    lab.inquiry.weigh(last)
-    assert lab.end == (last, ()) and lab.inquiry.diagnosis is last.diagnosis
+    last = outcome_of('named')
+    lab.session.take_outcome(last)
+    assert lab.end == (last, ()) and lab.session.diagnosis is last.diagnosis
 
 
 def test_requests_are_bounded(lab):
-    lab.inquiry.begin()
+    lab.session.begin()
     lab.play()
-    lab.inquiry.weigh(judged('class', HOLDS))
+    lab.session.take_outcome(outcome_of('class', HOLDS))
     lab.play()
-    last = judged('class', SWEEPS)
-    lab.inquiry.weigh(last)
+    last = outcome_of('class', SWEEPS)
+    lab.session.take_outcome(last)
     assert len(lab.answers) == 2
     assert lab.end == (last, ('this cannot be tested, and no more than 2 requests are allowed',))
-    # the next one begins to count anew
     lab.end = None
-    lab.inquiry.begin()
-    lab.inquiry.weigh(judged('class', HOLDS))
+    lab.session.begin()
+    lab.session.take_outcome(outcome_of('class', HOLDS))
     assert lab.end is None and len(lab.answers) == 3
 
 
 def test_an_excitation_that_refuses_or_is_gone_leaves_the_verdict_as_it_is(lab):
     feed(lab.capture, measured())
-    first = judged('class', HOLDS)
-    lab.inquiry.begin()
-    lab.inquiry.weigh(first)
+    first = outcome_of('class', HOLDS)
+    lab.session.begin()
+    lab.session.take_outcome(first)
     lab.refusal = 'the excitation does not start: another one plays'
     lab.play()
     assert lab.end[0] is first
     assert lab.end[1] == (
-        'holds were asked for in vain: the excitation does not start: another one plays',
+        'holds were requested in vain: the excitation does not start: another one plays',
     )
     lab.there = False
-    lab.inquiry.begin()
-    lab.inquiry.weigh(first)
+    lab.session.begin()
+    lab.session.take_outcome(first)
     assert lab.end[0] is first
     assert lab.end[1] == (
-        'this and that cannot be told apart, and no excitation and stage are there to be asked',
+        'this and that cannot be told apart, and there is no excitation and no stage',
     )
 
 
 def test_without_any_data_a_refusal_is_a_failure(lab):
     lab.refusal = 'no sign'
-    lab.inquiry.begin()
+    lab.session.begin()
     lab.play()
-    assert lab.end == 'there is nothing to judge: no sign'
+    assert 'no sign' in lab.end
 
 
 def test_a_capture_without_motion_asks_and_fails_where_nobody_can_be_asked(lab):
@@ -177,25 +176,25 @@ def test_a_capture_without_motion_asks_and_fails_where_nobody_can_be_asked(lab):
     feed(lab.capture, still)
     found = diagnose_job(lab.capture.snapshot(), base_model(), (), None)(lambda *_: None)
     assert found.diagnosis is None and found.wanted.kind == 'sweeps'
-    lab.inquiry.begin()
-    lab.inquiry.weigh(found)
+    lab.session.begin()
+    lab.session.take_outcome(found)
     assert len(lab.answers) == 1
     lab.there = False
-    lab.inquiry.begin()
-    lab.inquiry.weigh(found)
-    assert lab.end.startswith('there is nothing to judge: what was captured holds no motion')
+    lab.session.begin()
+    lab.session.take_outcome(found)
+    assert 'no motion' in lab.end
 
 
 def test_another_model_forgets_the_verdict(lab):
     feed(lab.capture, measured())
-    lab.inquiry.begin()
-    lab.inquiry.weigh(judged('named'))
-    lab.inquiry.take(base_model(), lab.capture.mark())
-    assert lab.inquiry.diagnosis is None and not lab.inquiry.seconds
+    lab.session.begin()
+    lab.session.take_outcome(outcome_of('named'))
+    lab.session.take(base_model(), lab.capture.mark())
+    assert lab.session.diagnosis is None and not lab.session.seconds
     lab.capture.clear()
-    lab.inquiry.forget()
+    lab.session.forget()
     feed(lab.capture, measured())
-    assert lab.inquiry.seconds == pytest.approx(measured().duration, abs=0.01)
+    assert lab.session.seconds == pytest.approx(measured().duration, abs=0.01)
 
 
 def test_runs_of_the_clock_are_records_of_their_own():

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""The identifier's route to the excitation: set its programme, start it, watch it to the end."""
+"""The identifier's client of the excitation: set its program, start it, follow it to the end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-__all__ = ['Drive', 'Streams']
+__all__ = ['ExcitationClient', 'Streams']
 
 #: states of the excitation in which it has ended, one way or the other, or not begun
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
@@ -33,7 +33,7 @@ _AGAIN = 2.0
 
 @dataclass(frozen=True)
 class Streams:
-    """How far the two streams have come: a number that grows, and the time of the last sample."""
+    """Number of samples received, and time of the last one, of the two streams."""
 
     voltage: int
     voltage_time: float
@@ -41,20 +41,20 @@ class Streams:
     displacement_time: float
 
 
-class Drive:
+class ExcitationClient:
     """
-    One run of the excitation's programme at a time.
+    Plays one program of the excitation at a time.
 
-    Nothing waits: answers are looked for whenever `poll` is called.
+    No call waits; `poll` looks for responses.
 
     Parameters
     ----------
     node : Node
-        On which clients and subscription are made.
+        Gets the clients and the subscription.
     streams : callable
-        Returns the `Streams` as they are.
+        Returns the `Streams` as they are now.
     missing : callable
-        Returns the topics to which nobody publishes yet, for people; empty when all is there.
+        Returns the topics without a publisher, as text; empty when there is none.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Drive:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the excitation was asked to start and has not answered yet."""
+        """Whether the excitation has been called and has not responded yet."""
         return self._phase == 'starting'
 
     @property
@@ -112,12 +112,12 @@ class Drive:
         program : str
             For the excitation's parameter ``program``.
         limit : float
-            How long to wait for a sign of the excitation, or of the stage [s].
+            Longest silence of the excitation or the stage [s].
         ended : callable
-            Called once with None when the programme was captured to its end, else with the
-            reason; not called after `stop`.
+            Called once: with None when the program was captured to its end, else with the reason.
+            Not called after `stop`.
         begin : callable, optional
-            Called once the excitation has agreed to start.
+            Called when the excitation has accepted the start.
         """
         self._program, self._limit = program, limit
         self._begin, self._ended = begin or _nothing, ended
@@ -125,7 +125,7 @@ class Drive:
         self._sign = time.monotonic()
 
     def stop(self) -> None:
-        """Give up the run, and ask the excitation to ramp to rest."""
+        """Give up the run and have the excitation ramp to rest."""
         if self._phase in ('starting', 'playing') and self._stop.service_is_ready():
             self._stop.call_async(Trigger.Request())
         self._phase = ''
@@ -143,7 +143,7 @@ class Drive:
             return
         self._sign = time.monotonic()
         if self._state not in _RESTING:
-            # what was latched before this run says nothing about it
+            # a status latched before this run is not about it
             self._active = True
             try:
                 self.progress = float(values.get('progress', '0'))
@@ -151,7 +151,7 @@ class Drive:
                 pass
 
     def poll(self) -> None:
-        """Go on where something has happened, and give up where nothing has for too long."""
+        """Continue the run, or give it up after too long a silence."""
         if self._phase:
             getattr(self, f'_{self._phase}')()
 
@@ -163,16 +163,16 @@ class Drive:
         missing = self._missing() if ready else ''
         if ready and not missing:
             self._phase, self._sign = 'setting', time.monotonic()
-            self._ask_for_programme()
+            self._set_program()
         elif missing and self._silent():
-            self._end(f'nobody publishes {missing} within {self._limit:g} s; start the stage')
+            self._end(f'no publisher of {missing} within {self._limit:g} s; start the stage')
         elif self._silent():
             self._end(
                 f"no excitation offers '{self._start.srv_name}' within {self._limit:g} s; start "
                 'it in this namespace, or remap that name'
             )
 
-    def _ask_for_programme(self) -> None:
+    def _set_program(self) -> None:
         parameter = Parameter('program', value=self._program).to_parameter_msg()
         if self._future is not None:
             self._set.remove_pending_request(self._future)
@@ -180,16 +180,15 @@ class Drive:
         self._asked = time.monotonic()
 
     def _setting(self) -> None:
-        answer = self._answer('taking the programme')
-        if answer is None:
-            # what both sides have not heard of each other yet is dropped by the middleware, and to
-            # set a programme twice does no harm
+        response = self._response('taking the program')
+        if response is None:
+            # a request is lost before both sides have matched; setting twice is harmless
             if self.running and time.monotonic() - self._asked > _AGAIN:
-                self._ask_for_programme()
+                self._set_program()
             return
-        result = answer.results[0]
+        result = response.results[0]
         if not result.successful:
-            self._end(f'the excitation refuses the programme: {result.reason}')
+            self._end(f'the excitation refuses the program: {result.reason}')
             return
         self._first, self._active, self._done = self._streams(), False, 0.0
         self._seen, self._stage_sign = self._first, time.monotonic()
@@ -198,28 +197,28 @@ class Drive:
         self._future = self._start.call_async(Trigger.Request())
 
     def _starting(self) -> None:
-        answer = self._answer('starting')
-        if answer is None:
+        response = self._response('starting')
+        if response is None:
             return
-        if not answer.success:
-            # whatever it plays is not ours to stop
+        if not response.success:
+            # whatever it plays is not this node's to stop
             self._phase = 'refused'
-            self._end(f'the excitation does not start: {answer.message}')
+            self._end(f'the excitation does not start: {response.message}')
             return
         self._begin()
         self._phase, self._sign = 'playing', time.monotonic()
         # the status may have come before the answer
         self._active = self._state not in (*_RESTING, _UNHEARD)
 
-    def _answer(self, doing: str) -> Any:
+    def _response(self, doing: str) -> Any:
         if self._future.done():
             future, self._future = self._future, None
-            answer = future.result()
-            if answer is not None:
-                return answer
-            self._end(f'the excitation gave no answer while {doing}')
+            response = future.result()
+            if response is not None:
+                return response
+            self._end(f'the excitation did not respond while {doing}')
         elif self._silent():
-            self._end(f'the excitation gave no answer within {self._limit:g} s while {doing}')
+            self._end(f'the excitation did not respond within {self._limit:g} s while {doing}')
         return None
 
     def _playing(self) -> None:
@@ -227,7 +226,7 @@ class Drive:
         if _moved(streams.voltage_time, self._seen.voltage_time):
             self._sign = now
         heard = streams.voltage != self._first.voltage
-        # while nothing has come both times are NaN, and more may be under way
+        # both times are NaN while nothing has arrived
         behind = streams.displacement_time != streams.voltage_time
         gone_on = _moved(streams.displacement_time, self._seen.displacement_time)
         if gone_on or not behind or not heard:
@@ -242,18 +241,17 @@ class Drive:
             self._end(f'the excitation ended early ({self._state}): {self._message}')
         elif behind and heard and now - self._stage_sign > self._limit:
             at = streams.displacement_time
-            since = 'with none at all' if math.isnan(at) else f'since t = {at:.6g} s'
+            since = 'none at all' if math.isnan(at) else f'since t = {at:.6g} s'
             self._end(
-                f'the stage has given no displacement for {self._limit:g} s, {since}; is it '
-                'running?'
+                f'no displacement from the stage for {self._limit:g} s, {since}; is it running?'
             )
         elif self._silent():
-            said = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
-            self._end(f'no sign of the excitation for {self._limit:g} s{said}')
+            last = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
+            self._end(f'no status of the excitation for {self._limit:g} s{last}')
 
 
 def _moved(time: float, before: float) -> bool:
-    """Return whether a stream has come further; both are NaN while there is none."""
+    """Return whether a stream has advanced; both times are NaN while there is none."""
     return time != before and not (math.isnan(time) and math.isnan(before))
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""The identifier: captures what passes, drives the excitation, and learns the model."""
+"""The identifier node: subscriptions, services, status, and the jobs of its worker process."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from typing import Any
 
 from piezo_ident.cli.outputs import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
+from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Steps
 from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.nodes.diagnosis_jobs import Judgement, save_both_job
-from piezo_ident.nodes.drive import Drive, Streams
-from piezo_ident.nodes.helper import Helper
-from piezo_ident.nodes.inquiry import Inquiry
-from piezo_ident.nodes.jobs import (
+from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
+from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
+from piezo_ident.nodes.identifier.jobs import (
+    DiagnosisOutcome,
+    IdentificationOutcome,
     identify_job,
-    Outcome,
+    percent_of,
+    save_job,
     settings_of,
-    share_of,
-    Tick,
     warm_up,
 )
+from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message, LATCHED
-from piezo_ident.nodes.worker import Worker
 from piezo_ident.record.capture import APPLIED, Capture
 from std_msgs.msg import Float64MultiArray, String
 
 __all__ = ['IdentifierNode', 'main']
+
+Result = IdentificationOutcome | DiagnosisOutcome | str
 
 #: quantities that a topic may say it carries, beside its own name
 _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
@@ -60,14 +62,13 @@ class IdentifierNode(LabNode):
         self._files: dict[str, StageModel] = {}
         super().__init__(**kwargs)
         self._capture = Capture(self.values['capture_limit'])
-        self._worker = Worker()
-        self._helper = Helper(self.values['nice'], warm_up)
+        self._worker = Worker(self.values['nice'], warm_up)
         self._outcomes: deque[Callable[[], None]] = deque()
-        self._state, self._doing, self._told = 'idle', '', 0.0
+        self._state, self._task, self._reported_at = 'idle', '', 0.0
         self._steps = Steps()
-        self._found: Outcome | None = None
-        self._inquiry = Inquiry(self, self._capture)
-        # the capture that goes into the model at work, and the model that everybody has
+        self._result: IdentificationOutcome | None = None
+        self._session = DiagnosisSession(self, self._capture)
+        # what the running identification uses of the capture, and the model last published
         self._using: dict[str, int] = {}
         self._published = ''
         if self.values['model']:
@@ -82,7 +83,7 @@ class IdentifierNode(LabNode):
             self._inputs.add(key, key)
         for topic in self.values['channels'].split():
             self._inputs.add(topic, '')
-        self._drive = Drive(self, self._streams, self._unheard)
+        self._excitation = ExcitationClient(self, self._streams, self._unpublished)
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
@@ -96,7 +97,7 @@ class IdentifierNode(LabNode):
         self.offer('save', self._save)
 
     def offer(self, name: str, handler: Callable[[], str]) -> None:
-        """Offer a service; what was sent before the call counts as captured."""
+        """Offer a service; samples sent before the call count as captured."""
 
         def drained() -> str:
             self._drain()
@@ -108,8 +109,8 @@ class IdentifierNode(LabNode):
 
     def _drain(self) -> None:
         self._inputs.drain()
-        # what was captured before a run is forgotten once it has begun, and kept if it does not
-        if self._drive.is_starting or not self._held:
+        # the earlier capture is kept until the excitation has accepted the start
+        if self._excitation.is_starting or not self._held:
             return
         while self._held:
             self._take(*self._held.popleft())
@@ -121,7 +122,7 @@ class IdentifierNode(LabNode):
             samples = from_message(message)
             known = (*_CARRIED[key], key) if key else ()
             quantity = samples.quantity
-            # a further channel says itself what it is
+            # a further channel names itself
             if quantity not in known and (key or not quantity.startswith('x_')):
                 wanted = key or 'x_<name>'
                 raise DataError(f"layout says 't,{quantity}', not 't,{wanted}'")
@@ -136,7 +137,7 @@ class IdentifierNode(LabNode):
         c = self._capture
         answered = c.last_time('displacement')
         if APPLIED in c.keys:
-            # the stage says both, one after the other: a run ends with the later of them
+            # the stage sends both, one after the other: a run ends with the later one
             answered = min(answered, c.last_time(APPLIED))
         return Streams(
             self._passed.get('voltage', 0),
@@ -145,33 +146,33 @@ class IdentifierNode(LabNode):
             answered,
         )
 
-    def _unheard(self) -> str:
-        # what is sent before publisher and subscription have met is lost
+    def _unpublished(self) -> str:
+        # what is sent before publisher and subscription have matched is lost
         return ', '.join(t for t in self._inputs.unpublished if t not in ('voltage', APPLIED))
 
     # state
 
-    def _say(self, state: str, progress: float, message: str, level: bytes = OK) -> None:
+    def _set_state(self, state: str, progress: float, message: str, level: bytes = OK) -> None:
         self._state = state
         self.report_status(state, progress, message, level)
 
     def _poll(self) -> None:
-        if self._drive.running:
-            # a run that has ended is identified from all of it
+        if self._excitation.running:
+            # all of a run is captured before it counts as ended
             self._drain()
-            self._drive.poll()
-        if self._drive.running:
+            self._excitation.poll()
+        if self._excitation.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
-            message = f'{self._doing}: {self._capture.seconds:.0f} s captured{segment}'
-            self._say_with_problems('exciting', self._drive.progress, message)
-        elif self._state == 'idle' and time.monotonic() - self._told > TELL:
-            self._told = time.monotonic()
-            self._say_with_problems('idle', 0.0, self._listening())
+            message = f'{self._task}: {self._capture.seconds:.0f} s captured{segment}'
+            self._report_capture('exciting', self._excitation.progress, message)
+        elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
+            self._reported_at = time.monotonic()
+            self._report_capture('idle', 0.0, self._listening())
 
-    def _say_with_problems(self, state: str, progress: float, message: str) -> None:
+    def _report_capture(self, state: str, progress: float, message: str) -> None:
         problems = self._capture.problems
         text = '; '.join([message, *problems])
-        self._say(state, progress, text, WARN if problems else OK)
+        self._set_state(state, progress, text, WARN if problems else OK)
 
     def _kept(self) -> str:
         keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
@@ -181,15 +182,15 @@ class IdentifierNode(LabNode):
         return f'{self._kept()} captured' if self._capture.keys else 'ready'
 
     def _is_busy(self) -> bool:
-        # the first values of parameters come before anything else is there
-        return hasattr(self, '_drive') and (self._drive.running or self._worker.busy)
+        # parameters are declared before the rest exists
+        return hasattr(self, '_excitation') and (self._excitation.running or self._worker.is_busy)
 
     def _refuse_when_busy(self) -> None:
         if self._is_busy():
-            raise PiezoIdentError(f'busy: {self._doing}; wait for its end, or call ~/cancel')
+            raise PiezoIdentError(f'busy: {self._task}; wait for its end, or call ~/cancel')
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse what the settings would refuse later."""
+        """Refuse values that the settings would refuse later."""
         if name == 'thresholds':
             defaults = {'solver': 'least_squares', 'max_order': 15, 'seed': 0}
             swarm = {'swarm_size': 40, 'swarm_iterations': 1000}
@@ -198,10 +199,10 @@ class IdentifierNode(LabNode):
             except PiezoIdentError as error:
                 return str(error)
         if name.endswith('program') and not value.strip():
-            return f'{name} must not be empty; name a programme, a path, or write YAML'
+            return f'{name} must not be empty; name a program, a path, or write YAML'
         if name == 'model' and value:
             if self._is_busy():
-                return f'busy: {self._doing}; set the model when that has ended, or call ~/cancel'
+                return f'busy: {self._task}; set the model when that has ended, or call ~/cancel'
             try:
                 self._files = {value: load(value)}
             except PiezoIdentError as error:
@@ -209,7 +210,7 @@ class IdentifierNode(LabNode):
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
-        """Hand the limit on to the capture; the rest is read when work begins."""
+        """Apply the limit of the capture and the model; the rest is read when work begins."""
         if 'capture_limit' in changed:
             self._capture.limit = changed['capture_limit']
         if changed.get('model'):
@@ -217,7 +218,7 @@ class IdentifierNode(LabNode):
 
     def _take_file(self, path: str) -> None:
         model = self._files.pop(path)
-        self._inquiry.take(model, {})
+        self._session.take(model, {})
         self._published = model_to_yaml(model)
 
     # services
@@ -225,25 +226,25 @@ class IdentifierNode(LabNode):
     def _run(self) -> str:
         self._refuse_when_busy()
         settings_of(self.values)
-        self._doing = 'excitation'
-        self._drive.start(
+        self._task = 'excitation'
+        self._excitation.start(
             self.values['program'],
             self.values['excitation_limit'],
             self._run_ended,
-            # a run stands for itself: older data may come from another stage, or another day
+            # older data may come from another stage, or another day
             self._forget,
         )
-        self._say('exciting', 0.0, 'asking the excitation for the programme')
-        return 'the programme is asked for; see ~/status'
+        self._set_state('exciting', 0.0, 'requesting the program from the excitation')
+        return 'the program is requested; see ~/status'
 
     def _run_ended(self, reason: str | None) -> None:
         if reason is not None:
-            self._say('failed', 0.0, reason, ERROR)
+            self._set_state('failed', 0.0, reason, ERROR)
             return
         try:
             self._identify('all')
         except PiezoIdentError as error:
-            self._say('failed', 0.0, str(error), ERROR)
+            self._set_state('failed', 0.0, str(error), ERROR)
 
     def _identify(self, which: str) -> str:
         self._refuse_when_busy()
@@ -253,86 +254,86 @@ class IdentifierNode(LabNode):
             )
         self._using = self._capture.mark()
         job = identify_job(self._capture.snapshot(), settings_of(self.values), which, self._steps)
-        self._doing = 'identification' if which == 'all' else f'identification of the {which}'
-        self._say('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
+        self._task = 'identification' if which == 'all' else f'identification of the {which}'
+        self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
         self._start(job)
-        return f'{self._doing} has begun; see ~/status'
+        return f'{self._task} has begun; see ~/status'
 
-    def _start(self, job: Callable[[Tick], Outcome | Judgement | str]) -> None:
-        self._worker.start(self._helper.job(job), progress=self._progress, ended=self._ended)
+    def _start(self, job: Callable[[Tick], Result]) -> None:
+        self._worker.start(job, progress=self._progress, ended=self._ended)
 
     def _save(self) -> str:
         self._refuse_when_busy()
-        found, folder = self._found, self.values['output']
+        outcome, folder = self._result, self.values['output']
         identified = None
-        if found is not None and found.identification is not None and found.record is not None:
-            identified = (found.identification, found.record)
-        if identified is None and self._inquiry.diagnosis is None:
+        if outcome is not None and outcome.identification and outcome.record:
+            identified = (outcome.identification, outcome.record)
+        if identified is None and self._session.diagnosis is None:
             raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
         if not folder:
             raise PiezoIdentError("parameter 'output' is empty; set it to the folder to write to")
         check_folder(Path(folder))
-        self._doing = 'saving'
-        self._say('saving', 0.0, f'writing to {folder}')
-        self._start(save_both_job(identified, self._inquiry.diagnosis, folder))
+        self._task = 'saving'
+        self._set_state('saving', 0.0, f'writing to {folder}')
+        self._start(save_job(identified, self._session.diagnosis, folder))
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
-        if self._drive.running:
-            self._drive.stop()
-            self._inquiry.drop()
-            self._say('cancelled', 0.0, 'the excitation was asked to ramp to rest')
+        if self._excitation.running:
+            self._excitation.stop()
+            self._session.drop()
+            self._set_state('cancelled', 0.0, 'the excitation ramps to rest')
             return 'cancelled; the excitation ramps to rest'
-        if not self._worker.busy:
-            raise PiezoIdentError('nothing is at work')
+        if not self._worker.is_busy:
+            raise PiezoIdentError('there is no work to cancel')
         self._worker.cancel()
-        return f'{self._doing} is being cancelled; see ~/status'
+        return f'{self._task} is being cancelled; see ~/status'
 
     def _clear(self) -> str:
         self._refuse_when_busy()
         seconds = self._capture.seconds
         self._forget()
-        self._say('idle', 0.0, 'ready')
+        self._set_state('idle', 0.0, 'ready')
         return f'{seconds:.3g} s of capture forgotten'
 
     def _forget(self) -> None:
         self._capture.clear()
-        self._inquiry.forget()
+        self._session.forget()
         self._steps = Steps()
 
-    # diagnosis: what its inquiry asks for
+    # what the diagnosis session needs
 
     def _diagnose(self) -> str:
         self._refuse_when_busy()
-        return f'{self._inquiry.begin()}; see ~/status'
+        return f'{self._session.begin()}; see ~/status'
 
-    def may_ask(self) -> bool:
+    def can_excite(self) -> bool:
         """Return whether an excitation and a stage are there."""
-        return self._drive.is_possible
+        return self._excitation.is_possible
 
-    def ask(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
-        """Have the excitation play a programme."""
-        self._doing = why
-        self._drive.start(program, self.values['excitation_limit'], ended)
-        self._say('exciting', 0.0, why)
+    def excite(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
+        """Play a program of the excitation."""
+        self._task = why
+        self._excitation.start(program, self.values['excitation_limit'], ended)
+        self._set_state('exciting', 0.0, why)
 
-    def judge(self, job: Callable[[Tick], Judgement], seconds: float) -> None:
-        """Have the helper do a job."""
-        self._doing = 'diagnosis'
-        self._say('diagnosing', 0.0, f'the model is judged by {seconds:.3g} s')
+    def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
+        """Start a job of the worker."""
+        self._task = 'diagnosis'
+        self._set_state('diagnosing', 0.0, f'the model is tested on {seconds:.3g} s')
         self._start(job)
 
-    def give_verdict(self, found: Judgement, notes: tuple[str, ...]) -> None:
-        """Publish report and model, and say the sentence."""
-        self._report.publish(String(data=found.report))
-        if found.model != self._published:
-            self._publish_model(found.model)
-        message = '; '.join([found.message.rstrip('.'), *notes])
-        self._say('done', 100.0, message, WARN if notes else OK)
+    def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
+        """Publish report, model and verdict."""
+        self._report.publish(String(data=outcome.report))
+        if outcome.model != self._published:
+            self._publish_model(outcome.model)
+        message = '; '.join([outcome.message.rstrip('.'), *notes])
+        self._set_state('done', 100.0, message, WARN if notes else OK)
 
     def fail(self, reason: str) -> None:
-        """Say why there is no verdict."""
-        self._say('failed', 0.0, reason, ERROR)
+        """Report why there is no verdict."""
+        self._set_state('failed', 0.0, reason, ERROR)
 
     def _publish_model(self, text: str) -> None:
         self._published = text
@@ -341,12 +342,12 @@ class IdentifierNode(LabNode):
     # work
 
     def _progress(self, step: str, share: float) -> None:
-        state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._doing, 'identifying')
-        percent = 100.0 * share if state == 'saving' else share_of(step, share)
+        state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
+        percent = 100.0 * share if state == 'saving' else percent_of(step, share)
         self.report_status(state, percent, step)
 
-    def _ended(self, result: Outcome | Judgement | str | None, error: Exception | None) -> None:
-        # published by the executor, so that who hears of the end finds the worker free
+    def _ended(self, result: Result | None, error: Exception | None) -> None:
+        # published by the executor, so that the worker is free when the end is reported
         self._outcomes.append(functools.partial(self._conclude, result, error))
         self._wake.trigger()
 
@@ -355,37 +356,40 @@ class IdentifierNode(LabNode):
             self._worker.join(1.0)
             self._outcomes.popleft()()
 
-    def _conclude(self, result: Outcome | Judgement | str | None, error: Exception | None) -> None:
+    def _conclude(self, result: Result | None, error: Exception | None) -> None:
         if error is not None:
-            self._inquiry.drop()
+            self._session.drop()
         if isinstance(error, Cancelled):
-            self._say('cancelled', 0.0, f'{self._doing} was cancelled; nothing was changed')
+            self._set_state('cancelled', 0.0, f'{self._task} was cancelled; nothing was changed')
         elif isinstance(error, PiezoIdentError):
-            self._say('failed', 0.0, ' '.join(str(error).split()), ERROR)
+            self._set_state('failed', 0.0, ' '.join(str(error).split()), ERROR)
         elif error is not None:
-            reason = f'{self._doing}: {type(error).__name__}: {error}'
+            reason = f'{self._task}: {type(error).__name__}: {error}'
             self.get_logger().error(reason)
-            self._say('failed', 0.0, ' '.join(reason.split()), ERROR)
-        elif isinstance(result, Outcome):
+            self._set_state('failed', 0.0, ' '.join(reason.split()), ERROR)
+        elif isinstance(result, IdentificationOutcome):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
             if result.model and result.identification is not None:
-                self._found = result
-                self._inquiry.take(result.identification.model, self._using)
+                self._result = result
+                self._session.take(result.identification.model, self._using)
                 self._publish_model(result.model)
             count = result.warnings
-            said = f'; {count} warning{"s" * (count > 1)} in the report' if count else ''
-            message = result.message.rstrip('.') + said if count else result.message
-            self._say('done', 100.0, message, WARN if count else OK)
-        elif isinstance(result, Judgement):
-            self._inquiry.weigh(result)
+            message = result.message
+            if count:
+                message = (
+                    f'{message.rstrip(".")}; {count} warning{"s" * (count > 1)} in the report'
+                )
+            self._set_state('done', 100.0, message, WARN if count else OK)
+        elif isinstance(result, DiagnosisOutcome):
+            self._session.take_outcome(result)
         else:
-            self._say('done', 100.0, f'written: {result}')
+            self._set_state('done', 100.0, f'written: {result}')
 
     # end and diagnostics
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return how the capture goes."""
+        """Return the state of the capture."""
         now, passed = time.monotonic(), self._passed.get('voltage', 0)
         rate = (passed - self._counted) / max(now - self._counted_at, 1e-3)
         self._counted, self._counted_at = passed, now
@@ -403,23 +407,19 @@ class IdentifierNode(LabNode):
         problems = capture.problems
         if problems:
             return WARN, '; '.join(problems), values
-        return OK, self._doing if self._worker.busy else 'listening', values
+        return OK, self._task if self._worker.is_busy else 'listening', values
 
     def close(self) -> None:
-        """Cancel what is at work, and ask the excitation to ramp to rest."""
-        if self._drive.running:
-            self._drive.stop()
-        if self._worker.busy:
+        """Cancel the work and have the excitation ramp to rest."""
+        if self._excitation.running:
+            self._excitation.stop()
+        if self._worker.is_busy:
             self._worker.cancel()
             self._worker.join(PATIENCE)
-            self._say('cancelled', 0.0, 'the node ends')
-        self._helper.close()
+            self._set_state('cancelled', 0.0, 'the node ends')
+        self._worker.close()
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node."""
     return run(IdentifierNode, argv)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

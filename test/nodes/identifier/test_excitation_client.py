@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""The route to the excitation where the middleware drops a call."""
+"""The client of the excitation where the middleware loses a request."""
 
 import time
 
@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
-from piezo_ident.nodes import drive
-from piezo_ident.nodes.drive import Drive, Streams
+from piezo_ident.nodes.identifier import excitation_client
+from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.task import Future
@@ -64,25 +64,25 @@ class Node:
 
 
 @pytest.mark.parametrize(
-    ('dropped', 'reason'), [(2, None), (10**6, 'gave no answer within 0.3 s')]
+    ('dropped', 'reason'), [(2, None), (10**6, 'did not respond within 0.3 s')]
 )
-def test_a_programme_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, reason):
-    monkeypatch.setattr(drive, '_AGAIN', 0.01)
+def test_a_program_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, reason):
+    monkeypatch.setattr(excitation_client, '_AGAIN', 0.01)
     node, ends, begun = Node(dropped), [], []
     nan = float('nan')
-    it = Drive(node, lambda: Streams(0, nan, 0, nan), lambda: '')
-    it.start('programme', 0.3, ends.append, lambda: begun.append(True))
+    client = ExcitationClient(node, lambda: Streams(0, nan, 0, nan), lambda: '')
+    client.start('a program', 0.3, ends.append, lambda: begun.append(True))
     give_up = time.monotonic() + 10.0
-    while it.running and not begun and time.monotonic() < give_up:
-        it.poll()
+    while client.running and not begun and time.monotonic() < give_up:
+        client.poll()
         time.sleep(0.001)
     setter, starter, _ = node.clients
     if reason is None:
-        # started once, when the programme is there
+        # started once, when the program is set
         assert begun == [True] and ends == []
         assert (setter.calls, starter.calls) == (3, 1)
     else:
         assert begun == [] and reason in ends[0]
         assert setter.calls > 2 and starter.calls == 0
-    # those that were given up are waited for no more
+    # requests that were given up are forgotten
     assert len(setter.waited_for) == 1

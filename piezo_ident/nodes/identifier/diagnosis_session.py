@@ -1,0 +1,172 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""A diagnosis on the graph: diagnose, request the excitation that would decide, diagnose again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.common.process import Tick
+from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome
+from piezo_ident.record.capture import Capture
+
+__all__ = ['DiagnosisSession', 'Host']
+
+
+class Host(Protocol):
+    """What a session needs from its node."""
+
+    values: dict[str, Any]
+
+    def can_excite(self) -> bool:
+        """Return whether an excitation and a stage are there."""
+
+    def excite(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
+        """Play a program; `ended` gets None, or the reason why it was not captured to its end."""
+
+    def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
+        """Start a job whose result goes to `DiagnosisSession.take_outcome`."""
+
+    def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
+        """Publish the last outcome, with notes on what could not be decided."""
+
+    def fail(self, reason: str) -> None:
+        """Report that there is no verdict."""
+
+
+class DiagnosisSession:
+    """
+    Diagnoses a model until nothing is open, always from the model as it was identified.
+
+    Parameters
+    ----------
+    host : Host
+    capture : Capture
+
+    Attributes
+    ----------
+    given : StageModel or None
+        The model that is diagnosed.
+    diagnosis : Diagnosis or None
+        The last one of this model.
+    """
+
+    def __init__(self, host: Host, capture: Capture) -> None:
+        self._host, self._capture = host, capture
+        self.given: StageModel | None = None
+        self.diagnosis: Diagnosis | None = None
+        # samples up to here went into the model and cannot test it
+        self._used: Mapping[str, int] = {}
+        self.drop()
+
+    def take(self, model: StageModel, used: Mapping[str, int]) -> None:
+        """
+        Take another model to diagnose.
+
+        Parameters
+        ----------
+        model : StageModel
+        used : mapping
+            From `Capture.mark`, when the capture up to then went into the model.
+        """
+        self.given, self.diagnosis, self._used = model, None, used
+
+    def forget(self) -> None:
+        """Take note that the capture was cleared."""
+        self._used = {}
+
+    def drop(self) -> None:
+        """Give up the session under way."""
+        self._requested: list[Kind] = []
+        self._last: DiagnosisOutcome | None = None
+        self._notes: list[str] = []
+
+    @property
+    def seconds(self) -> float:
+        """Length of what was captured and did not go into the model [s]."""
+        keys = ('voltage', 'displacement')
+        return min(self._capture.seconds_since(self._used, key) for key in keys)
+
+    def begin(self) -> str:
+        """
+        Begin, and return what is done first.
+
+        Raises
+        ------
+        PiezoIdentError
+            When there is no model, or neither data nor an excitation.
+        """
+        self.drop()
+        if self.given is None:
+            raise PiezoIdentError(
+                "there is no model to diagnose; call ~/run or ~/identify first, or set 'model'"
+            )
+        if self.seconds:
+            self._diagnose(self.given)
+            return 'diagnosis has begun'
+        wanted, hindrance = next_experiment(None), self._hindrance()
+        if wanted is None or hindrance:
+            raise DataError(
+                'nothing was captured except what the model was identified from; play another '
+                f'program, or replay a bag ({hindrance})'
+            )
+        self._request(wanted)
+        return self._reason(wanted)
+
+    def _hindrance(self) -> str:
+        """Return why no excitation can be requested, empty when it can."""
+        most = self._host.values['requests']
+        if len(self._requested) >= most:
+            return f'no more than {most} requests are allowed'
+        return '' if self._host.can_excite() else 'there is no excitation and no stage'
+
+    def _diagnose(self, given: StageModel) -> None:
+        settings = DiagnosisSettings(seed=self._host.values['seed'])
+        snapshot = self._capture.snapshot(self._used)
+        job = diagnose_job(snapshot, given, tuple(self._requested), settings)
+        self._host.start_diagnosis(job, self.seconds)
+
+    def _request(self, wanted: Experiment) -> None:
+        self._requested.append(wanted.kind)
+        program = self._host.values[f'{wanted.kind}_program']
+        self._host.excite(program, self._reason(wanted), self._excited)
+
+    @staticmethod
+    def _reason(wanted: Experiment) -> str:
+        return f'asking for {wanted.kind}: {wanted.reason}'
+
+    def _excited(self, reason: str | None) -> None:
+        if reason is None and self.given is not None:
+            self._diagnose(self.given)
+        elif self._last is None:
+            self._host.fail(f'there is nothing to diagnose: {reason}')
+        else:
+            self._notes.append(f'{self._requested[-1]} were requested in vain: {reason}')
+            self._conclude(self._last)
+
+    def take_outcome(self, outcome: DiagnosisOutcome) -> None:
+        """Request the experiment that would decide what is open, or conclude."""
+        if outcome.diagnosis is not None:
+            self._last = outcome
+        wanted, hindrance = outcome.wanted, self._hindrance()
+        if wanted is not None and not hindrance:
+            self._request(wanted)
+        elif self._last is None:
+            self._host.fail(
+                f'there is nothing to diagnose: no motion was captured, and {hindrance}'
+            )
+        else:
+            if wanted is not None:
+                self._notes.append(f'{wanted.reason}, and {hindrance}')
+            self._conclude(self._last)
+
+    def _conclude(self, outcome: DiagnosisOutcome) -> None:
+        self.diagnosis = outcome.diagnosis
+        self._host.conclude(outcome, tuple(self._notes))

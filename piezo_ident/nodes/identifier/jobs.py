@@ -1,0 +1,336 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""
+The jobs of the identifier's worker process; nothing here knows of topics.
+
+Jobs are sent to another process, so each is a partial of a function of this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.process import Tick
+from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis.diagnosis_json import json_text
+from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings, Steps
+from piezo_ident.identification.single_steps import find_delay, find_dynamics, find_hysteresis
+from piezo_ident.model.files import model_to_yaml
+from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.capture import refuse_incomplete, Snapshot
+from piezo_ident.record.record import Piece, Record
+from piezo_ident.report import (
+    steps_to_json,
+    to_json,
+    verdict,
+    write_diagnosis_report,
+    write_report,
+)
+
+__all__ = [
+    'DiagnosisOutcome',
+    'IdentificationOutcome',
+    'diagnose_job',
+    'identify_job',
+    'percent_of',
+    'records_of_runs',
+    'save_job',
+    'settings_of',
+    'warm_up',
+]
+
+#: the shortest program that all three steps take
+_SMALL = """
+limits: [0, 10]
+slew: 500
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.02, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 4, frequency: 100}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 0.5}
+  - {signal: triangle, slope: 100}
+"""
+
+#: a record whose voltage moves by less than this share of the model's range is not driven
+DRIVEN = 0.01
+#: folder of the report of a diagnosis, inside that of the identification
+FOLDER = 'diagnosis'
+
+#: share of the whole at which each step begins and ends
+_SHARES = {
+    'delay': (0.02, 0.05),
+    'dynamics': (0.05, 0.8),
+    'hysteresis': (0.8, 0.98),
+    'residual': (0.02, 0.1),
+    'candidates': (0.1, 0.95),
+    'whole records': (0.95, 0.95),
+    'verdict': (0.95, 0.98),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationOutcome:
+    """
+    Result of an identification, or of one of its steps.
+
+    Attributes
+    ----------
+    message : str
+        One line for people.
+    report : str
+        JSON.
+    warnings : int
+        Number of warnings in the report.
+    steps : Steps or None
+        Results of the steps so far.
+    identification, record : Identification and Record, or None
+    model : str
+        YAML; empty without a model.
+    """
+
+    message: str
+    report: str = ''
+    warnings: int = 0
+    steps: Steps | None = None
+    identification: Identification | None = None
+    record: Record | None = None
+    model: str = ''
+
+
+def settings_of(values: dict[str, object]) -> Settings:
+    """
+    Return the settings that a node's parameters ask for.
+
+    Raises
+    ------
+    ConfigError
+        When a value is out of range.
+    """
+    text = str(values['thresholds']).strip()
+    if text != 'auto' and not text.isdecimal():
+        raise ConfigError(f"thresholds must be a number of 2 to 400, or 'auto', got {text!r}")
+    swarm = values['solver'] == 'swarm'
+    return Settings(
+        thresholds=None if text == 'auto' else int(text),
+        solver=str(values['solver']),  # type: ignore[arg-type]
+        polish=swarm and bool(values.get('polish')),
+        max_order=int(str(values['max_order'])),
+        swarm_size=int(str(values['swarm_size'])),
+        swarm_iterations=int(str(values['swarm_iterations'])),
+        seed=int(str(values['seed'])),
+    )
+
+
+def percent_of(step: str, share: float) -> float:
+    """Return the progress of the whole in percent."""
+    low, high = _SHARES.get(step, (0.0, 1.0))
+    return 100.0 * (low + (high - low) * share)
+
+
+def identify_job(
+    snapshot: Snapshot, settings: Settings, which: str = 'all', steps: Steps | None = None
+) -> Callable[[Tick], IdentificationOutcome]:
+    """
+    Return a job that makes a record of a capture and identifies it.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    settings : Settings
+    which : {'all', 'delay', 'dynamics', 'hysteresis'}
+    steps : Steps, optional
+        Results of earlier steps; for single steps only.
+    """
+    return functools.partial(_identify, snapshot, settings, which, steps)
+
+
+def _identify(
+    snapshot: Snapshot, settings: Settings, which: str, steps: Steps | None, tick: Tick
+) -> IdentificationOutcome:
+    tick('record', 0.0)
+    record = snapshot.record('capture')
+    tick('record', 0.01)
+    refuse_incomplete(record, snapshot.sent())
+    records = [record]
+    if which in ('delay', 'dynamics'):
+        if which == 'delay':
+            step = find_delay(records, settings, progress=tick)
+        else:
+            step = find_dynamics(records, settings, steps=steps, progress=tick)
+        data = steps_to_json(step, record.pieces[0].sample_rate, records)
+        return IdentificationOutcome(_sentence(step), json.dumps(data), len(record.faults), step)
+    if which == 'hysteresis':
+        result = find_hysteresis(records, settings, steps=steps, progress=tick)
+    else:
+        result = identify(records, settings, progress=tick)
+    tick('report', 0.98)
+    runs = piece_runs(result.model, records, result.memories)
+    tick('report', 0.99)
+    return IdentificationOutcome(
+        message=verdict(result),
+        report=json.dumps(to_json(result, records, runs)),
+        warnings=len(result.warnings),
+        steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
+        identification=result,
+        record=record,
+        model=model_to_yaml(result.model),
+    )
+
+
+def _sentence(steps: Steps) -> str:
+    if steps.dynamics is not None:
+        na, nb = steps.dynamics[0].order
+        return f'dynamics: na = {na}, nb = {nb}'
+    delay = steps.delay
+    return '' if delay is None else f'delay: {delay.samples} samples ({delay.source})'
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisOutcome:
+    """
+    Result of a diagnosis.
+
+    Attributes
+    ----------
+    diagnosis : Diagnosis or None
+        None when the capture holds no motion.
+    message, report, model : str
+        The sentence, the diagnosis as JSON, the refined model as YAML.
+    wanted : Experiment or None
+        The experiment that would decide what is open.
+    """
+
+    diagnosis: Diagnosis | None
+    message: str = ''
+    report: str = ''
+    model: str = ''
+    wanted: Experiment | None = None
+
+
+def records_of_runs(record: Record) -> list[Record]:
+    """
+    Return each run of the sample clock as a record of its own.
+
+    Between two runs an unknown time has passed, so whatever depends on time starts again.
+    """
+    runs: list[list[Piece]] = []
+    for piece in record:
+        if runs and piece.start_time > runs[-1][-1].start_time:
+            runs[-1].append(piece)
+        else:
+            runs.append([piece])
+    if len(runs) == 1:
+        return [record]
+    return [Record(tuple(pieces), f'{record.name} {i}') for i, pieces in enumerate(runs, 1)]
+
+
+def diagnose_job(
+    snapshot: Snapshot, given: StageModel, asked: tuple[Kind, ...], settings: DiagnosisSettings
+) -> Callable[[Tick], DiagnosisOutcome]:
+    """
+    Return a job that makes records of a capture and diagnoses a model by them.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        Without what the model was identified from.
+    given : StageModel
+    asked : tuple of {'sweeps', 'holds'}
+        Experiments that the excitation has played already.
+    settings : DiagnosisSettings
+    """
+    return functools.partial(_diagnose, snapshot, given, asked, settings)
+
+
+def _diagnose(
+    snapshot: Snapshot,
+    given: StageModel,
+    asked: tuple[Kind, ...],
+    settings: DiagnosisSettings,
+    tick: Tick,
+) -> DiagnosisOutcome:
+    tick('record', 0.0)
+    record = snapshot.record('capture')
+    records = [r for r in records_of_runs(record) if _is_driven(given, r)]
+    if not records:
+        return DiagnosisOutcome(None, wanted=next_experiment(None, asked=asked))
+    result = diagnose(given, records, settings, progress=tick)
+    # every run is a record of its own, so that a restart of the clock is no fault
+    faults = (fault for fault in record.faults if fault.name != 'restart')
+    result = replace(result, faults=(*faults, *result.faults))
+    tick('report', 0.99)
+    return DiagnosisOutcome(
+        result,
+        message=result.sentence,
+        report=json_text(result, indent=None),
+        model=model_to_yaml(result.model),
+        wanted=next_experiment(result, records, asked),
+    )
+
+
+def _is_driven(model: StageModel, record: Record) -> bool:
+    low, high = model.scaling.range
+    return bool(np.ptp(record.voltage_range) >= DRIVEN * (high - low))
+
+
+def save_job(
+    identified: tuple[Identification, Record] | None, diagnosis: Diagnosis | None, folder: str
+) -> Callable[[Tick], str]:
+    """
+    Return a job that writes models, reports and pictures.
+
+    Parameters
+    ----------
+    identified : (Identification, Record) or None
+    diagnosis : Diagnosis or None
+        Goes into a folder ``diagnosis`` inside the other.
+    folder : str
+    """
+    return functools.partial(_save, identified, diagnosis, folder)
+
+
+def _save(
+    identified: tuple[Identification, Record] | None,
+    diagnosis: Diagnosis | None,
+    folder: str,
+    tick: Tick,
+) -> str:
+    tick('drawing', 0.0)
+    share = 0.5 if identified and diagnosis else 1.0
+    written = []
+    if identified:
+        result, record = identified
+        page = write_report(
+            result, record, folder, progress=lambda step, done: tick(step, share * done)
+        )
+        written.append(str(page))
+    if diagnosis:
+        page = write_diagnosis_report(
+            diagnosis,
+            Path(folder, FOLDER),
+            progress=lambda step, done: tick(step, 1.0 - share + share * done),
+        )
+        written.append(str(page))
+    return ' and '.join(written)
+
+
+def warm_up() -> None:
+    """Compile or load the kernels of an identification, so that the first one is not slower."""
+    stage = SimulatedStage.load('paper')
+    sequence = parse_program(_SMALL).build(stage.model.sample_rate)
+    record = stage.play(sequence, np.random.default_rng(0))
+    settings = Settings(thresholds=3, max_order=2, solver='swarm', swarm_size=4)
+    identify(record, replace(settings, swarm_iterations=100))

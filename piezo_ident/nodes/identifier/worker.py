@@ -1,0 +1,115 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One job at a time in a process of its own, watched by a thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+import time
+from typing import Any
+
+from piezo_ident.common.errors import Cancelled, PiezoIdentError
+from piezo_ident.common.process import Job, WorkerProcess
+
+__all__ = ['Worker']
+
+#: time between two reports of progress [s]
+EVERY = 0.1
+
+
+class Worker:
+    """
+    Does one job at a time without holding up its owner.
+
+    Parameters
+    ----------
+    nice : int, optional
+        By how much the process gives way to others.
+    warm_up : callable, optional
+        A function of a module that the process calls first.
+    """
+
+    def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
+        self._process = WorkerProcess(nice, warm_up)
+        self._thread: threading.Thread | None = None
+        self._cancel = threading.Event()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a job runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(
+        self,
+        job: Job,
+        *,
+        progress: Callable[[str, float], None],
+        ended: Callable[[Any, Exception | None], None],
+    ) -> None:
+        """
+        Start a job.
+
+        Parameters
+        ----------
+        job : callable
+            Goes to the process; see `piezo_ident.common.process.WorkerProcess.run`.
+        progress : callable
+            Called with the step and its share done, some times a second, in another thread.
+        ended : callable
+            Called with the result and None, or None and the error, in another thread.
+
+        Raises
+        ------
+        PiezoIdentError
+            When another job runs.
+        """
+        if self.is_busy:
+            raise PiezoIdentError('another job runs; wait for its end or cancel it')
+        self._cancel.clear()
+        self._thread = threading.Thread(
+            target=self._run, args=(job, progress, ended), name='worker', daemon=True
+        )
+        self._thread.start()
+
+    def _run(
+        self,
+        job: Job,
+        progress: Callable[[str, float], None],
+        ended: Callable[[Any, Exception | None], None],
+    ) -> None:
+        last = 0.0
+
+        def tick(step: str, share: float) -> None:
+            nonlocal last
+            if self._cancel.is_set():
+                raise Cancelled('cancelled')
+            now = time.monotonic()
+            if now - last >= EVERY:
+                last = now
+                progress(step, share)
+
+        try:
+            result = self._process.run(job, tick)
+            if self._cancel.is_set():
+                raise Cancelled('cancelled')
+        # whatever the job raises is for the owner to report
+        except Exception as error:  # noqa: BLE001
+            ended(None, error)
+        else:
+            ended(result, None)
+
+    def cancel(self) -> None:
+        """Cancel the job; it ends at its next tick, or with its process."""
+        self._cancel.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end of the job; return whether it came within the time [s]."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+        return not self.is_busy
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        self._process.close()
