@@ -1,4 +1,4 @@
-# make demo    the lab graph on a simulated stage, identified from nothing: demo_report/
+# make demo    a simulated stage on the running graph: demo_report/index.html
 # make test    the checks and the tests
 #
 # Each makes its own virtual environment from a bare Python: make PYTHON=python3.12 test
@@ -15,7 +15,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
-	.venv/bin/piezo_ident demo --out demo_report
+	.venv/bin/python examples/demo.py --out demo_report
 
 test: lint pytest
 

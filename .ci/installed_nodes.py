@@ -60,7 +60,8 @@ def main() -> None:
 
     if not Path(piezo_ident.__file__).is_relative_to(space):
         sys.exit(f'{piezo_ident.__file__} is not below {space}; source its setup first')
-    from piezo_ident.nodes.client import Client
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'examples'))
+    from lab_graph import Client
     from piezo_ident.nodes.parameters import NODES
 
     with tempfile.TemporaryDirectory() as folder, Client() as client:

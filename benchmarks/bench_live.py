@@ -34,7 +34,6 @@ import time
 import numpy as np
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.nodes.starter import Nodes
 from piezo_ident.record.bags.read import opened_bag, typestore
 
 RATE, BLOCK = 20_000, 100
@@ -150,7 +149,7 @@ def processes() -> dict[int, tuple[int, float]]:
 class Shares:
     """CPU time of each node, and of what works for it, over a stretch of time."""
 
-    def __init__(self, nodes: Nodes) -> None:
+    def __init__(self, nodes) -> None:
         self._pids = {name: p.pid for name, p in nodes.processes.items()}
         self._begin, self._times = time.monotonic(), self._read()
 
@@ -224,7 +223,7 @@ class Played:
 class Session:
     """The running graph, and what is asked of it."""
 
-    def __init__(self, nodes: Nodes, client, folder: Path) -> None:
+    def __init__(self, nodes, client, folder: Path) -> None:
         self.nodes, self.client, self.folder = nodes, client, folder
         for name in NODES:
             client.follow(name)
@@ -369,7 +368,8 @@ def main() -> int:
     args = parser.parse_args()
     os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    from piezo_ident.nodes.client import Client
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'examples'))
+    from lab_graph import Client, Nodes
 
     lines = [
         '# The running graph, measured',

@@ -27,7 +27,6 @@ from bench_live import Fetcher, machine, RATE, Shares, sine
 import numpy as np
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.nodes.starter import Nodes
 
 SIZES = (20, 50, 100, 200, 500, 1000)
 #: stages that are tried at most
@@ -64,6 +63,8 @@ class Bench:
         self, spaces: list[str], size: int, *, read: bool = True
     ) -> tuple[Watch, dict[str, float], float]:
         """Play a sine to every stage, and return what was seen, CPU shares and the time taken."""
+        from lab_graph import Nodes
+
         client = self.client
         with Nodes(self.folder / 'log') as nodes:
             told = {
@@ -180,6 +181,8 @@ def starts(bench: Bench) -> Iterator[str]:
     yield ''
     yield '| node | best | median |'
     yield '|---|---|---|'
+    from lab_graph import Nodes
+
     client = bench.client
     for name in ('excitation', 'stage', 'model', 'identifier', 'recorder', 'player'):
         times = []
@@ -211,7 +214,8 @@ def main() -> int:
     args = parser.parse_args()
     os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    from piezo_ident.nodes.client import Client
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'examples'))
+    from lab_graph import Client
 
     lines = [
         '# Blocks, stages, starts',

@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve()
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[2] / 'test/nodes')]
+ROOT = HERE.parents[2]
+sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes'), str(ROOT / 'examples')]
 
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.record.blocks import Samples
@@ -388,7 +389,7 @@ class Attack:
 
 def client(seconds: float) -> int:
     """Call services one after the other, and print how many answers came."""
-    from piezo_ident.nodes.client import Client
+    from lab_graph import Client
 
     count = 0
     with Client(f'attacker_{os.getpid()}') as c:

@@ -32,7 +32,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[2]
-sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes')]
+sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes'), str(ROOT / 'examples')]
 from course import PROGRAM
 
 PROFILES = ROOT / 'config/fastdds_two_hosts.xml'
@@ -262,22 +262,24 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
 def drive(program: str) -> int:
     """Call ``~/run`` on this host, and print what came of it."""
     from diagnostic_msgs.msg import DiagnosticArray
-    from piezo_ident.nodes.client import Client
+    from lab_graph import Client
     from piezo_ident.nodes.wire import PREVIEW
 
     lost: list[int] = [0]
+    captured: list[int] = [0]
 
     def keep(message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.strip('/') == 'identifier':
-                lost.append(int({p.key: p.value for p in status.values}['lost']))
+                values = {p.key: p.value for p in status.values}
+                lost.append(int(values['lost']))
+                captured.append(round(20_000 * float(values['captured'])))
 
     with Client('driver') as client:
         client.node.create_subscription(DiagnosticArray, '/diagnostics', keep, PREVIEW)
         client.follow('identifier')
         client.follow('excitation')
         models, reports = client.listen('model'), client.listen('report')
-        client.count('identifier')
         done, why = client.set('identifier', 'program', Path(program).read_text(), LIMIT)
         if not done:
             raise RuntimeError(why)
@@ -290,9 +292,7 @@ def drive(program: str) -> int:
         def state() -> str:
             return client.status('identifier').get('state', '')
 
-        client.wait(
-            lambda: client.count('identifier') > 20_000 or state() in ends, LIMIT, 'the programme'
-        )
+        client.wait(lambda: captured[-1] > 20_000 or state() in ends, LIMIT, 'the programme')
         print('running', flush=True)
         client.wait(lambda: state() in ends, LIMIT, 'the end')
         seconds = time.monotonic() - begin
@@ -306,7 +306,7 @@ def drive(program: str) -> int:
                 {
                     'state': status['state'],
                     'message': status['message'],
-                    'captured': client.count('identifier'),
+                    'captured': captured[-1],
                     'lost': lost[-1],
                     'faults': [f['name'] for f in report.get('data_faults', [])],
                     'model': models[-1] if models else '',
@@ -345,8 +345,7 @@ def seen_from(
 
 def look(host: int) -> int:
     """Start a stage as the demonstration does, and print which stages can be seen."""
-    from piezo_ident.nodes.client import Client
-    from piezo_ident.nodes.starter import Nodes
+    from lab_graph import Client, Nodes
 
     with tempfile.TemporaryDirectory() as folder, Nodes(Path(folder)) as nodes:
         nodes.start('stage', namespace=f'host{host}')

@@ -32,10 +32,9 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve()
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[2] / 'examples')]
 
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.nodes.starter import Nodes
 from piezo_ident.record.bags.read import opened_bag
 from rows import processors, shares, write_rows
 
@@ -220,7 +219,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         For bags and logs.
     """
     from diagnostic_msgs.msg import DiagnosticArray
-    from piezo_ident.nodes.client import Client
+    from lab_graph import Client, Nodes
     from piezo_ident.nodes.wire import PREVIEW
 
     told: dict[str, dict[str, str]] = {}
@@ -374,7 +373,7 @@ def _set(client: Any, node: str, name: str, value: object) -> None:
         raise PiezoIdentError(f'{node}: {name} was refused: {reason}')
 
 
-def _until(nodes: Nodes, client: Any, node: str, states: tuple[str, ...], limit: float) -> None:
+def _until(nodes, client: Any, node: str, states: tuple[str, ...], limit: float) -> None:
     client.wait(lambda: client.status(node).get('state') in states, limit, node, nodes.check)
 
 

@@ -4,8 +4,7 @@
 """
 The command line: ``piezo_ident VERB ...``.
 
-Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted;
-1 when the graph of the demonstration did not get through.
+Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted.
 Nothing heavy is imported before the arguments are understood.
 """
 
@@ -284,10 +283,6 @@ def _build_parser() -> _Parser:
 
     p = verb('effects', 'List the effects that a model can have', _json())
     p.add_argument('name', nargs='?', type=_name, metavar='NAME', help='say more about this one')
-
-    p = verb('demo', 'Identify simulated stages, and a measured one if it is there')
-    p.add_argument('--out', type=_path, default=Path('demo_report'), metavar='DIR', help='reports')
-    p.add_argument('--measured', type=_path, metavar='RECORD', help='a measured record')
     return parser
 
 

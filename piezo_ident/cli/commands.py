@@ -15,7 +15,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.effects_command import effects_command
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
-from piezo_ident.cli.outputs import check_apart, check_folder, check_link
+from piezo_ident.cli.outputs import check_apart, check_link
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program
@@ -101,17 +101,8 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     command(args, console)
 
 
-def demo_command(args: argparse.Namespace, console: Console) -> int:
-    """``piezo_ident demo``."""
-    from piezo_ident.cli.demo import demo
-
-    check_folder(args.out)
-    return demo(args.out, args.measured, console)
-
-
 COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], int | None]] = {
     'convert': convert_command,
-    'demo': demo_command,
     'diagnose': diagnose_command,
     'effects': effects_command,
     'identify': identify_command,

@@ -21,7 +21,6 @@ from piezo_ident import __version__
 from piezo_ident.cli import main
 from piezo_ident.cli.common import expand
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.demo import find_measured
 from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.outputs import check_file, check_folder
 from piezo_ident.common.config import find_config, shipped_names
@@ -112,7 +111,7 @@ def made(tmp_path_factory) -> Path:
 def test_version_and_help(capsys):
     assert succeed(capsys, '--version') == f'piezo_ident {__version__}\n'
     text = succeed(capsys, '--help')
-    for verb in ('simulate', 'identify', 'predict', 'convert', 'effects', 'demo'):
+    for verb in ('simulate', 'identify', 'predict', 'convert', 'diagnose', 'effects'):
         assert verb in text
         assert verb in succeed(capsys, verb, '--help')
 
@@ -569,7 +568,6 @@ def test_empty_names(capsys, tmp_path, made, monkeypatch):
         ['simulate', ''],
         ['simulate', '--config', '', 'r.csv'],
         ['simulate', '--program', '', 'r.csv'],
-        ['demo', '--out', ''],
     ):
         refuse(capsys, tmp_path, argv, 'is empty; give a name')
 
@@ -690,7 +688,6 @@ def test_unwritable_outputs_are_refused_before_the_work(capsys, tmp_path, made, 
         ['simulate', '/dev/null'],
         ['simulate', '--overwrite', '/dev/null'],
         ['convert', record, below.with_suffix('.csv')],
-        ['demo', '--out', tmp_path / 'file'],
     ):
         refuse(capsys, tmp_path, argv, argv[-1], ';')
 
@@ -702,46 +699,6 @@ def test_long_names_and_devices(tmp_path):
         check_file(Path('/dev/null'), overwrite=True)
     check_folder(tmp_path / 'a' / 'b')
     assert list(tmp_path.iterdir()) == []
-
-
-def test_demo_names_a_measured_record_that_is_not_there(capsys, tmp_path, monkeypatch):
-    argv = ['demo', '--out', tmp_path / 'out', '--measured', tmp_path / 'no.csv']
-    refuse(capsys, tmp_path, argv, 'no.csv', '--measured')
-    monkeypatch.setenv('PIEZO_IDENT_DATA', str(tmp_path))
-    assert find_measured(None) is None
-    (tmp_path / 'piezo_1hz.csv').write_text('')
-    assert find_measured(None) == tmp_path / 'piezo_1hz.csv'
-
-
-@pytest.mark.slow
-def test_demo_finds_what_it_claims(tmp_path):
-    # in a process of its own, because it keeps BLAS on one thread before it is imported; without
-    # nodes, which have tests of their own
-    code = (
-        'import runpy, sys; sys.modules["rclpy"] = None; '
-        f'sys.argv = ["piezo_ident", "demo", "--out", {str(tmp_path / "out")!r}]; '
-        'runpy.run_module("piezo_ident", run_name="__main__", alter_sys=True)'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code],
-        env={**os.environ, 'PIEZO_IDENT_DATA': str(tmp_path)},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stderr) == (0, '')
-    rows = {
-        line[:38].strip(): [float(x) for x in line[38:].split()]
-        for line in done.stdout.splitlines()
-        if line.startswith(('  paper, ', '  here, ', '  ten ', '  chosen '))
-    }
-    assert rows['paper, real stage: hysteresis alone'][-1] == 10.06  # Table I at 120 Hz
-    # 20 times the sensor noise, 0.002 %, is still far below what any real stage would give
-    assert max(rows['here, simulated: model']) < 0.04
-    (ten,) = (row for name, row in rows.items() if name.startswith('ten'))
-    (chosen,) = (row for name, row in rows.items() if name.startswith('chosen'))
-    assert all(b < a for a, b in zip(ten, chosen, strict=True))
-    assert 'piezo_1hz.csv is not there' in done.stdout
-    assert (tmp_path / 'out' / 'stage_dense' / 'report.html').is_file()
 
 
 # --- interrupted ----------------------------------------------------------------------------
