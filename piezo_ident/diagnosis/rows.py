@@ -122,6 +122,11 @@ class Rows:
         return run.piece.time(start, stop) - float(self.begin[i])
 
     @property
+    def longest(self) -> int:
+        """Number of the record that has most rows."""
+        return int(np.bincount(self.of_record, minlength=len(self.names)).argmax())
+
+    @property
     def edges(self) -> NDArray[np.int64]:
         """First row of each block, and the end; shape (blocks + 1,)."""
         starts = np.flatnonzero(np.diff(self.block, prepend=-1))

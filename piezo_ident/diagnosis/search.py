@@ -4,42 +4,38 @@
 """
 The search: which effects, added one after another, lower the error on data that were not fitted.
 
-A round scores every candidate on the residual, fits the most promising ones together with
-everything else, takes the best, and tries whether an earlier one can go.  What random residuals
-of the same colour would gain sets the bar.
+A round scores every candidate on the residual and fits the most promising ones together with
+everything else.  The best one is added if it is an effect (`verdict.takes`).  What candidates
+gain on circular-shift surrogates of the residual is what chance gains.
+
+An effect that was there when G was identified has bent G a little.  Unless a linear change is the
+larger part of the residual, G is therefore retuned along with the candidates, by a factor
+``1 + c_1 (1 - z^-1) + c_2 (1 - z^-1)^2`` and two slow relaxations.  No candidate is chosen for
+what that explains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.candidates import score_trials, Scored, started, view_of
-from piezo_ident.diagnosis.fit import base_at, fit_jointly, Fitted, ITERATIONS
-from piezo_ident.diagnosis.gain import gram_of
+from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.diagnosis.candidates import score_trials, Scored, started, Tick
+from piezo_ident.diagnosis.criteria import JOINT_FITS, SIMPLER, SURROGATES, WORTH_FIT
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
 
-__all__ = ['Contender', 'Round', 'Tick', 'afresh', 'drop_needless', 'polished', 'search_round']
+__all__ = ['Contender', 'Round', 'drop_needless', 'polished', 'search_round']
 
-#: called with the share of the round that is done; may raise `Cancelled`
-Tick = Callable[[float], None]
-
-#: candidates of a round that are fitted jointly, at most, and the share that makes them worth it
-JOINT, WORTH = 4, 0.05
-#: iterations of their first fit, and how many are fitted to the end
+#: iterations of the first joint fit of a candidate, and how many are fitted to the end
 FIRST, FINAL = 3, 2
 #: trials of a candidate that a fit starts from
 STARTS = 2
 #: passes with fresh columns at the end, at most, and the gain that makes another worth it
-PASSES, POLISH = 6, 0.02
-#: a simpler effect goes first when it leaves no more than this times what the best one leaves
-SIMPLER = 1.3
-#: turned residuals that say what chance gains
-TURNS = 16
+POLISHING, POLISH = 6, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +46,10 @@ class Contender:
     Attributes
     ----------
     effect : type of Effect
-    scored : Scored
-        Its best trial, before the joint fit.
     fitted : Fitted
     """
 
     effect: type[Effect]
-    scored: Scored
     fitted: Fitted
 
     @property
@@ -79,9 +72,11 @@ class Round:
     contenders : tuple of Contender
         Those that were fitted jointly, best first.
     chance : dict of str to float
-        Mean square that a candidate gains on residuals that have nothing to do with it, at best.
+        Mean square that a candidate gains on surrogates of the residual, at best.
     visible : dict of str to float
         Share of a candidate's own columns that a refit of the rest does not swallow.
+    warnings : tuple of str
+        Candidates whose joint fit failed, and why.
     """
 
     before: Fitted
@@ -89,6 +84,7 @@ class Round:
     contenders: tuple[Contender, ...]
     chance: dict[str, float]
     visible: dict[str, float]
+    warnings: tuple[str, ...] = ()
 
 
 def search_round(
@@ -114,77 +110,91 @@ def search_round(
     noise : float
         Mean square of the noise of a row.
     rng : numpy.random.Generator
-        Turns the residuals.
+        Draws the shifts of the surrogates.
     tick : callable
     """
-    rows = simulator.rows
-    now = simulator.remember(before.state)
-    M = before.J[:, before.free]
-    prior = before.prior[before.free]
-    turns = rng.integers(rows.n // 20, rows.n - rows.n // 20, TURNS)
-    turned = np.stack([np.roll(before.e, int(k)) for k in turns], axis=1)
-    base = (M, gram_of(rows, M, before.e), prior)
+    n = simulator.rows.n
+    shifts = rng.integers(n // 20, n - n // 20, SURROGATES)
+    surrogates = np.stack([np.roll(before.e, int(k)) for k in shifts], axis=1)
     trials: dict[str, list[Scored]] = {}
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
     for scored in score_trials(
-        simulator,
-        effects,
-        view_of(simulator, lines),
-        base,
-        before.e,
-        now,
-        turned,
-        lambda share: tick(0.5 * share),
+        simulator, before, effects, lines, surrogates, lambda share: tick(0.5 * share)
     ):
         name = scored.effect.name
         visible[name] = max(visible.get(name, 0.0), scored.visible)
-        if not scored.is_possible:
-            continue
-        chance[name] = max(chance.get(name, 0.0), float(scored.chance.max()) / rows.n)
-        trials.setdefault(name, []).append(scored)
+        if scored.is_possible:
+            chance[name] = max(chance.get(name, 0.0), scored.chance / n)
+            trials.setdefault(name, []).append(scored)
     for scores in trials.values():
-        scores.sort(key=lambda s: float(s.errors.sum()))
+        scores.sort(key=_error)
     best = {name: scores[0] for name, scores in trials.items()}
-    explainable = max(float(before.errors.sum()) - noise * rows.n, 1e-300)
-    ranked = sorted(best.values(), key=lambda s: float(s.errors.sum()))
-    promising = [s for s in ranked if before.errors.sum() - s.errors.sum() > WORTH * explainable][
-        :JOINT
-    ]
-    contenders = []
+    total = float(before.errors.sum())
+    least = WORTH_FIT * max(total - noise * n, 1e-300)
+    promising = [s for s in sorted(best.values(), key=_error) if total - s.errors.sum() > least]
+    contenders, warnings = _contenders(simulator, before, promising[:JOINT_FITS], trials, tick)
+    tick(1.0)
+    return Round(
+        before=before,
+        best=best,
+        contenders=tuple(_simplest_first(contenders, noise)),
+        chance=chance,
+        visible=visible,
+        warnings=tuple(warnings),
+    )
+
+
+def _error(scored: Scored) -> float:
+    return float(scored.errors.sum())
+
+
+def _contenders(
+    simulator: Simulator,
+    before: Fitted,
+    promising: Sequence[Scored],
+    trials: dict[str, list[Scored]],
+    tick: Tick,
+) -> tuple[list[Contender], list[str]]:
+    """Return the promising candidates fitted jointly, best first, and the fits that failed."""
+    contenders, warnings = [], []
+    at = 0.5
 
     def alive() -> None:
         tick(at)
 
     for i, scored in enumerate(promising):
         at = 0.5 + 0.5 * i / len(promising)
-        tick(at)
-        fits = []
+        alive()
+        fits, failure = [], ''
         # a law that looks best while it is small need not be the one that fits best
         for start in trials[scored.effect.name][:STARTS]:
-            state = before.state.with_effect(started(rows, start))
-            with contextlib.suppress(ModelError):
+            state = before.state.with_effect(started(simulator.rows, start))
+            try:
                 fits.append(
                     fit_jointly(simulator, state, before.base, iterations=FIRST, tick=alive)
                 )
+            except ModelError:
+                # the law cannot run with these parameters
+                continue
+            except IdentificationError as error:
+                failure = f'{scored.effect.name} was not judged: {error}'
         if fits:
             fitted = min(fits, key=lambda f: f.mean_square)
-            contenders.append(Contender(scored.effect, scored, fitted))
+            contenders.append(Contender(scored.effect, fitted))
+        elif failure:
+            warnings.append(failure)
     contenders.sort(key=lambda c: c.fitted.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
         state = contender.fitted.state
-        better = fit_jointly(simulator, state, base_at(simulator, state), tick=alive)
-        contenders[i] = replace(contender, fitted=better)
+        try:
+            better = fit_jointly(simulator, state, base_at(simulator, state), tick=alive)
+        except IdentificationError as error:
+            warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
+        else:
+            contenders[i] = replace(contender, fitted=better)
     contenders.sort(key=lambda c: c.fitted.mean_square)
-    contenders = _simplest_first(contenders, noise)
-    tick(1.0)
-    return Round(
-        before=before,
-        best=best,
-        contenders=tuple(contenders),
-        chance=chance,
-        visible=visible,
-    )
+    return contenders, warnings
 
 
 def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender]:
@@ -193,7 +203,7 @@ def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender
         return contenders
     limit = SIMPLER * max(contenders[0].fitted.mean_square - noise, 0.0) + noise
     good = [c for c in contenders if c.fitted.mean_square <= limit]
-    simplest = min(good, key=lambda c: len(c.fitted.handles))
+    simplest = min(good, key=lambda c: len(c.fitted.parameters))
     return [simplest, *(c for c in contenders if c is not simplest)]
 
 
@@ -201,7 +211,7 @@ def drop_needless(
     simulator: Simulator, fitted: Fitted, least: float
 ) -> tuple[Fitted, tuple[int, ...]]:
     """
-    Take out effects that later ones have made needless.
+    Take out effects that the last one has made needless.
 
     Parameters
     ----------
@@ -215,7 +225,7 @@ def drop_needless(
     -------
     fitted : Fitted
     dropped : tuple of int
-        Places of the effects that went.
+        Places of the effects that went, falling.
     """
     dropped: list[int] = []
     for i in range(len(fitted.state.effects) - 2, -1, -1):
@@ -234,20 +244,12 @@ def polished(
     Fit several effects again, each from fresh starts now that the others are known.
 
     An effect that was found beside others not yet in the model took a law that made up for them.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    fitted : Fitted
-    lines : sequence of float
-        Lines in the residual [Hz].
-    tick : callable
     """
     for i in range(len(fitted.state.effects)):
-        for fresh in afresh(simulator, fitted, i, lines, tick):
+        for fresh in _afresh(simulator, fitted, i, lines, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
-    for _ in range(PASSES):
+    for _ in range(POLISHING):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
         if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
@@ -256,42 +258,25 @@ def polished(
     return fitted
 
 
-def afresh(
+def _afresh(
     simulator: Simulator,
     fitted: Fitted,
     i: int,
     lines: Sequence[float],
     tick: Callable[[], None],
-    iterations: int = ITERATIONS,
 ) -> Iterator[Fitted]:
-    """
-    Yield fits in which one effect starts anew, from its best trials beside the others.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    fitted : Fitted
-    i : int
-        Place of the effect.
-    lines : sequence of float
-        Lines in the residual [Hz].
-    tick : callable
-    iterations : int, optional
-        Of each fit.
-    """
+    """Yield fits in which effect i starts anew, from its best trials beside the others."""
     rows, own = simulator.rows, fitted.state.effects[i]
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
-    now = simulator.remember(rest.state)
-    M, prior = rest.J[:, rest.free], rest.prior[rest.free]
-    base = (M, gram_of(rows, M, rest.e), prior)
-    view, nothing = view_of(simulator, lines), np.zeros((rows.n, 0))
-    scored = score_trials(simulator, [own.effect], view, base, rest.e, now, nothing)
-    trials = [trial for trial in scored if trial.is_possible]
-    trials.sort(key=lambda s: float(s.errors.sum()))
+    scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
+    trials = sorted((s for s in scored if s.is_possible), key=_error)
     for start in trials[:STARTS]:
-        effects = [*others[:i], started(rows, start), *others[i:]]
-        state = replace(rest.state, effects=tuple(effects))
-        with contextlib.suppress(ModelError):
-            yield fit_jointly(simulator, state, fitted.base, iterations=iterations, tick=tick)
+        effects = (*others[:i], started(rows, start), *others[i:])
+        state = replace(rest.state, effects=effects)
+        try:
+            yield fit_jointly(simulator, state, fitted.base, tick=tick)
+        except (ModelError, IdentificationError):
+            # the fit that is there already stays
+            continue

@@ -2,23 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The whole model over the rows, again and again with a little changed.
+The whole model over the rows, run again and again with little changed.
 
-Candidates, finite differences and the joint fit all ask the same question: what would the model
-say with these weights and these effects?  What lies before the change in the chain is kept from
-the run before.
+Candidates, finite differences and the joint fit all need the prediction with other weights or
+other effects.  What lies before the change in the chain is kept from the run before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.diagnosis.rows import means, Rows
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block, Operator
@@ -28,8 +27,8 @@ from piezo_ident.operators.play import play_columns
 
 __all__ = ['Added', 'Simulator', 'State', 'retuned']
 
-#: samples that pass the chain at once, about
-WINDOW = 1_000_000
+Array = NDArray[np.float64]
+
 #: corner frequencies of the relaxations that a retuned G may show [Hz]
 RELAXATIONS = (15.0, 100.0)
 
@@ -90,7 +89,7 @@ class State:
     """
 
     hysteresis: Hysteresis
-    offsets: NDArray[np.float64]
+    offsets: Array
     effects: tuple[Added, ...] = ()
     retuning: tuple[float, ...] = ()
 
@@ -114,10 +113,11 @@ class Simulator:
         self.model = model
         self.rows = rows
         self._state: State | None = None
-        self._inputs: list[list[Block]] = []
+        #: for each run the block before every link of the chain, and the one behind the last
+        self._kept: list[list[Block]] = []
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
-        """Return the model that a state stands for, with the effects as in one record."""
+        """Return the model of a state, with the effects as in one record."""
         settings = [EffectSetting(a.name, a.values[record]) for a in state.effects]
         return replace(
             self.model,
@@ -126,7 +126,7 @@ class Simulator:
             effects=(*self.model.effects, *settings),
         )
 
-    def base_columns(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def base_columns(self, thresholds: Array) -> Array:
         """
         Return ``[G F_r | G v^3 | G v]`` as rows; shape (n, m + 2).
 
@@ -147,54 +147,32 @@ class Simulator:
             columns.append(self.rows.of(signals))
         return np.stack(columns, axis=1)
 
-    def run(self, state: State) -> NDArray[np.float64]:
+    def run(self, state: State) -> Array:
         """Return the predicted rows; shape (n,)."""
-        found = [
-            np.concatenate([means(x, self.rows.m) for x in self.windows(state, i)])[keep]
-            for i, keep in enumerate(self.rows.keep)
-        ]
-        return np.concatenate(found) + state.offsets[self.rows.of_record]
+        outputs = [self._blocks(state, i)[-1].x for i in range(len(self.rows.runs))]
+        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
 
-    def full(self, state: State) -> list[NDArray[np.float64]]:
+    def full(self, state: State) -> list[Array]:
         """Return the prediction of each run at the full rate, normalised."""
         return [
-            np.concatenate(list(self.windows(state, i))) + state.offsets[k]
+            self._blocks(state, i)[-1].x + state.offsets[k]
             for i, k in enumerate(self.rows.record)
         ]
 
-    def windows(self, state: State, run_index: int) -> Iterator[NDArray[np.float64]]:
-        """Yield the prediction of a run without its offset, whole rows at a time."""
-        run = self.rows.runs[run_index]
-        operators = self._operators(state, run_index)
-        self._rest(operators, run.u)
-        size = max(1, WINDOW // self.rows.m) * self.rows.m
-        for start in range(0, run.u.size, size):
-            cut = slice(start, start + size)
-            block = Block(
-                t=self.rows.time(run_index, start, start + size),
-                v=run.u[cut],
-                x=run.u[cut],
-                channels={name: c[cut] for name, c in run.piece.channels.items()},
-            )
-            for operator in operators:
-                block = operator.process(block)
-            yield block.x
-
-    def remember(self, state: State) -> NDArray[np.float64]:
+    def remember(self, state: State) -> Array:
         """Return the predicted rows, and keep what runs between the links for `added`."""
         self._state = state
-        return self.rows.of(self._kept_signals(state)) + state.offsets[self.rows.of_record]
+        self._kept = [self._blocks(state, i, keep=True) for i in range(len(self.rows.runs))]
+        outputs = [blocks[-1].x for blocks in self._kept]
+        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
 
-    def forget(self) -> None:
-        """Give back what `remember` keeps."""
-        self._state = None
-        self._inputs = []
-
-    def added(self, effect: Added) -> NDArray[np.float64]:
+    def added(self, effect: Added) -> Array:
         """Return the predicted rows of the remembered state with one more effect in its slot."""
-        return self.varied(self._remembered.with_effect(effect), effect.effect)
+        if self._state is None:
+            raise ValueError('remember a state first')
+        return self.varied(self._state.with_effect(effect), effect.effect)
 
-    def varied(self, state: State, effect: type[Effect] | None) -> NDArray[np.float64]:
+    def varied(self, state: State, effect: type[Effect] | None) -> Array:
         """
         Return the predicted rows of a state that differs from the remembered one in one place.
 
@@ -205,48 +183,34 @@ class Simulator:
             The one that was added or changed, None for G; the chain is only run from there.
         """
         signals = []
-        for i, (run, k) in enumerate(zip(self.rows.runs, self.rows.record, strict=True)):
+        for i, k in enumerate(self.rows.record):
             operators = self._operators(state, i)
             start = _place(effect, operators)
-            self._rest(operators, run.u)
-            block = self._inputs[i][start]
+            block = self._kept[i][start]
             for operator in operators[start:]:
                 block = operator.process(block)
             signals.append(block.x + state.offsets[k])
         return self.rows.of(signals)
 
-    @property
-    def _remembered(self) -> State:
-        if self._state is None:
-            raise ValueError('remember a state first')
-        return self._state
-
     def _operators(self, state: State, run_index: int) -> tuple[Operator, ...]:
-        k = int(self.rows.record[run_index])
-        model = self.model_of(state, k)
+        """Return the links of the chain of a run, reset to rest at its first command."""
+        model = self.model_of(state, int(self.rows.record[run_index]))
         memory = self.rows.memories[run_index](state.hysteresis.thresholds)
-        return model.chain(memory).operators
-
-    @staticmethod
-    def _rest(operators: Sequence[Operator], u: NDArray[np.float64]) -> None:
-        x0 = u0 = float(u[0])
+        operators = model.chain(memory).operators
+        x0 = u0 = float(self.rows.runs[run_index].u[0])
         for operator in operators:
             x0 = operator.reset(u0, x0)
+        return operators
 
-    def _kept_signals(self, state: State) -> list[NDArray[np.float64]]:
-        signals = []
-        self._inputs = []
-        for i, run in enumerate(self.rows.runs):
-            operators = self._operators(state, i)
-            self._rest(operators, run.u)
-            block = Block(t=self.rows.time(i), v=run.u, x=run.u, channels=run.piece.channels)
-            inputs = []
-            for operator in operators:
-                inputs.append(block)
-                block = operator.process(block)
-            self._inputs.append([*inputs, block])
-            signals.append(block.x)
-        return signals
+    def _blocks(self, state: State, run_index: int, *, keep: bool = False) -> list[Block]:
+        """Return the block behind the chain of a run, or all between its links."""
+        run = self.rows.runs[run_index]
+        t = self.rows.time(run_index)
+        blocks = [Block(t=t, v=run.u, x=run.u, channels=run.piece.channels)]
+        for operator in self._operators(state, run_index):
+            block = operator.process(blocks[-1])
+            blocks = [*blocks, block] if keep else [block]
+        return blocks
 
 
 def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -> Dynamics:

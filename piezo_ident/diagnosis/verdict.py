@@ -6,7 +6,9 @@ The verdict: what was found, how sure that is, and what the data cannot tell.
 
 A name needs nearly all that can be explained, and must be clearly ahead of every other candidate;
 otherwise the names that remain are reported as a class, or the residual as partly explained or
-unexplained.
+unexplained.  No real effect has quite the form of a textbook law, so of two laws the one that
+leaves less need not be the cause: it must leave clearly less, by more than laws deviate, and by
+more than the difference scatters over held-out blocks.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.diagnosis.apart import experiment_for, look_alikes, rivals_of
-from piezo_ident.diagnosis.fit import Fitted
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.cross_validation import standard_errors
+from piezo_ident.diagnosis.joint_fit import Fitted
+from piezo_ident.diagnosis.look_alikes import CONTAINS, look_alikes, separating_experiment
 from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
@@ -25,35 +29,19 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round
+from piezo_ident.diagnosis.search import Contender, Round
 from piezo_ident.effects import catalogue, find_effect
 
 __all__ = [
-    'PASSES',
     'Findings',
     'candidates_of',
     'judge',
-    'smallest_taken',
+    'percent',
+    'rivals_of',
+    'smallest_detectable',
     'takes',
     'untestable_of',
 ]
-
-#: least share of the explainable part that a name stands for; below the second nothing is added
-NAMED, ADDED = 0.92, 0.5
-#: a gain below this share of what is left, or below this rms [% of stroke], is no effect
-LEAST_GAIN, SMALLEST = 0.10, 0.05
-#: how much better than on turned residuals a gain must be
-BEYOND_CHANCE = 1.5
-#: what a further effect must explain of what the ones before it left
-FURTHER = 0.6
-#: how much an effect may raise the error of any kind of excitation
-HARM = 1.25
-#: names of a class, at most
-MOST = 3
-#: a candidate is not testable when a refit of the base swallows all but this share of it
-SWALLOWED = 1e-4
-#: passes over the range, there or back, that a test on data not fitted needs
-PASSES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +57,28 @@ class Findings:
     effects : tuple of str
         Added, in order.
     group : Class or None
-    unexplained : Unexplained
+    left : float
+        Beyond the noise, rms in % of stroke.
     """
 
     verdict: str
     share: float
     effects: tuple[str, ...]
     group: Class | None
-    unexplained: Unexplained
+    left: float
+
+    def unexplained(self, description: str) -> Unexplained:
+        """Return what is left beyond the noise."""
+        share = 1.0 - self.share if self.effects or self.left else 0.0
+        return Unexplained(share, self.left, description)
 
 
 def percent(rows: Rows, mean_square: float) -> float:
     """Return a mean square as rms in % of stroke."""
     return 100.0 * float(np.sqrt(max(mean_square, 0.0))) / rows.stroke
+
+
+# -- is it an effect? ----------------------------------------------------------------------------
 
 
 def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: bool) -> bool:
@@ -104,19 +101,29 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
     best = this.contenders[0]
     before, after = this.before.mean_square, best.fitted.mean_square
     gain, left = before - after, max(before - noise, 1e-300)
-    if percent(rows, gain) < SMALLEST or gain < LEAST_GAIN * explainable:
+    if percent(rows, gain) < criteria.SMALLEST_EFFECT or gain < criteria.LEAST_GAIN * explainable:
         return False
-    # what follows time alone fits a residual that was turned in time as well; its lines and
-    # trends have tests of their own
+    # what follows time alone fits a shifted residual as well; its lines and trends have tests
+    # of their own
     chance = 0.0 if best.effect.time_driven else this.chance.get(best.name, 0.0)
-    if gain < BEYOND_CHANCE * chance:
+    if gain < criteria.BEYOND_CHANCE * chance:
         return False
-    if gain < (ADDED if first else FURTHER) * left:
+    if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
         return False
     return not _harms(rows, this.before, best.fitted, noise)
 
 
-def smallest_taken(
+def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
+    """Return whether the error of a kind of excitation grows, where it was no trifle."""
+    kinds = np.unique(rows.group)
+    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
+    one = np.bincount(rows.group, before.errors) / counts
+    other = np.bincount(rows.group, after.errors) / counts
+    trifle = noise + (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2
+    return bool(np.any(other > criteria.HARM**2 * one + trifle))
+
+
+def smallest_detectable(
     rows: Rows,
     base: Fitted,
     fitted: Fitted,
@@ -125,44 +132,26 @@ def smallest_taken(
     noise: float,
 ) -> float | None:
     """
-    Return how much a further effect would have to explain, rms in % of stroke.
+    Return the size that a further effect must have to be taken, rms in % of stroke.
 
-    Parameters
-    ----------
-    rows : Rows
-    base, fitted : Fitted
-        Before and after everything that was added.
-    rounds, taken : sequence of Round
-        All, and those whose best contender was added.
-    noise : float
-        Mean square of the noise of a row.
-
-    Returns
-    -------
-    float or None
-        None where the range was passed so rarely that none would have been taken.
+    None where the range was passed so rarely that none is taken.  Parameters as in `judge`;
+    `rounds` are all rounds.
     """
-    if rows.passes < PASSES:
+    if rows.passes < criteria.PASSES:
         return None
     # what follows time alone fits any slow residual
     last = rounds[-1].chance
     chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
+    share = criteria.FURTHER if taken else criteria.ADDED
     least = max(
-        BEYOND_CHANCE * chance,
-        LEAST_GAIN * (base.mean_square - noise),
-        (FURTHER if taken else ADDED) * (fitted.mean_square - noise),
+        criteria.BEYOND_CHANCE * chance,
+        criteria.LEAST_GAIN * (base.mean_square - noise),
+        share * (fitted.mean_square - noise),
     )
-    return max(SMALLEST, percent(rows, least))
+    return max(criteria.SMALLEST_EFFECT, percent(rows, least))
 
 
-def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
-    """Return whether the error grows where it was no trifle."""
-    kinds = np.unique(rows.group)
-    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
-    one = np.bincount(rows.group, before.errors) / counts
-    other = np.bincount(rows.group, after.errors) / counts
-    trifle = noise + (SMALLEST * rows.stroke / 100.0) ** 2
-    return bool(np.any(other > HARM**2 * one + trifle))
+# -- which effect is it? -------------------------------------------------------------------------
 
 
 def judge(
@@ -193,35 +182,82 @@ def judge(
     """
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
-    size = percent(rows, explainable)
     if not taken:
-        rest = Unexplained(1.0 if explainable else 0.0, size, '')
-        small = size < SMALLEST
-        return Findings('none' if small else 'unexplained', 0.0, (), None, rest)
+        size = percent(rows, explainable)
+        small = size < criteria.SMALLEST_EFFECT
+        return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
-    rest = Unexplained(1.0 - share, percent(rows, left), '')
-    if share < NAMED:
+    rest = percent(rows, left)
+    if share < criteria.NAMED:
         return Findings('partly_explained', share, effects, None, rest)
     for i, this in enumerate(taken):
         contenders = (*this.contenders, *(bent.contenders[:1] if bent and i == 0 else ()))
         # what the effects after it account for is held against none of them
         rest_of = max(this.contenders[0].fitted.mean_square - fitted.mean_square, 0.0) + noise
-        size = (base if i == 0 else this.before).mean_square
-        rivals = rivals_of(rows, contenders, rest_of, size - rest_of)
+        whole = (base if i == 0 else this.before).mean_square
+        rivals = rivals_of(rows, contenders, rest_of, whole - rest_of)
         names = tuple(dict.fromkeys((effects[i], *(c.name for c in rivals))))
         untried = [name for name in look_alikes(names[0]) if name in left_out]
         if len(names) > 1 or untried:
-            group = _class((*names, *untried)[:MOST], untried)
-            return Findings('class', share, effects, group, rest)
+            names = (*names, *untried)[: criteria.CLASS_SIZE]
+            return Findings('class', share, effects, _class(names, untried), rest)
     return Findings('named', share, effects, None, rest)
 
 
-def _class(names: Sequence[str], untried: Sequence[str]) -> Class:
-    todo = f'record {experiment_for(names)}'
+def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:
+    experiment = f'record {separating_experiment(names)}'
     if untried:
-        todo = f'diagnose again with {" and ".join(untried)} among the candidates; {todo}'
-    return Class(tuple(names), todo)
+        experiment = (
+            f'diagnose again with {" and ".join(untried)} among the candidates; {experiment}'
+        )
+    return Class(names, experiment)
+
+
+def rivals_of(
+    rows: Rows, contenders: Sequence[Contender], noise: float, explainable: float
+) -> tuple[Contender, ...]:
+    """
+    Return the contenders that the data do not tell from the first one, which was added.
+
+    Parameters
+    ----------
+    rows : Rows
+    contenders : sequence of Contender
+    noise : float
+        Mean square of the noise of a row.
+    explainable : float
+        Mean square that there was to explain.
+    """
+    best, *others = contenders
+    floor = (criteria.INDISTINCT * rows.stroke / 100.0) ** 2
+    return tuple(c for c in others if _as_good(c, best, noise, explainable, floor))
+
+
+def _as_good(
+    rival: Contender, best: Contender, noise: float, explainable: float, floor: float
+) -> bool:
+    def fits(left: float) -> bool:
+        return left <= max((1.0 - criteria.LAW_FITS) * explainable, floor)
+
+    left = max(best.fitted.mean_square - noise, 0.0)
+    other = max(rival.fitted.mean_square - noise, 0.0)
+    ratio = (other + floor) / (left + floor)
+    more = len(rival.fitted.parameters) - len(best.fitted.parameters)
+    if more > 0 and (fits(left) or best.name in CONTAINS.get(rival.name, ())):
+        # nothing is left that a richer law is needed for
+        return ratio <= criteria.RICHER_AHEAD
+    if ratio <= criteria.AHEAD:
+        return True
+    if ratio > criteria.FORM_RATIO:
+        return False
+    if more < 0 and fits(other):
+        return True
+    difference = rival.fitted.errors - best.fitted.errors
+    return standard_errors(difference) < criteria.STANDARD_ERRORS
+
+
+# -- the other candidates ------------------------------------------------------------------------
 
 
 def candidates_of(
@@ -252,7 +288,7 @@ def candidates_of(
     found += [
         Candidate(name, 0.0, 'these data speak against it')
         for name, share in first.visible.items()
-        if share >= SWALLOWED and name not in possible
+        if share >= criteria.SWALLOWED and name not in possible
     ]
     return tuple(found)
 
@@ -261,46 +297,42 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
-    if not findings.effects:
-        if share < LEAST_GAIN:
-            return 'explains next to nothing'
-        if findings.verdict == 'none':
-            return f'there is only {findings.unexplained.rms_percent:.2g} % of stroke to explain'
-        said = f'explains {100.0 * share:.0f} % of what could be explained'
-        if passes < PASSES:
-            return f'{said}, of a range that was passed too rarely to test that'
-        if share < ADDED:
-            return f'{said}, too little for a cause'
-        return f'{said}, as chance might, or at the expense of another kind of excitation'
-    if share < LEAST_GAIN:
+    if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'
-    gain = last.before.mean_square
-    if name in last.best and gain > 0.0:
+    if not findings.effects:
+        if findings.verdict == 'none':
+            return f'there is only {findings.left:.2g} % of stroke to explain'
+        explains = f'explains {100.0 * share:.0f} % of what could be explained'
+        if passes < criteria.PASSES:
+            return f'{explains}, of a range that was passed too rarely to test that'
+        if share < criteria.ADDED:
+            return f'{explains}, too little for a cause'
+        return f'{explains}, as chance might, or at the expense of another kind of excitation'
+    if name in last.best and last.before.mean_square > 0.0:
         more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
-        if more < LEAST_GAIN:
+        if more < criteria.LEAST_GAIN:
             return f'{best} explains more; nothing is left for it after that'
     return f'{best} explains more'
 
 
 def untestable_of(
-    rounds: Sequence[Round], settings: DiagnosisSettings, tested: Collection[str]
+    first: Round, settings: DiagnosisSettings, tested: Collection[str]
 ) -> tuple[Untestable, ...]:
     """
     Return the candidates that these data cannot show.
 
     Parameters
     ----------
-    rounds : sequence of Round
+    first : Round
     settings : DiagnosisSettings
     tested : collection of str
         Effects that were tested otherwise, or are in the model as it was given.
     """
-    first = rounds[0]
-    found = []
-    for name in settings.effects or catalogue():
-        if name in settings.without or name in tested:
-            continue
-        effect = find_effect(name)
-        if first.visible.get(name, 0.0) < SWALLOWED:
-            found.append(Untestable(name, effect.needs or 'data in which it shows'))
-    return tuple(found)
+    names = settings.effects or tuple(catalogue())
+    return tuple(
+        Untestable(name, find_effect(name).needs or 'data in which it shows')
+        for name in names
+        if name not in settings.without
+        and name not in tested
+        and first.visible.get(name, 0.0) < criteria.SWALLOWED
+    )

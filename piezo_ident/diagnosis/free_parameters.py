@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from piezo_ident.diagnosis.simulator import State
 
-__all__ = ['RETUNING', 'Handle', 'handles_of']
+__all__ = ['RETUNING', 'FreeParameter', 'free_parameters']
 
 #: how far G may be retuned: about samples of delay, their squares, and two relaxations
 RETUNING = (20.0, 800.0, 1.0, 1.0)
-#: relative size of a finite difference in the logarithm of a parameter
+#: finite difference of the logarithm of a parameter
 LOG_STEP = 1e-2
 
 
 @dataclass(frozen=True)
-class Handle:
+class FreeParameter:
     """
     One number that the fit may move.
 
@@ -34,7 +34,6 @@ class Handle:
     step: float
     lower: float
     upper: float
-    is_amplitude: bool
 
     def get(self, state: State) -> float:
         """Return its value."""
@@ -43,8 +42,13 @@ class Handle:
         value = state.effects[self.effect].values[self.record or 0][self.name]
         return float(value if self.index is None else value[self.index])
 
-    def set(self, state: State, value: float) -> State:
-        """Return the state with another value, kept within its bounds."""
+    def moved(self, state: State, delta: float) -> State:
+        """Return the state after a step within the bounds; relative if logarithmic."""
+        value = self.get(state)
+        if self.logarithmic:
+            value *= float(np.exp(np.clip(delta, -1.0, 1.0)))
+        else:
+            value += delta
         value = float(np.clip(value, self.lower, self.upper))
         if self.effect is None:
             retuning = list(state.retuning)
@@ -56,21 +60,20 @@ class Handle:
         )
         return replace(state, effects=tuple(effects))
 
-    def moved(self, state: State, delta: float) -> State:
-        """Return the state after a step; for a logarithmic handle the step is relative."""
+    def room(self, state: State) -> tuple[float, float]:
+        """Return the largest steps down and up."""
         value = self.get(state)
         if self.logarithmic:
-            return self.set(state, value * float(np.exp(np.clip(delta, -1.0, 1.0))))
-        return self.set(state, value + delta)
+            down = max(-1.0, np.log(max(self.lower, 1e-300) / value))
+            return min(down, 0.0), max(min(1.0, np.log(self.upper / value)), 0.0)
+        return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
 
 
-def handles_of(state: State, records: int) -> tuple[Handle, ...]:
+def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
     """Return every number of G's retuning and of the effects that the fit may move."""
-    handles = [
-        Handle(
-            None, None, 'retuning', i, False, 1e-3 * RETUNING[i], -RETUNING[i], RETUNING[i], True
-        )
-        for i in range(len(state.retuning))
+    found = [
+        FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
+        for i, size in enumerate(RETUNING[: len(state.retuning)])
     ]
     for i, added in enumerate(state.effects):
         effect = added.effect
@@ -78,24 +81,15 @@ def handles_of(state: State, records: int) -> tuple[Handle, ...]:
             value = added.values[0][p.name]
             if p.scale == 'fixed' or p.kind == 'text':
                 continue
-            is_amplitude = p.step > 0.0
-            per_record = effect.time_driven and is_amplitude
+            is_log = p.scale == 'log'
+            step = LOG_STEP if is_log else (p.step or 1e-3)
+            # the amplitude of what follows time is another one in each record
+            per_record = effect.time_driven and p.step > 0.0
             for k in range(records) if per_record else (None,):
                 for index in range(np.size(value)) if p.vector else (None,):
                     number = float(value if index is None else value[index])
-                    if not np.isfinite(number) or (p.scale == 'log' and number <= 0.0):
-                        continue
-                    handles.append(
-                        Handle(
-                            effect=i,
-                            record=k,
-                            name=p.name,
-                            index=index,
-                            logarithmic=p.scale == 'log',
-                            step=LOG_STEP if p.scale == 'log' else (p.step or 1e-3),
-                            lower=p.lower,
-                            upper=p.upper,
-                            is_amplitude=is_amplitude,
+                    if np.isfinite(number) and not (is_log and number <= 0.0):
+                        found.append(
+                            FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)
                         )
-                    )
-    return tuple(handles)
+    return tuple(found)

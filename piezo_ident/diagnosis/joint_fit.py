@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The joint fit: weights of H, offsets and effects together, by free-run error (Gauss-Newton).
+The joint fit: weights of H, offsets and effects together, by free-run error.
 
-G and the delay stay: they came from records of their own, and a change in them is a candidate of
-its own.
+Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay keep their values
+but for a factor near one (`simulator.retuned`): a change of them is a candidate of its own.
 """
 
 from __future__ import annotations
@@ -15,25 +15,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.gain import gram_of, held_out_errors
-from piezo_ident.diagnosis.handles import Handle, handles_of
+from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD
+from piezo_ident.diagnosis.cross_validation import (
+    held_out_errors,
+    held_out_residual,
+    normal_equations,
+)
+from piezo_ident.diagnosis.free_parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
 __all__ = [
+    'ITERATIONS',
     'BaseColumns',
     'Fitted',
     'base_at',
     'base_thresholds',
     'fit_base',
     'fit_jointly',
+    'standard_deviations',
 ]
 
-#: how far a weight of H may be expected to move, normalised: what keeps collinear plays quiet
-WEIGHT_SPREAD = 0.1
+Array = NDArray[np.float64]
+
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
@@ -42,18 +49,18 @@ WEIGHT_STEP = 1e-3
 @dataclass(frozen=True, eq=False)
 class BaseColumns:
     """
-    What a refit of the base model can do.
+    Columns of a refit of the base model, and their products.
 
     Attributes
     ----------
     columns : ndarray, shape (n, m + 2 + records)
         Filtered plays, v^3, v and the offset of each record.
     total : ndarray, shape (m + 2 + records, m + 2 + records)
-        Their products.
+        ``columns' columns``.
     """
 
-    columns: NDArray[np.float64]
-    total: NDArray[np.float64]
+    columns: Array
+    total: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +72,14 @@ class Fitted:
     ----------
     state : State
     base : BaseColumns
-        That were used for H.
+        Used for H.
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
     J : ndarray, shape (n, p)
-        Derivatives of the prediction: weights, p1, p2, offsets, then the handles.
+        Derivatives of the prediction: weights, p1, p2, offsets, then the free parameters.
     free : ndarray of bool, shape (p,)
         Columns that are not on a bound.
-    handles : tuple of Handle
+    parameters : tuple of FreeParameter
     prior : ndarray, shape (p,)
     errors, transfer : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets and in whole kinds.
@@ -80,44 +87,32 @@ class Fitted:
 
     state: State
     base: BaseColumns
-    e: NDArray[np.float64]
-    J: NDArray[np.float64]
+    e: Array
+    J: Array
     free: NDArray[np.bool_]
-    handles: tuple[Handle, ...]
-    prior: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    transfer: NDArray[np.float64]
+    parameters: tuple[FreeParameter, ...]
+    prior: Array
+    errors: Array
+    transfer: Array
 
     @property
     def mean_square(self) -> float:
         """Mean square error of the blocks held out in spread sets, normalised."""
         return float(self.errors.sum() / self.e.size)
 
-    @property
-    def transfer_mean_square(self) -> float:
-        """Mean square error of whole kinds held out."""
-        return float(self.transfer.sum() / self.e.size)
+    def held_out_residual(self, rows: Rows) -> Array:
+        """Return the residual of every row, fitted to other blocks; shape (n,), normalised."""
+        return held_out_residual(rows, self.J[:, self.free], self.e, self.prior[self.free])
 
 
-def base_thresholds(swing: float) -> NDArray[np.float64]:
-    """Return twenty even thresholds over the swing, and four fine ones near zero."""
+def base_thresholds(swing: float) -> Array:
+    """Return nineteen even thresholds over the swing, and four fine ones near zero."""
     fine = np.array([0.005, 0.012, 0.025, 0.037])
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
-def fit_base(
-    simulator: Simulator, state: State, thresholds: NDArray[np.float64]
-) -> tuple[State, BaseColumns]:
-    """
-    Return H refitted on other thresholds by bounded least squares, and the columns used.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    state : State
-        Its effects are kept as they are.
-    thresholds : ndarray, shape (m,)
-    """
+def fit_base(simulator: Simulator, state: State, thresholds: Array) -> tuple[State, BaseColumns]:
+    """Return H refitted on other thresholds, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, thresholds.size
     columns = np.hstack([simulator.base_columns(thresholds), _offset_columns(rows)])
     base = BaseColumns(columns, columns.T @ columns)
@@ -127,21 +122,14 @@ def fit_base(
     target = rows.x - (simulator.run(state) - state.offsets[rows.of_record] - linear)
     lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
     lower[:m] = 0.0
-    normal = _Normal(base, np.empty((rows.n, 0)), target, np.zeros(columns.shape[1]))
-    theta = normal.solve(lower, upper)
+    step = _Step(base, np.empty((rows.n, 0)), target, np.zeros(columns.shape[1]))
+    theta = step.solve(lower, upper)
     new = Hysteresis(thresholds, theta[:m], float(theta[m]), float(theta[m + 1]))
     return replace(state, hysteresis=new, offsets=theta[m + 2 :]), base
 
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
-    """
-    Return what a refit of H can do in a state, its effects and a retuned G included.
-
-    Parameters
-    ----------
-    simulator : Simulator
-    state : State
-    """
+    """Return the columns of a refit of H in a state, its effects and a retuned G included."""
     h = state.hysteresis
     prediction = simulator.run(state)
     columns = []
@@ -166,7 +154,7 @@ def fit_jointly(
     tick: Callable[[], None] = lambda: None,
 ) -> Fitted:
     """
-    Fit everything that a state holds by the free-run error (Levenberg-Marquardt).
+    Fit everything that a state holds by the free-run error.
 
     Parameters
     ----------
@@ -178,68 +166,108 @@ def fit_jointly(
     iterations : int, optional
     tick : callable, optional
         Called between the steps; may raise `piezo_ident.common.errors.Cancelled`.
+
+    Raises
+    ------
+    IdentificationError
+        When the equations are singular.
+    ModelError
+        When an effect cannot run on these data.
     """
     rows = simulator.rows
-    handles = handles_of(state, len(rows.names))
+    parameters = free_parameters(state, len(rows.names))
     m = state.hysteresis.thresholds.size
-    p = base.columns.shape[1] + len(handles)
+    p = base.columns.shape[1] + len(parameters)
     damping = 1e-4
     prediction = simulator.remember(state)
     e = rows.x - prediction
-    moving = _derivatives(simulator, state, handles, prediction, tick)
+    moving = _derivatives(simulator, state, parameters, prediction, tick)
     for _ in range(iterations):
         before = float(e @ e)
-        lower, upper = _room(state, handles, p)
-        normal = _Normal(base, moving, e, _prior(rows, e, p, m))
-        found = None
+        lower, upper = _room(state, parameters, p)
+        step = _Step(base, moving, e, _prior(rows, e, p, m))
+        better = None
         for _ in range(ATTEMPTS):
             tick()
-            step = normal.solve(lower, upper, damping)
+            delta = step.solve(lower, upper, damping)
             try:
-                trial = _moved(state, handles, step)
+                trial = _moved(state, parameters, delta)
                 left = rows.x - simulator.run(trial)
             except ModelError:
                 damping *= 10.0
                 continue
             after = float(left @ left)
             if np.isfinite(after) and after < before:
-                found = trial
+                better = trial
                 break
             damping *= 10.0
-        if found is None:
+        if better is None:
             break
         damping = max(damping / 10.0, 1e-8)
-        state = found
+        state = better
         prediction = simulator.remember(state)
         e = rows.x - prediction
-        moving = _derivatives(simulator, state, handles, prediction, tick)
+        moving = _derivatives(simulator, state, parameters, prediction, tick)
         if after > (1.0 - TOLERANCE) * before:
             break
-    lower, upper = _room(state, handles, p)
+    lower, upper = _room(state, parameters, p)
     J = np.hstack([base.columns, moving])
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
     prior = _prior(rows, e, p, m)
-    gram = gram_of(rows, J[:, free], e)
+    equations = normal_equations(rows, J[:, free], e)
     return Fitted(
         state=state,
         base=base,
         e=e,
         J=J,
         free=free,
-        handles=handles,
+        parameters=parameters,
         prior=prior,
-        errors=held_out_errors(gram, rows.fold, prior[free]),
-        transfer=held_out_errors(gram, rows.group, prior[free]),
+        errors=held_out_errors(equations, rows.fold, prior[free]),
+        transfer=held_out_errors(equations, rows.group, prior[free]),
     )
 
 
-def _offset_columns(rows: Rows) -> NDArray[np.float64]:
+def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, str, int], float]:
+    """
+    Return the standard deviations of the free parameters, in the record that has most rows.
+
+    The sandwich estimator over blocks: the gradient of a block is one observation, since
+    neighbouring residuals are alike.  Keys are the effect's place, the parameter's name, and the
+    place in a vector (0 for a number).
+    """
+    M = fitted.J[:, fitted.free]
+    size = np.linalg.norm(M, axis=0)
+    A = M.T @ M / np.outer(size, size)
+    A[np.diag_indices_from(A)] += 1e-10
+    gradients = np.stack(
+        [
+            M[start:stop].T @ fitted.e[start:stop] / size
+            for start, stop in zip(rows.edges[:-1], rows.edges[1:], strict=True)
+        ]
+    )
+    inverse = np.linalg.pinv(A, hermitian=True)
+    covariance = inverse @ (gradients.T @ gradients) @ inverse
+    deviation = np.full(fitted.free.size, np.nan)
+    deviation[fitted.free] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
+    first = fitted.J.shape[1] - len(fitted.parameters)
+    known = {}
+    for j, parameter in enumerate(fitted.parameters, start=first):
+        if np.isfinite(deviation[j]) and parameter.record in (None, rows.longest):
+            # of a logarithm, so relative
+            factor = abs(parameter.get(fitted.state)) if parameter.logarithmic else 1.0
+            key = (parameter.effect, parameter.name, parameter.index or 0)
+            known[key] = float(deviation[j]) * factor
+    return known
+
+
+def _offset_columns(rows: Rows) -> Array:
     of = rows.of_record[:, None] == np.arange(len(rows.names))
     return np.asarray(of, dtype=np.float64)
 
 
-def _prior(rows: Rows, e: NDArray[np.float64], p: int, m: int) -> NDArray[np.float64]:
+def _prior(rows: Rows, e: Array, p: int, m: int) -> Array:
     prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
@@ -250,21 +278,21 @@ def _prior(rows: Rows, e: NDArray[np.float64], p: int, m: int) -> NDArray[np.flo
 def _derivatives(
     simulator: Simulator,
     state: State,
-    handles: tuple[Handle, ...],
-    prediction: NDArray[np.float64],
+    parameters: tuple[FreeParameter, ...],
+    prediction: Array,
     tick: Callable[[], None],
-) -> NDArray[np.float64]:
-    columns = np.zeros((prediction.size, len(handles)))
-    for j, handle in enumerate(handles):
+) -> Array:
+    columns = np.zeros((prediction.size, len(parameters)))
+    for j, parameter in enumerate(parameters):
         tick()
-        value = handle.get(state)
-        step = handle.step
-        top = handle.upper / value if handle.logarithmic else handle.upper - value
-        if (handle.logarithmic and top < np.exp(step)) or (not handle.logarithmic and top < step):
+        value, step = parameter.get(state), parameter.step
+        top = parameter.upper / value if parameter.logarithmic else parameter.upper - value
+        if top < (np.exp(step) if parameter.logarithmic else step):
             step = -step
         try:
-            moved = handle.moved(state, step)
-            effect = None if handle.effect is None else state.effects[handle.effect].effect
+            moved = parameter.moved(state, step)
+            place = parameter.effect
+            effect = None if place is None else state.effects[place].effect
             columns[:, j] = (simulator.varied(moved, effect) - prediction) / step
         except ModelError:
             # a bound that depends on other parameters: this one stays
@@ -272,23 +300,16 @@ def _derivatives(
     return columns
 
 
-def _room(
-    state: State, handles: tuple[Handle, ...], p: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[Array, Array]:
     lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
     m = state.hysteresis.thresholds.size
-    lower[:m] = -state.hysteresis.weights
-    for j, handle in enumerate(handles, start=p - len(handles)):
-        value = handle.get(state)
-        if handle.logarithmic:
-            lower[j] = max(-1.0, np.log(max(handle.lower, 1e-300) / value))
-            upper[j] = min(1.0, np.log(handle.upper / value))
-        else:
-            lower[j], upper[j] = handle.lower - value, handle.upper - value
-    return np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    lower[:m] = np.minimum(-state.hysteresis.weights, 0.0)
+    for j, parameter in enumerate(parameters, start=p - len(parameters)):
+        lower[j], upper[j] = parameter.room(state)
+    return lower, upper
 
 
-def _moved(state: State, handles: tuple[Handle, ...], step: NDArray[np.float64]) -> State:
+def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> State:
     h = state.hysteresis
     m, k = h.thresholds.size, state.offsets.size
     new = replace(
@@ -301,21 +322,15 @@ def _moved(state: State, handles: tuple[Handle, ...], step: NDArray[np.float64])
         ),
         offsets=state.offsets + step[m + 2 : m + 2 + k],
     )
-    for handle, delta in zip(handles, step[m + 2 + k :], strict=True):
-        new = handle.moved(new, float(delta))
+    for parameter, delta in zip(parameters, step[m + 2 + k :], strict=True):
+        new = parameter.moved(new, float(delta))
     return new
 
 
-class _Normal:
+class _Step:
     """Normal equations of a step, scaled to columns of length one."""
 
-    def __init__(
-        self,
-        base: BaseColumns,
-        moving: NDArray[np.float64],
-        e: NDArray[np.float64],
-        prior: NDArray[np.float64],
-    ) -> None:
+    def __init__(self, base: BaseColumns, moving: Array, e: Array, prior: Array) -> None:
         mixed = base.columns.T @ moving
         A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
         size = np.sqrt(np.diag(A))
@@ -326,17 +341,21 @@ class _Normal:
         self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
         self._b = np.concatenate([base.columns.T @ e, moving.T @ e]) / self._size
 
-    def solve(
-        self, lower: NDArray[np.float64], upper: NDArray[np.float64], damping: float = 0.0
-    ) -> NDArray[np.float64]:
+    def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Return the bounded step; damping is a share of each column's own energy."""
         A = self._A.copy()
         A[np.diag_indices_from(A)] += damping
         wide = upper > lower
-        L = np.linalg.cholesky(A)
-        # what stays where it is adds nothing to the right-hand side
-        target = np.linalg.solve(L, self._b)
         x = np.zeros(self._size.size)
         bounds = ((lower * self._size)[wide], (upper * self._size)[wide])
-        x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        try:
+            L = np.linalg.cholesky(A)
+            # what stays where it is adds nothing to the right-hand side
+            target = np.linalg.solve(L, self._b)
+            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise IdentificationError(
+                f'the joint fit is singular ({error}): its parameters do not follow from these '
+                'data; are all values of a plausible size?'
+            ) from None
         return np.clip(x / self._size, lower, upper)

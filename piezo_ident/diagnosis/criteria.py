@@ -1,0 +1,83 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The constants that decide a verdict, and where each comes from.
+
+Physics: it follows from how stages, sensors and the candidates' laws behave.
+Statistics: it follows from a test or from how well a quantity can be estimated.
+Taste: another choice would be defensible; these were chosen on the study of simulated stages
+(``docs/diagnosis_study.md``), for few wrong names.
+
+Shares are of the explainable mean square (what the refitted base model leaves beyond the noise),
+sizes are rms in % of stroke.
+"""
+
+from __future__ import annotations
+
+# -- physics -------------------------------------------------------------------------------------
+
+#: size below which no effect is named: real laws differ from textbook ones by about as much
+SMALLEST_EFFECT = 0.05
+#: size of a difference that means nothing: no weights of H describe a stage to better than that
+INDISTINCT = 0.01
+#: share from which a law fits; real effects deviate from their law by a little
+LAW_FITS = 0.99
+#: ratio of what is left by which a law that fits rules out a simpler one that fits, too: further
+#: parameters make up for deviations of the form
+FORM_RATIO = 4.0
+#: range of the amplitude that an effect which is either on or off gets in a fit; 1 is exact
+ON_AMPLITUDE = (0.2, 3.0)
+#: expected deviation of a weight of H from zero, normalised: prior that keeps collinear plays small
+WEIGHT_SPREAD = 0.1
+#: share of the model's voltage range that data must cover for a refitted H to hold in all of it
+COVERED = 0.95
+#: share of the voltage range below which the command is at rest but for noise
+TREMBLES = 0.01
+
+# -- statistics ----------------------------------------------------------------------------------
+
+#: passes over the voltage range that held-out data need: a branch passed once has no second half
+PASSES = 3.0
+#: ratio of a gain to the largest gain on circular-shift surrogates that makes it significant, and
+#: the number of surrogates: their largest is exceeded by chance in 1 of 17 cases, the factor
+#: allows for the many candidates
+BEYOND_CHANCE, SURROGATES = 1.5, 16
+#: standard errors over held-out blocks from which a difference is one (95 % of a normal variable)
+STANDARD_ERRORS = 2.0
+#: share of a candidate's columns outside the span of the base below which it is not testable:
+#: its amplitude is then known a hundred times less well
+SWALLOWED = 1e-4
+#: share of the variance beyond which the displacement does not follow the voltage
+UNRELATED = 0.99
+#: share of samples with a fault up to which they are left out; beyond it little else is there
+FAULTY = 0.02
+
+# -- taste ---------------------------------------------------------------------------------------
+
+#: share that an effect, or several, must explain to be named, and to be added at all
+NAMED, ADDED = 0.92, 0.5
+#: share of what earlier effects left that a further one must explain
+FURTHER = 0.6
+#: least gain of an effect, share
+LEAST_GAIN = 0.10
+#: factor by which an effect may raise the rms of any kind of excitation
+HARM = 1.25
+#: a rival that leaves less than this times what the best leaves is not told from it
+AHEAD = 1.6
+#: a rival with more parameters must leave less than this times what a law that fits leaves
+RICHER_AHEAD = 0.95
+#: an effect with fewer parameters goes first if it leaves at most this times what the best leaves
+SIMPLER = 1.3
+#: most names of a class
+CLASS_SIZE = 3
+#: share from which a linear change is a finding of its own, not a side effect on G
+LINEAR = 0.5
+#: share of what a linear change leaves that a bent G and another effect must not exceed
+BENT = 0.25
+#: share that a candidate must gain to be fitted jointly, and the most candidates of a round
+WORTH_FIT, JOINT_FITS = 0.05, 4
+#: factor by which a refit of H may raise the rms of a kind of excitation that was held out
+REFIT_HARM = 1.05
+#: gain in rms from which a refit of H alone is kept, and the same if structure is unexplained
+WORTH_REFIT, WORTH_REFIT_IN_DOUBT = 0.05, 0.5

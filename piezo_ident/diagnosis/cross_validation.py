@@ -1,0 +1,266 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Cross-validation of a linear model over blocks, from its normal equations.
+
+With ``A_k = M_k' M_k``, ``b_k = M_k' e_k`` and ``s_k = e_k' e_k`` of every block k, a set of
+blocks is left out by a subtraction, and its error needs no sample again:
+
+    theta = (sum_train A + D)^-1 sum_train b,     E_k = s_k - 2 b_k' theta + theta' A_k theta.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.criteria import INDISTINCT, REFIT_HARM, STANDARD_ERRORS
+from piezo_ident.diagnosis.rows import centred, Rows
+
+__all__ = [
+    'NormalEquations',
+    'block_products',
+    'held_out_errors',
+    'held_out_residual',
+    'held_out_sums',
+    'normal_equations',
+    'refit_holds',
+    'solve',
+    'standard_errors',
+    'with_columns',
+]
+
+Array = NDArray[np.float64]
+
+#: share of a column's own energy that is added to the diagonal: keeps collinear columns small
+RIDGE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """
+    Normal equations of columns M and a residual e, block by block.
+
+    Attributes
+    ----------
+    A : ndarray, shape (blocks, p, p)
+    b : ndarray, shape (blocks, p)
+    s : ndarray, shape (blocks,)
+    """
+
+    A: Array
+    b: Array
+    s: Array
+
+
+def block_products(rows: Rows, M: Array, N: Array) -> Array:
+    """Return ``M_k' N_k`` of every block; shape (blocks, p, q)."""
+    edges = rows.edges
+    out = np.empty((edges.size - 1, M.shape[1], N.shape[1]))
+    for k, (start, stop) in enumerate(itertools.pairwise(edges)):
+        out[k] = M[start:stop].T @ N[start:stop]
+    return out
+
+
+def normal_equations(rows: Rows, M: Array, e: Array) -> NormalEquations:
+    """Return the normal equations of columns M, shape (n, p), and a residual e, shape (n,)."""
+    column = e[:, None]
+    return NormalEquations(
+        A=block_products(rows, M, M),
+        b=block_products(rows, M, column)[:, :, 0],
+        s=block_products(rows, column, column)[:, 0, 0],
+    )
+
+
+def with_columns(
+    rows: Rows, equations: NormalEquations, M: Array, C: Array, e: Array
+) -> NormalEquations:
+    """Return the normal equations of ``[M C]`` from those of M."""
+    right = block_products(rows, M, C)
+    lower = block_products(rows, C, np.column_stack([C, e]))
+    c = C.shape[1]
+    A = np.concatenate(
+        [
+            np.concatenate([equations.A, right], axis=2),
+            np.concatenate([right.transpose(0, 2, 1), lower[:, :, :c]], axis=2),
+        ],
+        axis=1,
+    )
+    return NormalEquations(
+        A, np.concatenate([equations.b, lower[:, :, c]], axis=1), equations.s
+    )
+
+
+def solve(A: Array, b: Array, prior: Array) -> Array:
+    """
+    Return the coefficients of a ridge regression.
+
+    Parameters
+    ----------
+    A : ndarray, shape (p, p)
+    b : ndarray, shape (p,) or (p, k)
+    prior : ndarray, shape (p,)
+        Added to the diagonal, besides `RIDGE` of the column's own energy.
+
+    Raises
+    ------
+    IdentificationError
+        When the equations are singular.
+    """
+    size = np.sqrt(np.diag(A))
+    size = np.where(size > 0.0, size, 1.0)
+    scaled = A / np.outer(size, size)
+    scaled[np.diag_indices_from(scaled)] += RIDGE + prior / size**2
+    # columns without any energy stay out
+    scaled[np.diag_indices_from(scaled)] += np.where(np.diag(A) > 0.0, 0.0, 1.0)
+    right = b.T / size
+    try:
+        return np.asarray((np.linalg.solve(scaled, right.T).T / size).T)
+    except np.linalg.LinAlgError:
+        raise IdentificationError(
+            'the equations of the joint fit are singular: its parameters do not follow from '
+            'these data; give a longer record, or fewer candidates'
+        ) from None
+
+
+def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: Array) -> Array:
+    """
+    Return the sum of squares of every block, each predicted from the blocks of other sets.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+    sets : ndarray of int, shape (blocks,)
+        Blocks of one set are left out together.
+    prior : ndarray, shape (p,)
+        As in `solve`.
+
+    Returns
+    -------
+    ndarray, shape (blocks,)
+    """
+    A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+    errors = np.empty(equations.s.size)
+    for one in np.unique(sets):
+        out = sets == one
+        here = equations.A[out]
+        theta = np.zeros(b.size)
+        if not out.all():
+            theta = solve(A - here.sum(axis=0), b - equations.b[out].sum(axis=0), prior)
+        errors[out] = (
+            equations.s[out] - 2.0 * equations.b[out] @ theta + (here @ theta) @ theta
+        )
+    return np.maximum(errors, 0.0)
+
+
+def held_out_sums(
+    A: Array, b: Array, s: Array, sets: NDArray[np.int64], prior: Array
+) -> Array:
+    """
+    Return the sum of the held-out squares of many residuals at once.
+
+    Parameters
+    ----------
+    A : ndarray, shape (blocks, p, p)
+    b : ndarray, shape (blocks, p, k)
+        Products of the columns with k residuals.
+    s : ndarray, shape (k,)
+        Their sums of squares.
+    sets, prior
+        As in `held_out_errors`.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+    """
+    total_A, total_b = A.sum(axis=0), b.sum(axis=0)
+    errors = s.copy()
+    for one in np.unique(sets):
+        out = sets == one
+        if out.all():
+            continue
+        A_out, b_out = A[out].sum(axis=0), b[out].sum(axis=0)
+        theta = solve(total_A - A_out, total_b - b_out, prior)
+        errors += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=0)
+    return np.asarray(errors)
+
+
+def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
+    """
+    Return the residual of every row, predicted with parameters fitted to other blocks.
+
+    Near the optimum the model is linear in its parameters, so leaving a set of blocks out moves
+    them by one Gauss-Newton step.
+
+    Parameters
+    ----------
+    rows : Rows
+    M : ndarray, shape (n, p)
+        Derivatives of the prediction.
+    e : ndarray, shape (n,)
+        Residual of the fit to all rows.
+    prior : ndarray, shape (p,)
+    """
+    equations = normal_equations(rows, M, e)
+    A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+    left = e.copy()
+    for one in np.unique(rows.fold):
+        out = rows.fold == one
+        if out.all():
+            continue
+        theta = solve(
+            A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior
+        )
+        here = out[rows.block]
+        left[here] -= M[here] @ theta
+    return left
+
+
+def standard_errors(difference: Array) -> float:
+    """
+    Return a sum over blocks, shape (blocks,), in units of its standard error.
+
+    Blocks count as independent.  Errors of two models on the same blocks are compared block by
+    block, so what makes a block hard for both cancels.
+
+    Examples
+    --------
+    >>> round(standard_errors(np.array([3.0, 1.0, 2.0, 2.0])), 2)
+    4.9
+    """
+    total = float(difference.sum())
+    if total == 0.0 or difference.size < 2:
+        return 0.0
+    deviation = float(np.sqrt(difference.size * difference.var(ddof=1)))
+    return total / deviation if deviation > 0.0 else float(np.copysign(np.inf, total))
+
+
+def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
+    """
+    Return whether a refit of H predicts held-out kinds of excitation better than the given model.
+
+    A drift, or steps of the converter, lower the error of a refit on blocks between those that
+    were fitted; a kind of excitation that was left out as a whole shows whether H is better.  An
+    offset of each record is no merit of the refit.
+
+    Parameters
+    ----------
+    rows : Rows
+    given : ndarray, shape (n,)
+        Residual of the model as given, normalised.
+    transfer : ndarray, shape (blocks,)
+        Sums of squares of the refit, whole kinds held out.
+    """
+    squares = centred(given, rows.of_record) ** 2
+    before = np.bincount(rows.block, squares, minlength=rows.group.size)
+    if standard_errors(before - transfer) < STANDARD_ERRORS:
+        return False
+    size = np.bincount(rows.group[rows.block], minlength=len(rows.labels))
+    one = np.bincount(rows.group, before, len(rows.labels))
+    other = np.bincount(rows.group, transfer, len(rows.labels))
+    indistinct = size * (INDISTINCT * rows.stroke / 100.0) ** 2
+    return bool(np.all(other <= REFIT_HARM**2 * one + indistinct))

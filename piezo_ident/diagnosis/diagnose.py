@@ -1,0 +1,436 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+From a model and measured data to the effect that the model lacks.
+
+1. Faults of the data are found and left out.
+2. The base model is refitted by free-run error, so that no effect is blamed for a weight of H.
+3. The lines and the noise floor of what is left give what there is to explain.
+4. Effects are added one after another as long as data that were not fitted gain (`search`).
+5. The verdict is given (`verdict`), and the model is refined by what holds (`refined_model`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.errors import errors_of, row_noise
+from piezo_ident.diagnosis.free_parameters import RETUNING
+from piezo_ident.diagnosis.joint_fit import (
+    base_thresholds,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    standard_deviations,
+)
+from piezo_ident.diagnosis.messages import left_over, part_searched, sentence, warnings_of
+from piezo_ident.diagnosis.refined_model import refine, Refined
+from piezo_ident.diagnosis.results import (
+    Diagnosis,
+    DiagnosisSettings,
+    FoundEffect,
+    FoundParameter,
+    Residual,
+)
+from piezo_ident.diagnosis.rows import centred, make_rows, Rows
+from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.verdict import (
+    candidates_of,
+    Findings,
+    judge,
+    percent,
+    smallest_detectable,
+    takes,
+    untestable_of,
+)
+from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.identification.prepare import same_rate
+from piezo_ident.identification.results import Progress, silent
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+from piezo_ident.residual.faults import find_faults
+from piezo_ident.residual.lines import find_lines, without_lines
+from piezo_ident.residual.noise_floor import residual_noise_floor
+from piezo_ident.residual.stretches import ResidualPart, stretches_of
+
+__all__ = ['diagnose']
+
+#: effect that is looked for by its lines
+HUM = 'periodic_disturbance'
+
+
+def diagnose(
+    model: StageModel,
+    records: Sequence[Record] | Record,
+    settings: DiagnosisSettings | None = None,
+    *,
+    progress: Progress = silent,
+) -> Diagnosis:
+    """
+    Find what a model lacks, add it, and say how sure that is.
+
+    Parameters
+    ----------
+    model : StageModel
+        From `identify`; it may hold effects already.
+    records : Record, or sequence of Record
+        Measured data that the model was not identified from, of its sampling rate.  Of more than
+        ``settings.most_samples`` the beginnings of the records are searched and fitted, and a
+        warning says how much that is.
+    settings : DiagnosisSettings, optional
+    progress : callable, optional
+        Called with the name of the step and the share done; may raise `Cancelled`.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    IdentificationError
+        When the records carry nothing to judge, the displacement does not follow the voltage, or
+        the joint fit is singular.
+
+    Examples
+    --------
+    A stage that creeps, and a model that does not know it:
+
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> from piezo_ident.model.stage_model import EffectSetting, Scaling
+    >>> from piezo_ident.operators.dynamics import Delay, Dynamics
+    >>> from piezo_ident.operators.hysteresis import Hysteresis
+    >>> model = pi.StageModel(
+    ...     sample_rate=2000.0,
+    ...     scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
+    ...     hysteresis=Hysteresis(np.array([0.2, 0.5]), np.array([0.3, 0.2]), -0.2, 0.9),
+    ...     dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
+    ...     delay=Delay(2),
+    ... )
+    >>> creep = EffectSetting('creep', {'gain': [0.02], 'time_constant': [0.5]})
+    >>> stage = pi.SimulatedStage(replace(model, effects=(creep,)))
+    >>> v = 5.0 + 5.0 * np.sin(np.arange(8000) * 2.0 * np.pi / 2000.0 - np.pi / 2.0)
+    """
+    settings = settings or DiagnosisSettings()
+    records = [records] if isinstance(records, Record) else list(records)
+    part = _beginnings(model, records, settings.most_samples)
+    is_whole = part == records
+    try:
+        result = _diagnosed(model, part, settings, progress)
+    except IdentificationError as error:
+        if is_whole:
+            raise
+        raise IdentificationError(f'{error} ({part_searched(records, part)})') from None
+    warnings = [warning for record in records for warning in model.extrapolation(record)]
+    if not is_whole:
+        warnings.append(part_searched(records, part))
+    return replace(result, warnings=(*result.warnings, *warnings))
+
+
+def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list[Record]:
+    """
+    Return the beginnings of records, in proportion to their lengths, `most` samples together.
+
+    A search holds about 500 bytes a sample.  Creep and hysteresis come out of what was before,
+    and only a beginning has nothing before it.
+    """
+    usable = [
+        (record, [p for p in record if same_rate(p.sample_rate, model.sample_rate)])
+        for record in records
+    ]
+    total = sum(p.n for _, pieces in usable for p in pieces)
+    if total <= most:
+        return list(records)
+    part = []
+    for record, pieces in usable:
+        left = max(1, sum(p.n for p in pieces) * most // total)
+        begun = []
+        for piece in pieces:
+            if left > 0:
+                begun.append(piece if piece.n <= left else piece.cut(0, left))
+                left -= begun[-1].n
+        if begun:
+            part.append(Record(tuple(begun), record.name, record.faults))
+    return part
+
+
+def _diagnosed(
+    model: StageModel,
+    records: Sequence[Record],
+    settings: DiagnosisSettings,
+    progress: Progress,
+) -> Diagnosis:
+    progress('residual', 0.0)
+    rows = make_rows(model, records)
+    given = State(model.hysteresis, np.zeros(len(rows.names)))
+    faults = find_faults(_parts(Simulator(model, rows), given))
+    few = [bad if bad.mean() < criteria.FAULTY else None for bad in faults.bad]
+    if any(bad is not None and bad.any() for bad in few):
+        rows = make_rows(model, records, few)
+    simulator = Simulator(model, rows)
+    progress('residual', 0.5)
+    base = _base(simulator, given)
+    _check_related(rows, base)
+    parts = _parts(simulator, base.state)
+    found = find_lines(parts, [s for i, part in enumerate(parts) for s in stretches_of(part, i)])
+    # hum is no noise: it can be explained
+    resting = _parts(simulator, base.state, whole=True)
+    rests = [s for i, part in enumerate(resting) for s in stretches_of(part, i)]
+    floor = residual_noise_floor([without_lines(part, found.lines) for part in resting], rests)
+    span = abs(model.scaling.Y)
+    noise = row_noise(floor, faults, rows.m, span)
+    progress('residual', 1.0)
+    search = _Search(simulator, [line.frequency for line in found.lines], noise, settings, progress)
+    rounds, taken, fitted = search.run(base)
+    if not taken:
+        fitted = base
+    findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
+    progress('verdict', 0.0)
+    rms = None if not floor.known else max(floor.rms or 0.0, faults.quantum / np.sqrt(12.0))
+    # what single samples have more of noise than rows
+    lost = 0.0 if rms is None else max((rms / span) ** 2 - noise, 0.0)
+    before, refit, after = (
+        errors_of(rows, e, lost)
+        for e in (
+            rows.x - simulator.run(given),
+            base.held_out_residual(rows),
+            fitted.held_out_residual(rows),
+        )
+    )
+    refined = refine(simulator, given, base, fitted, findings, before, refit)
+    if refined.is_given:
+        after = before
+    smallest = smallest_detectable(rows, base, fitted, rounds, taken, noise)
+    rest = findings.unexplained(left_over(findings, smallest, rows.passes))
+    explainable = max(base.mean_square - noise, 1e-300)
+    bent = (base.mean_square - rounds[0].before.mean_square) / explainable
+    tested = {setting.name for setting in model.effects}
+    if found.highest > 0.0:
+        # where no line stands out there is nothing to fit
+        tested.add(HUM)
+    progress('verdict', 1.0)
+    return Diagnosis(
+        verdict=findings.verdict,
+        sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
+        given=model,
+        model=refined.model,
+        effects=_effects(rows, base, fitted, taken, findings, explainable),
+        group=findings.group,
+        unexplained=rest,
+        candidates=candidates_of(rows, rounds, findings, noise),
+        before=before,
+        refit=refit,
+        after=after,
+        noise_floor=None if rms is None else 100.0 * rms / (rows.stroke * span),
+        noise_source=floor.source,
+        smallest_detectable=smallest,
+        untestable=untestable_of(rounds[0], settings, tested),
+        faults=faults.faults,
+        residuals=_residuals(simulator, given, base, refined),
+        records=rows.names,
+        blocks=int(rows.fold.size),
+        warnings=(
+            *warnings_of(model, refined, findings, floor, bent),
+            *(warning for one in rounds for warning in one.warnings),
+        ),
+        settings=settings,
+    )
+
+
+def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
+    """Return the residual of each run [m]; `whole` with what the unknown start still touches."""
+    Y = simulator.model.scaling.Y
+    return [
+        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.sound if whole else run.known)
+        for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
+    ]
+
+
+def _base(simulator: Simulator, given: State) -> Fitted:
+    """Return the base model refitted on a fine grid of thresholds."""
+    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
+    if swing == 0.0:
+        raise IdentificationError('the voltage never moves; record the stage while it is driven')
+    state, columns = fit_base(simulator, given, base_thresholds(swing))
+    return fit_jointly(simulator, state, columns)
+
+
+def _check_related(rows: Rows, base: Fitted) -> None:
+    """Refuse displacement that does not follow the voltage: no effect is missing, the stage is."""
+    swing = max(float(np.ptp(run.u)) for run in rows.runs)
+    moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
+    # where the voltage only trembles all else may well be larger
+    if swing > criteria.TREMBLES and base.mean_square > criteria.UNRELATED * moved:
+        raise IdentificationError(
+            f'{", ".join(rows.names)}: the displacement does not follow the voltage: a hysteresis '
+            'accounts for only '
+            f'{max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it was '
+            'not fitted to; is the sensor connected, and do both columns come from one stage?'
+        )
+
+
+class _Search:
+    """Forward selection: effects are added as long as held-out data gain."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        lines: Sequence[float],
+        noise: float,
+        settings: DiagnosisSettings,
+        progress: Progress,
+    ) -> None:
+        self._simulator = simulator
+        self._lines = lines
+        self._noise = noise
+        self._most = settings.most_effects
+        self._progress = progress
+        self._rng = np.random.default_rng(settings.seed)
+        names = settings.effects or tuple(catalogue())
+        self._candidates = [find_effect(name) for name in names if name not in settings.without]
+        self._have = {setting.name for setting in simulator.model.effects}
+        tried = self._have | {effect.name for effect in self._candidates}
+        #: effects that nobody can find, since they are not tried
+        self.left_out = frozenset(catalogue()) - tried
+        #: what an effect that bent G would leave, where a linear change was preferred
+        self.bent: Round | None = None
+        self._count = 0
+
+    def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:
+        """Return all rounds, those whose best contender was added, and the fit at the end."""
+        state = replace(base.state, retuning=(0.0,) * len(RETUNING))
+        retuned = fit_jointly(self._simulator, state, base.base)
+        explainable = max(base.mean_square - self._noise, 1e-300)
+        if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
+            return self._from(retuned, self._round(retuned))
+        # a linear change is the larger part: is it the whole of it?
+        linear, bent = self._round(base), None
+        if self._left(linear) > self._least:
+            bent = self._round(retuned)
+        if bent is not None and self._takes(bent, self._beyond_noise(bent.before), first=True):
+            if self._left(bent) < criteria.BENT * self._left(linear):
+                return self._from(retuned, bent)
+            self.bent = bent
+        return self._from(base, linear)
+
+    def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
+        rows = self._simulator.rows
+        return rows.passes >= criteria.PASSES and takes(
+            rows, this, self._noise, explainable, first=first
+        )
+
+    @property
+    def _least(self) -> float:
+        """Mean square of the smallest effect."""
+        return (criteria.SMALLEST_EFFECT * self._simulator.rows.stroke / 100.0) ** 2
+
+    def _beyond_noise(self, fitted: Fitted) -> float:
+        return max(fitted.mean_square - self._noise, 0.0)
+
+    def _left(self, this: Round) -> float:
+        return self._beyond_noise(this.contenders[0].fitted if this.contenders else this.before)
+
+    def _round(self, fitted: Fitted) -> Round:
+        have = self._have | {added.name for added in fitted.state.effects}
+        candidates = [effect for effect in self._candidates if effect.name not in have]
+        done = self._count
+        self._count += 1
+
+        def tick(share: float) -> None:
+            # most searches end after two or three rounds: the bar nears its end ever slower
+            self._progress('candidates', 1.0 - 0.4 ** (done + share))
+
+        return search_round(
+            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
+        )
+
+    def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
+        fitted, this = start, first
+        rounds, taken = [first], list[Round]()
+        explainable = self._beyond_noise(start)
+        while self._takes(this, explainable, first=not taken):
+            taken.append(this)
+            fitted, dropped = drop_needless(
+                self._simulator, this.contenders[0].fitted, self._least
+            )
+            for i in dropped:
+                del taken[i]
+            if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
+                break
+            this = self._round(fitted)
+            rounds.append(this)
+        if len(fitted.state.effects) > 1:
+            fitted = polished(
+                self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
+            )
+        self._progress('candidates', 1.0)
+        return rounds, taken, fitted
+
+
+# -- the result ----------------------------------------------------------------------------------
+
+
+def _residuals(
+    simulator: Simulator, given: State, base: Fitted, refined: Refined
+) -> tuple[Residual, ...]:
+    Y = simulator.model.scaling.Y
+    full = zip(*(simulator.full(s) for s in (given, base.state, refined.state)), strict=True)
+    return tuple(
+        Residual(run.record, run.piece, *((run.x - x) * Y for x in three), sound=run.known)
+        for run, three in zip(simulator.rows.runs, full, strict=True)
+    )
+
+
+def _effects(
+    rows: Rows,
+    base: Fitted,
+    fitted: Fitted,
+    taken: Sequence[Round],
+    findings: Findings,
+    explainable: float,
+) -> tuple[FoundEffect, ...]:
+    """Return the effects that were added, with parameters as in the record with most rows."""
+    if not findings.effects:
+        return ()
+    std = standard_deviations(rows, fitted)
+    steps = [this.contenders[0].fitted.mean_square for this in taken[:-1]]
+    levels = [base.mean_square, *steps, fitted.mean_square]
+    found = []
+    for i, name in enumerate(findings.effects):
+        gain = max(levels[i] - levels[i + 1], 0.0)
+        added = fitted.state.effects[i]
+        parameters = {}
+        for p in added.effect.parameters:
+            value = added.values[rows.longest][p.name]
+            keys = [(i, p.name, k) for k in range(np.size(value) if p.vector else 1)]
+            spread = tuple(std.get(key, 0.0) for key in keys)
+            known = any(key in std for key in keys)
+            parameters[p.name] = FoundParameter(
+                value=_plain(value),
+                unit=p.unit,
+                std=None if not known else spread if p.vector else spread[0],
+            )
+        found.append(
+            FoundEffect(
+                name=name,
+                slot=added.effect.slot,
+                share=float(np.clip(gain / explainable, 0.0, 1.0)),
+                rms_percent=percent(rows, gain),
+                parameters=parameters,
+            )
+        )
+    return tuple(found)
+
+
+def _plain(value: object) -> float | str | tuple[float, ...]:
+    if isinstance(value, str):
+        return value
+    array = np.asarray(value, dtype=np.float64)
+    return tuple(float(x) for x in array) if array.ndim else float(array)

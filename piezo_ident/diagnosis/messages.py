@@ -1,0 +1,156 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The sentence of a diagnosis and its warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from piezo_ident.diagnosis.criteria import WORTH_REFIT_IN_DOUBT
+from piezo_ident.diagnosis.refined_model import lasting, Refined
+from piezo_ident.diagnosis.results import Class, Errors, Unexplained
+from piezo_ident.diagnosis.simulator import Added, State
+from piezo_ident.diagnosis.verdict import Findings
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+from piezo_ident.residual.noise_floor import NoiseFloor
+
+__all__ = ['left_over', 'part_searched', 'sentence', 'warnings_of']
+
+#: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
+TUNED = 0.05
+
+
+def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
+    """Return what the unexplained rest is."""
+    if smallest is None:
+        return (
+            f'the voltage passes its range {passes:.1f} times, so nothing that is fitted could be '
+            'tested; drive the range back and forth twice or more'
+        )
+    if findings.left < smallest:
+        return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
+    if not findings.effects:
+        return 'structure that no candidate of the catalogue accounts for'
+    return 'structure that the effects added do not account for'
+
+
+def part_searched(records: Sequence[Record], part: Sequence[Record]) -> str:
+    """Return how much of the records was searched."""
+    n, of = (sum(r.n for r in some) for some in (part, records))
+    seconds, whole = (sum(r.duration for r in some) for some in (part, records))
+    return (
+        f'{n:,} of {of:,} samples were searched and fitted, the first {seconds:.4g} s of '
+        f'{whole:.4g} s (--most-samples)'
+    )
+
+
+def warnings_of(
+    given: StageModel, refined: Refined, findings: Findings, floor: NoiseFloor, bent: float
+) -> list[str]:
+    """
+    Return what a user of the refined model must know.
+
+    Parameters
+    ----------
+    given : StageModel
+    refined : Refined
+    findings : Findings
+    floor : NoiseFloor
+    bent : float
+        Share of the explainable part that goes with a retuned G alone.
+    """
+    state, stays = refined.state, lasting(findings.effects)
+    found = []
+    if not floor.known:
+        found.append(f'{floor.source}: every share counts the noise as unexplained')
+    if stays and np.any(np.abs(state.retuning) > TUNED):
+        found.append(
+            f'the dynamics were retuned along with the effect, and {100.0 * max(bent, 0.0):.0f} % '
+            'of what the model missed goes with that alone: the effect bent them at the '
+            'identification, or they have changed since'
+        )
+    found += [_of_time_driven(added, bool(stays)) for added in _time_driven(state)]
+    (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
+    if low > least or high < most:
+        found.append(
+            f'the hysteresis was refitted to {low:g} .. {high:g} V alone, and the refined model '
+            f'holds there; the given one holds in {least:g} .. {most:g} V'
+        )
+    return found
+
+
+def _time_driven(state: State) -> list[Added]:
+    return [added for added in state.effects if added.effect.time_driven]
+
+
+def _of_time_driven(added: Added, beside_lasting: bool) -> str:
+    effect = added.effect
+    is_off = all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
+    # beside a lasting effect H was fitted to the mean of what wanders
+    kept = 'its mean' if beside_lasting and not is_off else 'it switched off'
+    if not beside_lasting:
+        kept += ' beside the hysteresis as it was given'
+    return (
+        f'{added.name} follows time and not the voltage: what was found holds in its own '
+        f'record alone, so the refined model carries {kept}'
+    )
+
+
+def sentence(
+    findings: Findings,
+    errors: tuple[Errors, Errors, Errors],
+    rest: Unexplained,
+    smallest: float | None,
+    is_given: bool,
+) -> str:
+    """
+    Return the verdict as a sentence.
+
+    Parameters
+    ----------
+    findings : Findings
+    errors : (Errors, Errors, Errors)
+        Before, with the base model refitted, and after.
+    rest : Unexplained
+    smallest : float or None
+        Smallest detectable effect, rms in % of stroke.
+    is_given : bool
+        Whether the model stays as it was given.
+    """
+    before, refit, after = (e.overall for e in errors)
+    fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
+    missed = 'what the model missed'
+    if findings.effects and refit < (1.0 - WORTH_REFIT_IN_DOUBT) * before:
+        # shares are of what a refit leaves: a sensor set to zero anew is no effect
+        missed = 'what a refit of the hysteresis leaves'
+        fall += f', with the refit alone to {refit:.3g} %'
+    share = f'{100.0 * findings.share:.0f} % of {missed}'
+    names = ' and '.join(name.replace('_', ' ') for name in findings.effects)
+    tail = '' if is_given else f'; after a refit of the hysteresis {fall}'
+    if findings.verdict == 'named':
+        verb = 'explains' if len(findings.effects) == 1 else 'explain'
+        text = f'{names} {verb} {share}; {fall}.'
+    elif findings.verdict == 'class':
+        text = f'{_or(findings.group)}: these data do not tell which; {names} was added and '
+        text += f'explains {share}; {fall}.'
+    elif findings.verdict == 'partly_explained':
+        text = f'{names} explains {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
+        text += f'{fall}.'
+    elif findings.verdict == 'unexplained':
+        why = ' that no candidate explains: unexplained'
+        if smallest is None:
+            why = f', unexplained: {rest.description}'
+        text = f'The model misses {rest.rms_percent:.2g} % of stroke{why}{tail}.'
+    elif smallest is None:
+        text = f'{rest.description}{tail}.'
+    else:
+        text = 'No effect is missing that these data could show; the smallest would be '
+        text += f'{smallest:.2g} % of stroke{tail}.'
+    return text[0].upper() + text[1:]
+
+
+def _or(group: Class | None) -> str:
+    return ' or '.join(name.replace('_', ' ') for name in (group.names if group else ()))

@@ -1,0 +1,130 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The refined model: what of a fit holds beyond the records that it was fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.cross_validation import refit_holds
+from piezo_ident.diagnosis.joint_fit import Fitted
+from piezo_ident.diagnosis.results import Errors
+from piezo_ident.diagnosis.simulator import Added, Simulator, State
+from piezo_ident.diagnosis.verdict import Findings
+from piezo_ident.effects import find_effect
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['Refined', 'lasting', 'refine']
+
+#: a weight below this is left out of the refined model, normalised
+NOTHING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """
+    The refined model.
+
+    Attributes
+    ----------
+    model : StageModel
+    state : State
+        The fit that it comes from.
+    is_given : bool
+        Whether the model stays as it was given.
+    """
+
+    model: StageModel
+    state: State
+    is_given: bool = False
+
+
+def lasting(effects: tuple[str, ...]) -> list[str]:
+    """Return the effects that will be there in another record, too."""
+    return [name for name in effects if not find_effect(name).time_driven]
+
+
+def refine(
+    simulator: Simulator,
+    given: State,
+    base: Fitted,
+    fitted: Fitted,
+    findings: Findings,
+    before: Errors,
+    refit: Errors,
+) -> Refined:
+    """
+    Return the model that the user gets.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    given : State
+        The model as it was given.
+    base, fitted : Fitted
+        Refitted without and with what was found.
+    findings : Findings
+    before, refit : Errors
+        Of the model as given, and of the base model refitted.
+    """
+    rows, model = simulator.rows, simulator.model
+    in_doubt = findings.verdict == 'unexplained'
+    worth = criteria.WORTH_REFIT_IN_DOUBT if in_doubt else criteria.WORTH_REFIT
+    if not findings.effects and (
+        refit.overall > (1.0 - worth) * before.overall
+        or not refit_holds(rows, rows.x - simulator.run(given), base.transfer)
+    ):
+        return Refined(model, given, is_given=True)
+    if findings.effects and not lasting(findings.effects):
+        # H was refitted beside a drift that another record will not repeat
+        effects = tuple(
+            Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
+            for added in fitted.state.effects
+        )
+        state = replace(given, effects=effects)
+        return Refined(_model(simulator, state, findings, model.scaling.range), fitted.state)
+    return Refined(_model(simulator, fitted.state, findings, _range(simulator)), fitted.state)
+
+
+def _range(simulator: Simulator) -> tuple[float, float]:
+    """Return the voltages between which an H refitted to the rows holds."""
+    pieces = [run.piece for run in simulator.rows.runs]
+    low, high = min(float(p.v.min()) for p in pieces), max(float(p.v.max()) for p in pieces)
+    least, most = simulator.model.scaling.range
+    # plays of larger thresholds than what was driven have no weight any more
+    if high - low < criteria.COVERED * (most - least):
+        return low, high
+    return min(least, low), max(most, high)
+
+
+def _model(
+    simulator: Simulator, state: State, findings: Findings, span: tuple[float, float]
+) -> StageModel:
+    """Return the model of a state, in the record that holds the most rows, and its range."""
+    rows = simulator.rows
+    k = rows.longest
+    h = state.hysteresis
+    alive = h.weights > NOTHING
+    slim = replace(h, thresholds=h.thresholds[alive], weights=h.weights[alive])
+    kept = tuple(_elsewhere(added) for added in state.effects)
+    model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
+    scaling = model.scaling
+    moved = replace(scaling, y0=scaling.y0 + float(state.offsets[k]) * scaling.Y, range=span)
+    provenance = {
+        **model.identification,
+        'diagnosis': {
+            'verdict': findings.verdict,
+            'effects': list(findings.effects),
+            'records': list(rows.names),
+        },
+    }
+    return replace(model, scaling=moved, identification=provenance)
+
+
+def _elsewhere(added: Added) -> Added:
+    """Return an effect without what belongs to one record."""
+    if not added.effect.time_driven:
+        return added
+    return Added(added.name, tuple(added.effect.elsewhere(values) for values in added.values))
