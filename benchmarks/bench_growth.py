@@ -27,7 +27,7 @@ import tempfile
 import time
 
 from growth_of_bags import BAG_BYTES, BAG_MEASURES, Measure, paper, RATE, sine, SPARE
-from growth_of_fits import base_model, beginnings, EFFECT, FIT_MEASURES, labelled, to_diagnose
+from growth_of_fits import base_model, EFFECT, FIT_MEASURES, labelled, to_diagnose
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -171,7 +171,6 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
         if kind == 'predict_bag':
             for path in folder.glob('bag_*'):
                 shutil.rmtree(path)
-    text += [beginnings(quick, folder), '']
     intro = (
         f'At {RATE / 1000:g} kHz, each length in a process of its own. The exponent is the slope '
         'of log time over log length through the '

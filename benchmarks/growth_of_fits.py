@@ -14,25 +14,21 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable
-import json
 from pathlib import Path
-import sys
 import time
 
 from growth_of_bags import Measure, RATE
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.diagnosis.beginnings import rest_of
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
-from side_by_side import last_line, markdown, peak_memory, seconds
 
-__all__ = ['EFFECT', 'FIT_MEASURES', 'base_model', 'beginnings', 'labelled', 'to_diagnose']
+__all__ = ['EFFECT', 'FIT_MEASURES', 'base_model', 'labelled', 'to_diagnose']
 
 #: the effect that the diagnosed stage has, and its size [% of stroke]
 EFFECT, SIZE = 'creep', 0.3
@@ -135,75 +131,3 @@ FIT_MEASURES: dict[str, Callable[[float, Path], Measure]] = {
     'identify': identifying,
     'diagnose': diagnosing,
 }
-
-
-# -- a long record from its beginning ------------------------------------------------------------
-
-
-def beginnings(quick: bool, folder: Path) -> str:
-    """Return the table of long records that are diagnosed from their beginnings."""
-    base_model(folder)
-    most = DiagnosisSettings().most_samples
-    pairs = [(300, 20), (300, 60), (300, 300), (3600, most / RATE)]
-    rows = []
-    for size, used in [(20, 17), (20, 20)] if quick else pairs:
-        here = [sys.executable, str(Path(__file__).resolve())]
-        sizes = [f'{size:g}', f'{used:g}', str(folder)]
-        last_line('the answer', [*here, '--answer', *sizes])
-        cells = last_line(f'diagnosis of {size:g} s', [*here, '--beginning', *sizes])
-        rows.append([f'{size:g} s', f'{used:g} s', *json.loads(cells)])
-    heads = (
-        'record',
-        'searched',
-        'found',
-        'whole record: as given, refined',
-        'unseen record: as given, refined',
-        'time',
-        'peak memory',
-    )
-    return '\n\n'.join(
-        (
-            '**Diagnosis of a long record: its beginning is searched, what was found is fitted to '
-            f'all of it.** More than {most:,} samples are not searched unless asked for. Errors '
-            'in % of stroke, free run; the unseen record is another programme.',
-            markdown(heads, rows),
-        )
-    )
-
-
-def answer(size: float, folder: Path) -> None:
-    """Leave the answer over so many seconds in the folder: its memory is none of a diagnosis."""
-    path = folder / f'answer_{size:g}.npy'
-    if not path.exists():
-        np.save(path, _answer(_command(size, 1)[0], 1))
-
-
-def beginning(size: float, used: float, folder: Path) -> list[str]:
-    """Diagnose the beginning of a record; return the cells of its row."""
-    from truths import make_stage, programme
-
-    model = base_model(folder)
-    diagnose(model, to_diagnose(17.0), DiagnosisSettings(effects=(EFFECT,)))
-    v, segments = _command(size, 1)
-    y = np.load(folder / f'answer_{size:g}.npy')
-    record = Record((Piece(v, y, RATE, segments=segments),), 'long')
-    del v, y
-    start = time.perf_counter()
-    found = diagnose(model, record, DiagnosisSettings(most_samples=round(used * RATE)))
-    took, peak = time.perf_counter() - start, peak_memory()
-    t, v, _ = programme('unseen', 1)
-    unseen = Piece(v, make_stage(EFFECT, SIZE, 1, noise='white').respond(t, v), RATE)
-    errors = [
-        ', '.join(f'{rest_of(m, [r], [r]).used:.4f}' for m in (model, found.model))
-        for r in (record, Record((unseen,), 'unseen'))
-    ]
-    names = ', '.join(effect.name for effect in found.effects)
-    return [f'{found.verdict}: {names}', *errors, seconds(took), f'{peak:.0f} MiB']
-
-
-if __name__ == '__main__':
-    what, length, most, place = sys.argv[1:]
-    if what == '--answer':
-        answer(float(length), Path(place))
-    else:
-        print(json.dumps(beginning(float(length), float(most), Path(place))))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         ModelError,
         PiezoIdentError,
     )
-    from piezo_ident.diagnosis.procedure import diagnose
+    from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
     from piezo_ident.identification.identify import identify
@@ -65,7 +65,7 @@ _HOMES = {
     'Settings': 'identification.results',
     'SimulatedStage': 'model.simulated_stage',
     'StageModel': 'model.stage_model',
-    'diagnose': 'diagnosis.procedure',
+    'diagnose': 'diagnosis.diagnose',
     'effects': 'effects',
     'free_run': 'model.free_run',
     'identify': 'identification.identify',

@@ -3,7 +3,7 @@
 
 """Diagnosis: which effect does the model lack; add it; the error before and after."""
 
-from piezo_ident.diagnosis.procedure import diagnose
+from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
 
 __all__ = ['Diagnosis', 'DiagnosisSettings', 'diagnose']

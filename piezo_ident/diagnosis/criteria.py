@@ -28,7 +28,7 @@ LAW_FITS = 0.99
 FORM_RATIO = 4.0
 #: range of the amplitude that an effect which is either on or off gets in a fit; 1 is exact
 ON_AMPLITUDE = (0.2, 3.0)
-#: expected deviation of a weight of H from zero, normalised: prior that keeps collinear plays small
+#: expected size of a weight of H, normalised: the prior that keeps collinear plays small
 WEIGHT_SPREAD = 0.1
 #: share of the model's voltage range that data must cover for a refitted H to hold in all of it
 COVERED = 0.95

@@ -90,9 +90,7 @@ def with_columns(
         ],
         axis=1,
     )
-    return NormalEquations(
-        A, np.concatenate([equations.b, lower[:, :, c]], axis=1), equations.s
-    )
+    return NormalEquations(A, np.concatenate([equations.b, lower[:, :, c]], axis=1), equations.s)
 
 
 def solve(A: Array, b: Array, prior: Array) -> Array:
@@ -151,15 +149,11 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
         theta = np.zeros(b.size)
         if not out.all():
             theta = solve(A - here.sum(axis=0), b - equations.b[out].sum(axis=0), prior)
-        errors[out] = (
-            equations.s[out] - 2.0 * equations.b[out] @ theta + (here @ theta) @ theta
-        )
+        errors[out] = equations.s[out] - 2.0 * equations.b[out] @ theta + (here @ theta) @ theta
     return np.maximum(errors, 0.0)
 
 
-def held_out_sums(
-    A: Array, b: Array, s: Array, sets: NDArray[np.int64], prior: Array
-) -> Array:
+def held_out_sums(A: Array, b: Array, s: Array, sets: NDArray[np.int64], prior: Array) -> Array:
     """
     Return the sum of the held-out squares of many residuals at once.
 
@@ -212,9 +206,7 @@ def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
         out = rows.fold == one
         if out.all():
             continue
-        theta = solve(
-            A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior
-        )
+        theta = solve(A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior)
         here = out[rows.block]
         left[here] -= M[here] @ theta
     return left

@@ -20,7 +20,7 @@ import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.errors import errors_of, row_noise
-from piezo_ident.diagnosis.free_parameters import RETUNING
+from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.joint_fit import (
     base_thresholds,
     fit_base,
@@ -38,7 +38,7 @@ from piezo_ident.diagnosis.results import (
     Residual,
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, Rows
-from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
+from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
@@ -46,10 +46,8 @@ from piezo_ident.diagnosis.verdict import (
     judge,
     percent,
     smallest_detectable,
-    takes,
     untestable_of,
 )
-from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
@@ -187,11 +185,11 @@ def _diagnosed(
     span = abs(model.scaling.Y)
     noise = row_noise(floor, faults, rows.m, span)
     progress('residual', 1.0)
-    search = _Search(simulator, [line.frequency for line in found.lines], noise, settings, progress)
-    rounds, taken, fitted = search.run(base)
-    if not taken:
-        fitted = base
-    findings = judge(rows, base, fitted, taken, noise, search.left_out, search.bent)
+    lines = [line.frequency for line in found.lines]
+    selected = ForwardSelection(simulator, lines, noise, settings, progress).run(base)
+    rounds, taken = selected.rounds, selected.taken
+    fitted = selected.fitted if taken else base
+    findings = judge(rows, base, fitted, taken, noise, selected.left_out, selected.bent)
     progress('verdict', 0.0)
     rms = None if not floor.known else max(floor.rms or 0.0, faults.quantum / np.sqrt(12.0))
     # what single samples have more of noise than rows
@@ -276,104 +274,6 @@ def _check_related(rows: Rows, base: Fitted) -> None:
         )
 
 
-class _Search:
-    """Forward selection: effects are added as long as held-out data gain."""
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        lines: Sequence[float],
-        noise: float,
-        settings: DiagnosisSettings,
-        progress: Progress,
-    ) -> None:
-        self._simulator = simulator
-        self._lines = lines
-        self._noise = noise
-        self._most = settings.most_effects
-        self._progress = progress
-        self._rng = np.random.default_rng(settings.seed)
-        names = settings.effects or tuple(catalogue())
-        self._candidates = [find_effect(name) for name in names if name not in settings.without]
-        self._have = {setting.name for setting in simulator.model.effects}
-        tried = self._have | {effect.name for effect in self._candidates}
-        #: effects that nobody can find, since they are not tried
-        self.left_out = frozenset(catalogue()) - tried
-        #: what an effect that bent G would leave, where a linear change was preferred
-        self.bent: Round | None = None
-        self._count = 0
-
-    def run(self, base: Fitted) -> tuple[list[Round], list[Round], Fitted]:
-        """Return all rounds, those whose best contender was added, and the fit at the end."""
-        state = replace(base.state, retuning=(0.0,) * len(RETUNING))
-        retuned = fit_jointly(self._simulator, state, base.base)
-        explainable = max(base.mean_square - self._noise, 1e-300)
-        if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
-            return self._from(retuned, self._round(retuned))
-        # a linear change is the larger part: is it the whole of it?
-        linear, bent = self._round(base), None
-        if self._left(linear) > self._least:
-            bent = self._round(retuned)
-        if bent is not None and self._takes(bent, self._beyond_noise(bent.before), first=True):
-            if self._left(bent) < criteria.BENT * self._left(linear):
-                return self._from(retuned, bent)
-            self.bent = bent
-        return self._from(base, linear)
-
-    def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
-        rows = self._simulator.rows
-        return rows.passes >= criteria.PASSES and takes(
-            rows, this, self._noise, explainable, first=first
-        )
-
-    @property
-    def _least(self) -> float:
-        """Mean square of the smallest effect."""
-        return (criteria.SMALLEST_EFFECT * self._simulator.rows.stroke / 100.0) ** 2
-
-    def _beyond_noise(self, fitted: Fitted) -> float:
-        return max(fitted.mean_square - self._noise, 0.0)
-
-    def _left(self, this: Round) -> float:
-        return self._beyond_noise(this.contenders[0].fitted if this.contenders else this.before)
-
-    def _round(self, fitted: Fitted) -> Round:
-        have = self._have | {added.name for added in fitted.state.effects}
-        candidates = [effect for effect in self._candidates if effect.name not in have]
-        done = self._count
-        self._count += 1
-
-        def tick(share: float) -> None:
-            # most searches end after two or three rounds: the bar nears its end ever slower
-            self._progress('candidates', 1.0 - 0.4 ** (done + share))
-
-        return search_round(
-            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
-        )
-
-    def _from(self, start: Fitted, first: Round) -> tuple[list[Round], list[Round], Fitted]:
-        fitted, this = start, first
-        rounds, taken = [first], list[Round]()
-        explainable = self._beyond_noise(start)
-        while self._takes(this, explainable, first=not taken):
-            taken.append(this)
-            fitted, dropped = drop_needless(
-                self._simulator, this.contenders[0].fitted, self._least
-            )
-            for i in dropped:
-                del taken[i]
-            if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
-                break
-            this = self._round(fitted)
-            rounds.append(this)
-        if len(fitted.state.effects) > 1:
-            fitted = polished(
-                self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
-            )
-        self._progress('candidates', 1.0)
-        return rounds, taken, fitted
-
-
 # -- the result ----------------------------------------------------------------------------------
 
 
@@ -381,11 +281,12 @@ def _residuals(
     simulator: Simulator, given: State, base: Fitted, refined: Refined
 ) -> tuple[Residual, ...]:
     Y = simulator.model.scaling.Y
-    full = zip(*(simulator.full(s) for s in (given, base.state, refined.state)), strict=True)
-    return tuple(
-        Residual(run.record, run.piece, *((run.x - x) * Y for x in three), sound=run.known)
-        for run, three in zip(simulator.rows.runs, full, strict=True)
-    )
+    full = [simulator.full(s) for s in (given, base.state, refined.state)]
+    residuals = []
+    for i, run in enumerate(simulator.rows.runs):
+        as_given, before, after = ((run.x - x[i]) * Y for x in full)
+        residuals.append(Residual(run.record, run.piece, as_given, before, after, sound=run.known))
+    return tuple(residuals)
 
 
 def _effects(

@@ -40,7 +40,9 @@ def errors_of(rows: Rows, e: NDArray[np.float64], noise: float = 0.0) -> Errors:
         frequency = sine_frequency(label)
         if frequency is not None:
             of_frequency.setdefault(frequency, []).append(part)
-    by_frequency = {f'{f:g}': percent(np.concatenate(of_frequency[f])) for f in sorted(of_frequency)}
+    by_frequency = {
+        f'{f:g}': percent(np.concatenate(of_frequency[f])) for f in sorted(of_frequency)
+    }
     return Errors(percent(e), by_segment, by_frequency)
 
 

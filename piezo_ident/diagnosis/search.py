@@ -2,16 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The search: which effects, added one after another, lower the error on data that were not fitted.
+One round of the search: which candidate lowers the error on data that were not fitted.
 
 A round scores every candidate on the residual and fits the most promising ones together with
-everything else.  The best one is added if it is an effect (`verdict.takes`).  What candidates
-gain on circular-shift surrogates of the residual is what chance gains.
-
-An effect that was there when G was identified has bent G a little.  Unless a linear change is the
-larger part of the residual, G is therefore retuned along with the candidates, by a factor
-``1 + c_1 (1 - z^-1) + c_2 (1 - z^-1)^2`` and two slow relaxations.  No candidate is chosen for
-what that explains.
+everything else.  What candidates gain on circular-shift surrogates of the residual is what chance
+gains.
 """
 
 from __future__ import annotations
@@ -24,7 +19,6 @@ from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.candidates import score_trials, Scored, started, Tick
 from piezo_ident.diagnosis.criteria import JOINT_FITS, SIMPLER, SURROGATES, WORTH_FIT
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import Effect
 

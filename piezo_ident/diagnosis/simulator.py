@@ -155,8 +155,7 @@ class Simulator:
     def full(self, state: State) -> list[Array]:
         """Return the prediction of each run at the full rate, normalised."""
         return [
-            self._blocks(state, i)[-1].x + state.offsets[k]
-            for i, k in enumerate(self.rows.record)
+            self._blocks(state, i)[-1].x + state.offsets[k] for i, k in enumerate(self.rows.record)
         ]
 
     def remember(self, state: State) -> Array:

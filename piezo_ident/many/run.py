@@ -22,7 +22,7 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.common.files import write_text
 from piezo_ident.common.process import Tick
-from piezo_ident.diagnosis.procedure import diagnose
+from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings

@@ -11,20 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.record import Fault
+from piezo_ident.model.free_run import sine_frequency
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.record.record import Fault, Segment
 from piezo_ident.residual.dependence import Curve, curves_of
 from piezo_ident.residual.faults import find_faults
-from piezo_ident.residual.floor import noise_floor, NoiseFloor
 from piezo_ident.residual.lines import find_lines, LineSearch, without_lines
-from piezo_ident.residual.stretches import ResidualPart, stretches_of, strokes_of
-from piezo_ident.residual.tables import (
-    frequency_rows,
-    FrequencyRow,
-    record_rows,
-    RecordRow,
-    rows_of,
-    SegmentRow,
-)
+from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
+from piezo_ident.residual.stretches import find_repeats, ResidualPart, stretches_of, strokes_of
 from piezo_ident.residual.whiteness import (
     Coherence,
     coherence,
@@ -34,7 +28,61 @@ from piezo_ident.residual.whiteness import (
     whiteness,
 )
 
-__all__ = ['ResidualAnalysis', 'analyse']
+__all__ = ['FrequencyRow', 'RecordRow', 'ResidualAnalysis', 'SegmentRow', 'analyse']
+
+#: what is dropped at the start of a sine: this time and at least one period [s]
+SETTLING = 1.0
+
+
+@dataclass(frozen=True)
+class RecordRow:
+    """
+    The residual of one record: n sound samples, stroke and mean residual in metres.
+
+    `percent` is ``100 rms(e) / stroke``, `explainable` the share of the mean square that is above
+    the noise floor (None without a floor).
+    """
+
+    record: str
+    n: int
+    stroke: float
+    percent: float
+    mean: float
+    explainable: float | None
+
+
+@dataclass(frozen=True)
+class SegmentRow:
+    """
+    The residual of one segment, 'all' for a piece without segments; as in `RecordRow`.
+
+    `percent` is by the stroke of the whole record, `share` of the sum of squares of all records.
+    """
+
+    record: str
+    segment: str
+    start_time: float
+    n: int
+    percent: float
+    mean: float
+    share: float
+    explainable: float | None
+
+
+@dataclass(frozen=True)
+class FrequencyRow:
+    """
+    The residual of one sine in steady state; frequency in Hz, amplitude of the voltage in V.
+
+    `percent` is by the stroke of the samples compared.
+    """
+
+    record: str
+    segment: str
+    frequency: float
+    amplitude: float
+    percent: float
+    n: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +190,7 @@ def analyse(
     tick(0.6)
     # a line is no noise: a model may carry it
     quiet = [without_lines(part, lines.lines) for part in clean]
-    floor = noise_floor(quiet, stretches)
+    floor = residual_noise_floor(quiet, stretches)
     tick(0.7)
     correlations = [cross_correlation(quiet, which) for which in ('v', 'dv/dt')]
     white, coherent = whiteness(clean), coherence(clean)
@@ -158,9 +206,9 @@ def analyse(
         percent=100.0 * float(np.sqrt(relative / sum(int(p.mask.sum()) for p in parts))),
         floor=floor,
         explainable=floor.share(float(squares.mean())) if squares.size else None,
-        records=record_rows(parts, floor),
-        segments=rows_of(parts, floor),
-        frequencies=frequency_rows(parts),
+        records=_record_rows(parts, floor),
+        segments=_segment_rows(parts, floor),
+        frequencies=_frequency_rows(parts),
         whiteness=white,
         correlations=tuple(c for c in correlations if c is not None),
         coherence=coherent,
@@ -182,3 +230,93 @@ def _repaired(part: ResidualPart, bad: NDArray[np.bool_], out: NDArray[np.bool_]
         return part
     e[bad] = np.interp(np.flatnonzero(bad), np.flatnonzero(good), e[good])
     return ResidualPart(part.record, part.piece, e, part.mask & ~out)
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def _record_rows(parts: Sequence[ResidualPart], floor: NoiseFloor) -> tuple[RecordRow, ...]:
+    """Return one row a record, in order of appearance."""
+    rows = []
+    for name, stroke in strokes_of(parts).items():
+        e = np.concatenate([p.e[p.mask] for p in parts if p.record == name])
+        y = np.concatenate([p.piece.y[p.mask] for p in parts if p.record == name])
+        if e.size:
+            percent = percent_of_stroke(y, y - e, stroke)
+            share = floor.share(float(np.mean(e * e)))
+            rows.append(RecordRow(name, e.size, stroke, percent, float(e.mean()), share))
+    return tuple(rows)
+
+
+def _segment_rows(parts: Sequence[ResidualPart], floor: NoiseFloor) -> tuple[SegmentRow, ...]:
+    """Return one row a segment, in order of time."""
+    strokes = strokes_of(parts)
+    total = sum(float(np.sum(p.e[p.mask] ** 2)) for p in parts)
+    rows = []
+    for part in parts:
+        for s in part.piece.segments or (Segment('all', 0, part.piece.n),):
+            mask = part.mask[s.start : s.stop]
+            e = part.e[s.start : s.stop][mask]
+            if e.size == 0:
+                continue
+            y = part.piece.y[s.start : s.stop][mask]
+            power = float(e @ e)
+            rows.append(
+                SegmentRow(
+                    record=part.record,
+                    segment=s.label,
+                    start_time=float(part.piece.start_time + s.start / part.piece.sample_rate),
+                    n=e.size,
+                    percent=percent_of_stroke(y, y - e, strokes[part.record]),
+                    mean=float(e.mean()),
+                    share=power / total if total > 0.0 else 0.0,
+                    explainable=floor.share(power / e.size),
+                )
+            )
+    return tuple(rows)
+
+
+def _frequency_rows(parts: Sequence[ResidualPart]) -> tuple[FrequencyRow, ...]:
+    """
+    Return one row a sine, by frequency.
+
+    The first second and at least one period are dropped where as much is left; of shorter sines
+    one period.
+    """
+    rows = []
+    for part in parts:
+        rate = part.piece.sample_rate
+        for s in part.piece.find('sine'):
+            frequency = sine_frequency(s.label) or _frequency(part, s)
+            if frequency is None:
+                continue
+            period = rate / frequency
+            start = s.start + int(np.ceil(max(SETTLING * rate, period)))
+            if s.stop - start < period - 0.5:
+                start = s.start + int(np.ceil(period))
+            mask = part.mask[start : s.stop]
+            if mask.sum() < period - 0.5:
+                continue
+            y, e = part.piece.y[start : s.stop][mask], part.e[start : s.stop][mask]
+            rows.append(
+                FrequencyRow(
+                    record=part.record,
+                    segment=s.label,
+                    frequency=float(frequency),
+                    amplitude=0.5 * float(np.ptp(part.piece.v[start : s.stop])),
+                    percent=percent_of_stroke(y, y - e),
+                    n=int(mask.sum()),
+                )
+            )
+    return tuple(sorted(rows, key=lambda row: (row.frequency, row.amplitude)))
+
+
+def _frequency(part: ResidualPart, s: Segment) -> float | None:
+    """Return the frequency of a sine whose label does not say it."""
+    v = part.piece.v[s.start : s.stop]
+    repeats = find_repeats(v)
+    if not repeats:
+        return None
+    start, _, period = max(repeats, key=lambda r: r[1] - r[0])
+    spectrum = np.abs(np.fft.rfft(v[start : start + period] - v[start : start + period].mean()))
+    return float(np.argmax(spectrum) * part.piece.sample_rate / period)

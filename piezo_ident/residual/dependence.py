@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 
 __all__ = ['Curve', 'curves_of']
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 #: samples after averaging, bins of a curve, bins a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
@@ -52,10 +55,10 @@ class Curve:
     against: str
     branch: str
     unit: str
-    x: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
-    count: NDArray[np.int64]
+    x: Array
+    mean: Array
+    std: Array
+    count: Integers
     share: float
     per_decade: float = float('nan')
     per_decade_std: float = float('nan')
@@ -65,27 +68,23 @@ class Curve:
 class _Motion:
     """Averaged samples of the motions."""
 
-    e: NDArray[np.float64]
-    v: NDArray[np.float64]
-    speed: NDArray[np.float64]
-    since: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    chunk: NDArray[np.int64]
+    e: Array
+    v: Array
+    speed: Array
+    since: Array
+    direction: Array
+    chunk: Integers
+
+
+#: of a hold: bins of time, mean residual and samples in each, step as a share of the largest
+_Hold = tuple[Integers, Array, Integers, float]
 
 
 def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
     """
     Return the mean residual over v, dv/dt, and the time since the last turn and the last step.
 
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-    stretches : sequence of Stretch
-
-    Returns
-    -------
-    tuple of Curve
-        Those for which there are data.
+    Quantities without data have no curve.
     """
     found: list[Curve] = []
     motion = _motions(parts, stretches)
@@ -103,8 +102,8 @@ def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Mo
     if total == 0:
         return None
     m = max(1, -(-total // SAMPLES))
-    columns: list[list[NDArray[np.float64]]] = [[] for _ in range(5)]
-    chunks: list[NDArray[np.int64]] = []
+    columns: list[list[Array]] = [[] for _ in range(5)]
+    chunks: list[Integers] = []
     seconds = sum(s.n / parts[s.part].piece.sample_rate for s in moving)
     chunk_time = max(CHUNK_TIME, seconds / CHUNKS)
     number = 0
@@ -124,7 +123,7 @@ def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Mo
     return _Motion(e, v, speed, since, direction, np.concatenate(chunks))
 
 
-def _since(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _since(direction: Array) -> Array:
     """Return how many samples ago the direction changed; NaN before it first did."""
     turns = np.flatnonzero(np.diff(direction) != 0.0) + 1
     k = np.arange(direction.size)
@@ -179,7 +178,7 @@ def _since_turn(motion: _Motion) -> list[Curve]:
     return [_with_slope(curve)] if curve.x.size > 1 else []
 
 
-def _decades(t: NDArray[np.float64]) -> NDArray[np.int64]:
+def _decades(t: Array) -> Integers:
     k = np.floor(PER_DECADE * np.log10(t)).astype(np.int64)
     return np.asarray(k - k.min())
 
@@ -188,10 +187,10 @@ def _curve(
     against: str,
     branch: str,
     unit: str,
-    x: NDArray[np.float64],
-    e: NDArray[np.float64],
-    bins: NDArray[np.int64],
-    chunk: NDArray[np.int64],
+    x: Array,
+    e: Array,
+    bins: Integers,
+    chunk: Integers,
     own: NDArray[np.bool_],
     share: float,
 ) -> Curve:
@@ -217,10 +216,10 @@ def _curve(
 
 
 def _held_out(
-    e: NDArray[np.float64],
-    bins: NDArray[np.int64],
-    chunk: NDArray[np.int64],
-    weight: NDArray[np.float64],
+    e: Array,
+    bins: Integers,
+    chunk: Integers,
+    weight: Array,
 ) -> float:
     """Return the share of the variance of e that bin means times weight explain, held out."""
     left = whole = 0.0
@@ -244,23 +243,10 @@ def _held_out(
 
 def _with_slope(curve: Curve) -> Curve:
     slope, std = _slope(np.log10(curve.x), curve.mean, curve.std)
-    return Curve(
-        curve.against,
-        curve.branch,
-        curve.unit,
-        curve.x,
-        curve.mean,
-        curve.std,
-        curve.count,
-        curve.share,
-        slope,
-        std,
-    )
+    return replace(curve, per_decade=slope, per_decade_std=std)
 
 
-def _slope(
-    x: NDArray[np.float64], y: NDArray[np.float64], std: NDArray[np.float64]
-) -> tuple[float, float]:
+def _slope(x: Array, y: Array, std: Array) -> tuple[float, float]:
     known = std > 0.0
     if known.sum() < 3:
         return float('nan'), float('nan')
@@ -282,7 +268,7 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     if len(holds) < 2:
         return []
     largest = max(abs(s.step) for s in holds)
-    rows: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], float]] = []
+    rows: list[_Hold] = []
     first = min(2.0 / parts[s.part].piece.sample_rate for s in holds)
     for s in holds:
         rate = parts[s.part].piece.sample_rate
@@ -323,23 +309,14 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     correction = visits / np.maximum(visits - 1, 1)
     std = np.sqrt(top * correction) / np.maximum(bottom, 1e-300)
     origin = float(curve[shown][0]) if shown.any() else 0.0
+    mean = curve[shown] - origin
     made = Curve(
-        'time since the step',
-        'both',
-        's',
-        x[shown],
-        curve[shown] - origin,
-        std[shown],
-        count[shown],
-        share,
+        'time since the step', 'both', 's', x[shown], mean, std[shown], count[shown], share
     )
     return [_with_slope(made)] if made.x.size > 1 else []
 
 
-def _common(
-    rows: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], float]],
-    size: int,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _common(rows: Sequence[_Hold], size: int) -> tuple[Array, NDArray[np.bool_]]:
     """Return the curve g that fits e = offset of the hold + weight g(bin) best, and its bins."""
     n = sum(k.size for k, _, _, _ in rows)
     A, b = np.zeros((n, size + len(rows))), np.zeros(n)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data that a residual lays open: repeats, jitter, a comb, spikes, flat ends."""
+"""Faults of the data beside a model: missed samples, jitter, steps, outliers, clipping."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.record import Fault
-from piezo_ident.residual.scatter import Scatter, scatter_of
-from piezo_ident.residual.stretches import ResidualPart, strokes_of
+from piezo_ident.residual.stretches import ResidualPart, runs_of, strokes_of
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-__all__ = ['FaultSearch', 'find_faults']
+__all__ = ['FaultSearch', 'find_faults', 'quantum_of']
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 #: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
 CHANCE, MOVED = 0.01, 3e-5
@@ -33,6 +35,10 @@ FLAT, LEFT = 5, 6.0
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
 #: jitter is read where the fast part of the motion has at most this share of the scatter's power
 SMOOTH = 1.0
+
+
+#: samples in which a quantum is looked for, in rows of so many
+MOST, MOST_ROW = 2**17, 2**10
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,122 +61,155 @@ class FaultSearch:
     """
 
     faults: tuple[Fault, ...]
-    bad: tuple[NDArray[np.bool_], ...]
-    out: tuple[NDArray[np.bool_], ...]
+    bad: tuple[Mask, ...]
+    out: tuple[Mask, ...]
     jitter: float = 0.0
     quantum: float = 0.0
 
 
 def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
-    """
-    Look for the five faults.
-
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-
-    Returns
-    -------
-    FaultSearch
-        One fault a record and kind.
-    """
+    """Look for the five faults: one fault for each part and kind."""
     faults: list[Fault] = []
-    bad: list[NDArray[np.bool_]] = []
-    out: list[NDArray[np.bool_]] = []
+    bad: list[Mask] = []
+    out: list[Mask] = []
     largest_jitter = largest_quantum = 0.0
     strokes = strokes_of(parts)
     for part in parts:
         stroke = strokes[part.record]
         missed = clipped = outliers = np.zeros(part.piece.n, dtype=bool)
         if part.piece.n >= 100 and stroke > 0.0:
-            scatter = scatter_of(part)
-            largest_quantum = max(largest_quantum, scatter.quantum)
-            clipped = _clipped(part, scatter)
-            missed = _missed(part, scatter)
+            noise = _noise_of(part)
+            largest_quantum = max(largest_quantum, noise.quantum)
+            clipped = _clipped(part, noise)
+            missed = _missed(part, noise)
             wide = binary_dilation(missed, iterations=3)
-            outliers = _outliers(part, scatter, wide | clipped)
+            outliers = _outliers(part, noise, wide | clipped)
             if missed.any():
                 # a reading that repeats the one before is no spike
                 outliers[1:] &= np.diff(part.piece.y) != 0.0
-            jitter, growth = _jitter(part, scatter, wide | clipped | outliers)
+            jitter, growth = _jitter(part, noise, wide | clipped | outliers)
             if jitter > 0.0 and outliers.any():
                 # most of them may be readings at the wrong moment
-                outliers = _outliers(part, scatter, wide | clipped, jitter)
+                outliers = _outliers(part, noise, wide | clipped, jitter)
             largest_jitter = max(largest_jitter, jitter)
-            faults += _said(part, stroke, scatter, missed, outliers, clipped)
-            if jitter > 0.0:
-                faults.append(
-                    Fault(
-                        'timing_jitter',
-                        f'in {part.record}',
-                        part.piece.n,
-                        f'sampling instants scatter by {1e6 * jitter:.3g} us rms: the variance '
-                        f'of the residual grows {growth:.3g} times with (dy/dt)^2',
-                    )
-                )
+            faults += _masked(part, missed, outliers, clipped)
+            faults += _of_all(part, stroke, noise, jitter, growth)
         bad.append(missed | outliers | clipped)
         out.append(clipped)
     return FaultSearch(tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum)
 
 
-def _said(
-    part: ResidualPart,
-    stroke: float,
-    scatter: Scatter,
-    missed: NDArray[np.bool_],
-    outliers: NDArray[np.bool_],
-    clipped: NDArray[np.bool_],
+def _masked(part: ResidualPart, missed: Mask, outliers: Mask, clipped: Mask) -> list[Fault]:
+    return [
+        Fault(
+            name,
+            f'in {part.record}, first at {part.piece.t[int(np.argmax(mask))]:.6g} s',
+            int(mask.sum()),
+            f'{what}; to be left out',
+        )
+        for name, mask, what in (
+            ('missed_samples', missed, 'readings that repeat the one before in motion'),
+            ('outliers', outliers, 'isolated jumps'),
+            ('clipping', clipped, 'readings at the end of their range while the model moves'),
+        )
+        if mask.any()
+    ]
+
+
+def _of_all(
+    part: ResidualPart, stroke: float, noise: _Noise, jitter: float, growth: float
 ) -> list[Fault]:
-    faults = []
-    t = part.piece.t
-
-    def where(mask: NDArray[np.bool_]) -> str:
-        places = np.flatnonzero(mask)
-        return f'in {part.record}, first at {t[places[0]]:.6g} s'
-
-    if missed.any():
-        faults.append(
-            Fault(
-                'missed_samples',
-                where(missed),
-                int(missed.sum()),
-                'readings that repeat the one before while the position moves; to be left out',
-            )
+    where, n, faults = f'in {part.record}', part.piece.n, []
+    if noise.quantum > COARSE * noise.rest and noise.quantum > COARSE_SHARE * stroke:
+        what = (
+            f'readings are multiples of {1e9 * noise.quantum:.4g} nm, '
+            f'{100 * noise.quantum / stroke:.2g} % of the stroke and more than twice the rest of '
+            'the noise'
         )
-    coarse = scatter.quantum > COARSE * scatter.rest and scatter.quantum > COARSE_SHARE * stroke
-    if coarse:
-        faults.append(
-            Fault(
-                'quantisation',
-                f'in {part.record}',
-                part.piece.n,
-                f'readings are multiples of {1e9 * scatter.quantum:.4g} nm, '
-                f'{100 * scatter.quantum / stroke:.2g} % of the stroke and more than twice the '
-                'rest of the noise',
-            )
+        faults.append(Fault('quantisation', where, n, what))
+    if jitter > 0.0:
+        what = (
+            f'sampling instants scatter by {1e6 * jitter:.3g} us rms: the variance of the '
+            f'residual grows {growth:.3g} times with (dy/dt)^2'
         )
-    if outliers.any():
-        faults.append(
-            Fault(
-                'outliers',
-                where(outliers),
-                int(outliers.sum()),
-                'isolated jumps; to be left out',
-            )
-        )
-    if clipped.any():
-        faults.append(
-            Fault(
-                'clipping',
-                where(clipped),
-                int(clipped.sum()),
-                'readings rest at the end of their range while the model moves; to be left out',
-            )
-        )
+        faults.append(Fault('timing_jitter', where, n, what))
     return faults
 
 
-def _missed(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _Noise:
+    """
+    Fast noise of the readings.
+
+    `rms` from third differences, `quantum` the step of the converter or of the file's decimals (0
+    when there is none), `rest` the rms without the quantum's own q / sqrt(12) [m].
+    """
+
+    rms: float
+    quantum: float
+    rest: float
+
+
+def quantum_of(y: Array) -> float:
+    """Return the step of which all readings y, shape (n,), are multiples; 0 for none."""
+    span = float(np.ptp(y))
+    if span == 0.0:
+        return 0.0
+    # neighbours in time differ by few steps, so the rounding of numbers does not add up
+    some = _pieces(y)
+    jumps = np.abs(np.diff(some))
+    # the ends of a clipped range need not be codes
+    inner = (some > y.min()) & (some < y.max())
+    jumps = jumps[(jumps > 1e-9 * span) & inner[1:] & inner[:-1]]
+    total = jumps.size
+    jumps = np.unique(np.round(jumps, 18))
+    if jumps.size and total > 20 and np.ptp(jumps) < 1e-6 * jumps[0]:
+        return float(jumps.mean())
+    if jumps.size < 2 or jumps.size > y.size // 4 + 50:
+        return 0.0
+    small = jumps[: max(20, jumps.size // 10)]
+    step = float(small[0])
+    for _ in range(4):
+        ratio = small / step
+        off = np.abs(ratio - np.rint(ratio))
+        near = np.rint(ratio) < 50
+        if near.sum() >= 2 and np.mean(off[near] < 0.03) > 0.97:
+            whole = np.rint(ratio)[near]
+            return float(np.sum(small[near] * whole) / np.sum(whole * whole))
+        # a code in between was never hit: the step divides the differences of differences
+        gaps = np.diff(small)
+        gaps = gaps[gaps > 0.03 * step]
+        if gaps.size == 0 or float(gaps.min()) > 0.97 * step:
+            return 0.0
+        step = float(gaps.min())
+    return 0.0
+
+
+def _pieces(y: Array) -> Array:
+    """Return some whole stretches of a long signal, which tell the step as well."""
+    if y.size <= MOST:
+        return y
+    rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
+    return np.asarray(rows[:: max(1, y.size // MOST)].ravel())
+
+
+def _noise_of(part: ResidualPart) -> _Noise:
+    """Return the fast noise of a part's readings; a model's misfit is too slow to matter."""
+    y = part.piece.y
+    quantum = quantum_of(y)
+    third = np.diff(part.e, 3)[part.mask[3:]] / np.sqrt(20.0)
+    if third.size == 0:
+        return _Noise(0.0, quantum, 0.0)
+    size = np.abs(third)
+    # quantised readings may repeat more often than not, so a median could be zero
+    robust = 1.4826 * float(np.median(size))
+    usual = size[size <= max(5.0 * robust, 1.01 * quantum)]
+    rms = float(np.sqrt(np.mean(usual**2))) if usual.size else robust
+    rest = float(np.sqrt(max(rms * rms - quantum * quantum / 12.0, 0.0)))
+    return _Noise(rms, quantum, rest)
+
+
+def _missed(part: ResidualPart, noise: _Noise) -> Mask:
     """
     Return readings equal to the one before where those around say that the position moved.
 
@@ -184,7 +223,7 @@ def _missed(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
     inner = (start >= 1) & (stop < n)
     start, stop = start[inner], stop[inner]
     slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
-    sigma, q = max(scatter.rms, 1e-12 * stroke), scatter.quantum
+    sigma, q = max(noise.rms, 1e-12 * stroke), noise.quantum
     density = q / (np.sqrt(4.0 * np.pi) * sigma)
     # the slope is itself known to about half a deviation
     least = 2.0 * np.sqrt(np.log(max(density / CHANCE, 1.0))) + 1.0
@@ -195,7 +234,7 @@ def _missed(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
     entered = before > 0.3 * slope
     makes_up = (after - before) / np.maximum(length - 1, 1)
     for factor in (1.0, 1.5, 2.5, 4.0):
-        moving = slope > factor * max(least * scatter.rms + 1.5 * q, MOVED * stroke)
+        moving = slope > factor * max(least * noise.rms + 1.5 * q, MOVED * stroke)
         equal = moving & entered & (length > 1)
         samples, count = int(length[moving].sum()), int((length - 1)[equal].sum())
         distance = np.maximum(slope[moving] - 0.5 * sigma - q, 0.0) / (2.0 * sigma)
@@ -211,9 +250,7 @@ def _missed(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
     return found
 
 
-def _outliers(
-    part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_], jitter: float = 0.0
-) -> NDArray[np.bool_]:
+def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.0) -> Mask:
     """Return single readings far from both neighbours, which agree with each other."""
     e = part.e
     height = np.zeros(e.size)
@@ -222,13 +259,13 @@ def _outliers(
     window = 101
     # the usual scatter around a sample: of jittered or driven data it changes along the record
     local = _running_median(size, window) * 1.4826
-    level = np.maximum(local, np.sqrt(1.5) * scatter.rms)
+    level = np.maximum(local, np.sqrt(1.5) * noise.rms)
     level = np.maximum(level, 1e-6 * float(np.ptp(part.piece.y)))
     if jitter > 0.0:
         slope = np.gradient(part.y_hat) * part.piece.sample_rate
         level = np.hypot(level, np.sqrt(1.5) * jitter * slope)
     candidates = np.flatnonzero(
-        (size > FAR * level) & (size > 3.5 * scatter.quantum) & part.mask & ~known
+        (size > FAR * level) & (size > 3.5 * noise.quantum) & part.mask & ~known
     )
     found = np.zeros(e.size, dtype=bool)
     for k in candidates:
@@ -242,7 +279,7 @@ def _outliers(
     return found
 
 
-def _running_median(x: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+def _running_median(x: Array, window: int) -> Array:
     """Return the larger of the medians of a block and its neighbours, for every sample."""
     blocks = max(1, x.size // window)
     means = np.median(x[: blocks * window].reshape(blocks, -1), axis=1)
@@ -250,22 +287,21 @@ def _running_median(x: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     return np.asarray(means[np.minimum(np.arange(x.size) // window, blocks - 1)])
 
 
-def _clipped(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
+def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
     """Return readings that stay at the largest or smallest value while the model moves on."""
     y, y_hat, v = part.piece.y, part.y_hat, part.piece.v
     found = np.zeros(y.size, dtype=bool)
     span = float(np.ptp(v))
     stroke = float(np.ptp(y))
     for end in (float(y.max()), float(y.min())):
-        at = np.abs(y - end) <= max(1e-9 * stroke, 0.25 * scatter.quantum)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(np.int8), [0]])))
-        for a, b in zip(edges[::2], edges[1::2], strict=True):
+        at = np.abs(y - end) <= max(1e-9 * stroke, 0.25 * noise.quantum)
+        for a, b in runs_of(at):
             if b - a < FLAT:
                 continue
             # a delay lets the end of a rest look as if v moved on
             late = b - min((b - a) // 4, round(0.002 * part.piece.sample_rate))
             moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
-            gone = moved > LEFT * (scatter.rms + scatter.quantum) and moved > 1e-4 * stroke
+            gone = moved > LEFT * (noise.rms + noise.quantum) and moved > 1e-4 * stroke
             if drive > 1e-4 * span and (gone or (drive > 0.02 * span and b - a >= 4 * FLAT)):
                 # what reads the same elsewhere has been cut off there too
                 found |= at
@@ -273,7 +309,7 @@ def _clipped(part: ResidualPart, scatter: Scatter) -> NDArray[np.bool_]:
     return found & part.mask
 
 
-def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> tuple[float, float]:
+def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, float]:
     """
     Return the rms scatter of the sampling instants [s], and by how much the variance grows.
 
@@ -292,16 +328,16 @@ def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> t
     unusable[:4] = unusable[-4:] = True
     unusable = binary_dilation(unusable, iterations=3)
     n = e.size // CHUNK * CHUNK
-    if n < 40 * CHUNK or scatter.rms == 0.0:
+    if n < 40 * CHUNK or noise.rms == 0.0:
         return 0.0, 1.0
     motion2 = np.mean(motion[:n].reshape(-1, CHUNK) ** 2, axis=1)
-    smooth = motion2 < SMOOTH * scatter.rms**2
+    smooth = motion2 < SMOOTH * noise.rms**2
     rows = smooth & ~unusable[:n].reshape(-1, CHUNK).any(axis=1)
     s2 = np.mean(slope[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
     h2 = np.mean(third[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
     motion2 = motion2[rows]
     # readings that rest on one code have no scatter of their own to compare with
-    moving = np.sqrt(s2) > scatter.quantum * rate
+    moving = np.sqrt(s2) > noise.quantum * rate
     s2, h2, motion2 = s2[moving], h2[moving], motion2[moving]
     if s2.size < 40 or float(np.ptp(s2)) == 0.0:
         return 0.0, 1.0
@@ -319,9 +355,7 @@ def _jitter(part: ResidualPart, scatter: Scatter, known: NDArray[np.bool_]) -> t
     return float(np.sqrt(slope2)), growth
 
 
-def _slope(
-    x: NDArray[np.float64], other: NDArray[np.float64], y: NDArray[np.float64]
-) -> tuple[float, float]:
+def _slope(x: Array, other: Array, y: Array) -> tuple[float, float]:
     """Return the slope of y over x beside another cause, and its robust standard deviation."""
     scale = max(float(other.max(initial=0.0)), 1e-300)
     A = np.column_stack([x / float(x.max()), np.ones(x.size), other / scale])

@@ -1,7 +1,13 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Narrow lines in a residual that the drive did not make: hum, its harmonics, any other source."""
+"""
+Narrow lines in a residual that the drive did not make: hum, its harmonics, any other source.
+
+The best common sine of all stretches, each weighted by its own noise around the frequency
+(`line_spectrum`), is held against its neighbours, as Fisher (1929), Proc. R. Soc. A 125, 54-59,
+doi:10.1098/rspa.1929.0151, and corrected for the number of bins.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +16,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.residual.line_series import (
-    FEWEST,
-    Noise,
-    noise_around,
-    Series,
-    series_of,
-    spectrum_of,
-)
+from piezo_ident.residual.line_spectrum import FEWEST, Series, series_of, Spectrum
 from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
 from scipy import fft
-from scipy.special import gammaincc
+from scipy.special import gammaincc, gammaln
 
 __all__ = ['Line', 'LineSearch', 'find_lines', 'without_lines']
+
+Array = NDArray[np.float64]
 
 #: most lines that are looked for
 LINES = 6
@@ -96,8 +97,6 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
 
     Where v repeats, the residual of consecutive periods is subtracted: what the drive makes,
     with all its harmonics, is gone, and a line of any other frequency stays with a known gain.
-    A stretch is weighted by its own noise around each frequency, so the score is that of the best
-    common sine of a record, each with its own phase.
 
     Parameters
     ----------
@@ -108,11 +107,6 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     Returns
     -------
     LineSearch
-
-    Notes
-    -----
-    The test holds a peak against its neighbours, as Fisher (1929), Proc. R. Soc. A 125, 54-59,
-    doi:10.1098/rspa.1929.0151, and is corrected for the number of bins.
     """
     series, rate, high = series_of(parts, stretches)
     if not series:
@@ -121,206 +115,155 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     size = fft.next_fast_len(round(FINE * seconds * rate), real=True)
     longest = max(s.x.size for s in series) / rate
     f = np.arange(1 + int(high / rate * size)) * (rate / size)
-    keep = (f >= (FEWEST + 2) / longest) & (f <= high)
+    band = (f >= (FEWEST + 2) / longest) & (f <= high)
+    keep = band.copy()
     bins = max(1.0, TRIALS * float(keep.sum()) / FINE)
-    records = sorted({s.record for s in series})
-    found: list[Line] = []
-    spectra = [spectrum_of(s, size)[: f.size] for s in series]
-    noises = [noise_around(s, rate, f) for s in series]
     negligible = SMALLEST * max(strokes_of(parts).values())
+    search = _Search(series, f, size)
+    found: list[Line] = []
     smallest = float('inf')
     for _ in range(2 * LINES):
-        score, information, gain = _score(series, spectra, noises, f, records)
-        score = np.where(keep, score, 0.0)
-        if not found:
+        score, information, gain = search.score()
+        if not found and keep.any():
             with np.errstate(divide='ignore'):
                 least = np.sqrt(4.0 * np.log(bins / SIGNIFICANT) / information)
-            smallest = float(np.median(least[keep])) if keep.any() else smallest
-            smallest = max(smallest, negligible)
+            smallest = max(float(np.median(least[keep])), negligible)
         # strong lines are significant beside themselves too; the strongest is where it is
-        chances = np.minimum(1.0, bins * np.exp(-score))
-        significant = keep & (chances <= SIGNIFICANT)
+        chances = np.where(keep, np.minimum(1.0, bins * np.exp(-score)), 1.0)
+        significant = chances <= SIGNIFICANT
         if len(found) == LINES or not significant.any():
             break
         best = int(np.argmax(np.where(significant, gain, -1.0)))
-        p_value = float(chances[best])
-        frequency, std = _refined(series, noises, f, best, rate, float(f[1]))
-        fits = [(name, *_sine(series, noises, f, frequency, rate, name)) for name in records]
-        amplitude = max(float(a) for _, a, _ in fits)
-        if amplitude >= negligible and _steady(series, noises, f, frequency, rate, records):
-            found.append(Line(frequency, std, amplitude, p_value, (), tuple(fits)))
-            series = [_without(s, frequency, fits, rate) for s in series]
-            spectra = [spectrum_of(s, size)[: f.size] for s in series]
-            noises = [noise_around(s, rate, f) for s in series]
+        frequency, std = search.refined(best)
+        sines = [(name, *search.sine(frequency, name)) for name in search.records]
+        amplitude = max(a for _, a, _ in sines)
+        if amplitude >= negligible and search.is_steady(frequency):
+            found.append(Line(frequency, std, amplitude, float(chances[best]), (), tuple(sines)))
+            search = search.without(found[-1])
         keep &= np.abs(f - frequency) > 2.0 / longest
-    band = f[(f >= (FEWEST + 2) / longest) & (f <= high)]
-    lowest, highest = (float(band[0]), float(band[-1])) if band.size else (0.0, 0.0)
+    lowest, highest = (float(f[band][0]), float(f[band][-1])) if band.any() else (0.0, 0.0)
     return LineSearch(_grouped(found, 2.0 / longest), lowest, highest, smallest)
 
 
-def _parts_of(
-    s: Series,
-    spectrum: NDArray[np.complex128],
-    noise: Noise,
-    f: NDArray[np.float64],
-) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return the matched filter and its information at each f."""
-    response = s.gain(f) * (0.5 * s.window.sum())
-    weight = 1.0 / noise[0]
-    return (
-        np.asarray(np.conj(response) * spectrum * weight),
-        np.asarray(np.abs(response) ** 2 * weight),
-    )
+class _Search:
+    """The series with their spectra on a common grid of frequencies f [Hz]."""
 
+    def __init__(self, series: Sequence[Series], f: Array, size: int) -> None:
+        self._f, self._size = f, size
+        self._spectra = [Spectrum.of(s, f, size) for s in series]
+        self.records = sorted({s.record for s in series})
 
-def _score(
-    series: Sequence[Series],
-    spectra: Sequence[NDArray[np.complex128]],
-    noises: Sequence[Noise],
-    f: NDArray[np.float64],
-    records: Sequence[str],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """
-    Return for every f -ln of its chance under noise alone, the information, and the gain.
+    def without(self, line: Line) -> _Search:
+        """Return the search with a line subtracted."""
+        sines = {name: (amplitude, phase) for name, amplitude, phase in line.records}
+        series = []
+        for spectrum in self._spectra:
+            s = spectrum.series
+            amplitude, phase = sines[s.record]
+            t = s.t + np.arange(s.x.size) / s.rate
+            gain = complex(s.gain(np.array(line.frequency)))
+            wave = gain * amplitude * np.exp(1j * (2.0 * np.pi * line.frequency * t + phase))
+            series.append(replace(s, x=s.x - wave.imag))
+        return _Search(series, self._f, self._size)
 
-    The gain is what a sine takes off the weighted squares: its maximum is the frequency, while
-    the chance also depends on how well the noise is known there.
-    """
-    total, most, gain = np.zeros(f.size), np.zeros(f.size), np.zeros(f.size)
-    for name in records:
-        top = np.zeros(f.size, dtype=np.complex128)
-        information, doubt = np.zeros(f.size), np.zeros(f.size)
-        for s, spectrum, noise in zip(series, spectra, noises, strict=True):
-            if s.record != name:
+    def score(self) -> tuple[Array, Array, Array]:
+        """
+        Return for every f -ln of its chance under noise alone, the information, and the gain.
+
+        The gain is what a sine takes off the weighted squares: its maximum is the frequency,
+        while the chance also depends on how well the noise is known there.
+        """
+        n = self._f.size
+        total, most, gain = np.zeros(n), np.zeros(n), np.zeros(n)
+        tiny = np.finfo(float).tiny
+        for name in self.records:
+            top = np.zeros(n, dtype=np.complex128)
+            information, doubt = np.zeros(n), np.zeros(n)
+            for s in self._spectra:
+                if s.series.record != name:
+                    continue
+                response = s.series.gain(self._f) * (0.5 * s.series.window.sum())
+                weight = 1.0 / s.noise
+                own = np.abs(response) ** 2 * weight
+                top += np.conj(response) * s.values * weight
+                information += own
+                doubt += own * own / s.worth
+            safe = np.maximum(information, tiny)
+            ratio = np.abs(top) ** 2 / safe
+            # F with 2 and 2k degrees of freedom, since the noise is itself an estimate: that of
+            # each stretch for itself, so their doubts average (Welch and Satterthwaite)
+            k = np.maximum(safe**2 / np.maximum(doubt, tiny), 1.0)
+            gain += ratio
+            total += k * np.log1p(ratio / k)
+            most = np.maximum(most, information)
+        return _log_chance(total, len(self.records)), most, gain
+
+    def refined(self, best: int) -> tuple[float, float]:
+        """Return the frequency of the least squared error and its standard deviation."""
+
+        def gain(frequency: float) -> float:
+            fits = [self._fit(frequency, name) for name in self.records]
+            return sum(abs(a) ** 2 * information for a, information in fits)
+
+        step = float(self._f[1])
+        centre, curvature = float(self._f[best]), 0.0
+        for width in (0.5 * step, 0.1 * step):
+            left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
+            bend = left - 2.0 * middle + right
+            if bend < 0.0:
+                centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
+                curvature = -bend / width**2
+        # the gain is half of twice the logarithm of the likelihood
+        return centre, float(1.0 / np.sqrt(2.0 * curvature)) if curvature > 0.0 else float('inf')
+
+    def sine(self, frequency: float, record: str) -> tuple[float, float]:
+        """Return amplitude and phase of A sin(2 pi f t + phase)."""
+        a, _ = self._fit(frequency, record)
+        return float(abs(a)), float(np.angle(1j * a))
+
+    def is_steady(self, frequency: float) -> bool:
+        """Return whether both halves of the stretches see the same sine; a transient does not."""
+        for name in self.records:
+            whole, information = self._fit(frequency, name)
+            if abs(whole) ** 2 * information < 12.0:
                 continue
-            matched, told = _parts_of(s, spectrum, noise, f)
-            top += matched
-            information += told
-            doubt += told * told / noise[1]
-        safe = np.maximum(information, np.finfo(float).tiny)
-        ratio = np.abs(top) ** 2 / safe
-        # F with 2 and 2k degrees of freedom, since the noise is itself an estimate: that of each
-        # stretch for itself, so their doubts average (Welch and Satterthwaite)
-        k = np.maximum(safe**2 / np.maximum(doubt, np.finfo(float).tiny), 1.0)
-        gain += ratio
-        total += k * np.log1p(ratio / k)
-        most = np.maximum(most, information)
-    if len(records) > 1:
-        # a sum of exponential variables; far out the asymptotic form, which does not underflow
-        n = len(records)
-        p = gammaincc(n, total)
-        with np.errstate(divide='ignore', invalid='ignore'):
-            far = total - (n - 1) * np.log(np.maximum(total, 1.0)) + _log_factorial(n - 1)
-            total = np.where(total > 500.0, far, -np.log(np.maximum(p, 1e-300)))
-    return total, most, gain
+            for half in (0, 1):
+                a, own = self._fit(frequency, name, half)
+                spread = 3.0 / np.sqrt(max(own, 1e-300))
+                if abs(a - whole) > (1.0 - STEADY) * abs(whole) + spread:
+                    return False
+        return True
+
+    def _fit(
+        self, frequency: float, record: str, half: int | None = None
+    ) -> tuple[complex, float]:
+        """Return the best common amplitude of a record's stretches, and the information on it."""
+        k = int(np.clip(np.rint(frequency / self._f[1]), 0, self._f.size - 1))
+        top, bottom = 0j, 0.0
+        for spectrum in self._spectra:
+            s = spectrum.series
+            if s.record != record:
+                continue
+            middle = s.x.size // 2
+            part = slice(None) if half is None else (slice(0, middle), slice(middle, None))[half]
+            x = (s.window * s.x)[part]
+            t = s.t + ((part.start or 0) + np.arange(x.size)) / s.rate
+            z = complex(np.sum(x * np.exp(-2j * np.pi * frequency * t)))
+            response = complex(s.gain(np.array(frequency))) * 0.5 * float(s.window[part].sum())
+            top += np.conj(response) * z / spectrum.noise[k]
+            bottom += abs(response) ** 2 / spectrum.noise[k]
+        return (top / bottom if bottom > 0.0 else 0j), bottom
 
 
-def _log_factorial(n: int) -> float:
-    return float(np.sum(np.log(np.arange(1, n + 1))))
-
-
-def _at(s: Series, f: float, rate: float, part: slice = slice(None)) -> tuple[complex, float]:
-    """Return the windowed transform at one f, of a part of the stretch, and the window's sum."""
-    x = (s.window * s.x)[part]
-    start = part.start or 0
-    t = s.t + (start + np.arange(x.size)) / rate
-    return complex(np.sum(x * np.exp(-2j * np.pi * f * t))), float(s.window[part].sum())
-
-
-def _fit(
-    series: Sequence[Series],
-    noises: Sequence[Noise],
-    f: NDArray[np.float64],
-    frequency: float,
-    rate: float,
-    record: str,
-    half: int | None = None,
-) -> tuple[complex, float]:
-    """Return the best common amplitude of a record's stretches, and the information on it."""
-    k = int(np.clip(np.rint(frequency / f[1]), 0, f.size - 1))
-    top, bottom = 0j, 0.0
-    for s, noise in zip(series, noises, strict=True):
-        if s.record != record:
-            continue
-        middle = s.x.size // 2
-        part = slice(None) if half is None else (slice(0, middle), slice(middle, None))[half]
-        z, weight = _at(s, frequency, rate, part)
-        response = complex(s.gain(np.array(frequency))) * 0.5 * weight
-        top += np.conj(response) * z / noise[0][k]
-        bottom += abs(response) ** 2 / noise[0][k]
-    return (top / bottom if bottom > 0.0 else 0j), bottom
-
-
-def _refined(
-    series: Sequence[Series],
-    noises: Sequence[Noise],
-    f: NDArray[np.float64],
-    best: int,
-    rate: float,
-    step: float,
-) -> tuple[float, float]:
-    """Return the frequency of the least squared error and its standard deviation."""
-
-    def gain(frequency: float) -> float:
-        total = 0.0
-        for name in {s.record for s in series}:
-            a, information = _fit(series, noises, f, frequency, rate, name)
-            total += abs(a) ** 2 * information
+def _log_chance(total: Array, n: int) -> Array:
+    """Return -ln of the chance that a sum of n exponential variables exceeds a total."""
+    if n == 1:
         return total
-
-    centre, curvature = float(f[best]), 0.0
-    for width in (0.5 * step, 0.1 * step):
-        left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
-        bend = left - 2.0 * middle + right
-        if bend < 0.0:
-            centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
-            curvature = -bend / width**2
-    # the gain is half of twice the logarithm of the likelihood
-    return centre, float(1.0 / np.sqrt(2.0 * curvature)) if curvature > 0.0 else float('inf')
-
-
-def _sine(
-    series: Sequence[Series],
-    noises: Sequence[Noise],
-    f: NDArray[np.float64],
-    frequency: float,
-    rate: float,
-    record: str,
-) -> tuple[float, float]:
-    """Return amplitude and phase of A sin(2 pi f t + phase)."""
-    a, _ = _fit(series, noises, f, frequency, rate, record)
-    return float(abs(a)), float(np.angle(1j * a))
-
-
-def _steady(
-    series: Sequence[Series],
-    noises: Sequence[Noise],
-    f: NDArray[np.float64],
-    frequency: float,
-    rate: float,
-    records: Sequence[str],
-) -> bool:
-    """Return whether both halves of the stretches see the same sine; a transient does not."""
-    for name in records:
-        whole, information = _fit(series, noises, f, frequency, rate, name)
-        if abs(whole) ** 2 * information < 12.0:
-            continue
-        for half in (0, 1):
-            a, told = _fit(series, noises, f, frequency, rate, name, half)
-            off = abs(a - whole)
-            if off > (1.0 - STEADY) * abs(whole) + 3.0 / np.sqrt(max(told, 1e-300)):
-                return False
-    return True
-
-
-def _without(
-    s: Series, frequency: float, fits: Sequence[tuple[str, float, float]], rate: float
-) -> Series:
-    amplitude, phase = next((a, b) for name, a, b in fits if name == s.record)
-    t = s.t + np.arange(s.x.size) / rate
-    gain = complex(s.gain(np.array(frequency)))
-    wave = gain * amplitude * np.exp(1j * (2.0 * np.pi * frequency * t + phase))
-    return replace(s, x=s.x - wave.imag)
+    p = gammaincc(n, total)
+    # far out the asymptotic form, which does not underflow
+    with np.errstate(divide='ignore', invalid='ignore'):
+        far = total - (n - 1) * np.log(np.maximum(total, 1.0)) + float(gammaln(n))
+        return np.asarray(np.where(total > 500.0, far, -np.log(np.maximum(p, 1e-300))))
 
 
 def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:
@@ -335,28 +278,12 @@ def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:
                     harmonics.append((order, line))
                     left.remove(line)
                     break
-        grouped.append(
-            Line(
-                base.frequency,
-                base.std,
-                base.amplitude,
-                base.p_value,
-                tuple(harmonics),
-                base.records,
-            )
-        )
+        grouped.append(replace(base, harmonics=tuple(harmonics)))
     return tuple(sorted(grouped, key=lambda line: -line.amplitude))
 
 
 def without_lines(part: ResidualPart, lines: Sequence[Line]) -> ResidualPart:
-    """
-    Return a part without the lines found in its record, harmonics included as they were fitted.
-
-    Parameters
-    ----------
-    part : ResidualPart
-    lines : sequence of Line
-    """
+    """Return a part without the lines of its record, harmonics included as they were fitted."""
     own = [
         (line.frequency, amplitude, phase)
         for base in lines

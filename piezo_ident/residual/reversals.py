@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How large a residual is by the way since the voltage last turned: what stands near a turn."""
+"""How large a residual is over the way since the voltage last turned."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 __all__ = ['EDGES', 'Way', 'turns_of', 'way_since_turn', 'ways']
 
+Array = NDArray[np.float64]
+
 #: edges of the stretches behind a turn, shares of the voltage range
 EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.01)
 #: a change of direction counts from this share of the range: noise turns all the time
 TURN = 0.01
 #: residuals are means over this time, so that noise does not hide what is looked for [s]
 MEAN = 0.002
-#: fewest means that a row stands on
+#: fewest means of a way
 FEWEST = 20
 
 
@@ -45,7 +47,7 @@ class Way:
     n: int
 
 
-def turns_of(v: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+def turns_of(v: Array, least: float) -> NDArray[np.int64]:
     """
     Return where a voltage turns and then moves by `least` or more the other way.
 
@@ -85,22 +87,8 @@ def turns_of(v: NDArray[np.float64], least: float) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64)
 
 
-def way_since_turn(v: NDArray[np.float64], span: float) -> NDArray[np.float64]:
-    """
-    Return how far the voltage has come since it last turned, as a share of its range.
-
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-        [V]
-    span : float
-        Range of the voltage [V].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        NaN before the first turn.
-    """
+def way_since_turn(v: Array, span: float) -> Array:
+    """Return how far v has come since it last turned, share of its span; NaN before a turn."""
     turns = turns_of(v, TURN * span)
     way = np.full(v.size, np.nan)
     if turns.size:
@@ -110,8 +98,8 @@ def way_since_turn(v: NDArray[np.float64], span: float) -> NDArray[np.float64]:
 
 
 def ways(
-    pieces: Sequence[tuple[NDArray[np.float64], NDArray[np.bool_], float]],
-    residuals: Sequence[Sequence[NDArray[np.float64]]],
+    pieces: Sequence[tuple[Array, NDArray[np.bool_], float]],
+    residuals: Sequence[Sequence[Array]],
 ) -> tuple[Way, ...]:
     """
     Return the rms of residuals by the way since the last turn.
@@ -131,7 +119,7 @@ def ways(
     span = max((float(np.ptp(v)) for v, _, _ in pieces), default=0.0)
     if span == 0.0:
         return ()
-    found: list[NDArray[np.float64]] = []
+    found: list[Array] = []
     for (v, sound, rate), errors in zip(pieces, residuals, strict=True):
         m = max(1, round(MEAN * rate))
         n = v.size // m * m

@@ -21,7 +21,16 @@ from scipy.ndimage import (
     uniform_filter1d,
 )
 
-__all__ = ['ResidualPart', 'Stretch', 'block_means', 'find_repeats', 'stretches_of', 'strokes_of']
+__all__ = [
+    'ResidualPart',
+    'Stretch',
+    'block_means',
+    'find_repeats',
+    'rests',
+    'runs_of',
+    'stretches_of',
+    'strokes_of',
+]
 
 #: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
 REST_TIME, REST_SAMPLES = 0.05, 200
@@ -99,7 +108,7 @@ class ResidualPart:
 
     def runs(self) -> list[tuple[int, int]]:
         """Return the unbroken stretches of sound samples, as first and behind the last."""
-        return _runs(self.mask)
+        return runs_of(self.mask)
 
 
 @dataclass(frozen=True)
@@ -136,7 +145,8 @@ class Stretch:
         return self.stop - self.start
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of true values, as first and behind the last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -158,60 +168,65 @@ def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
     """
     Cut a part where its voltage comes to rest, starts to repeat, or changes its segment.
 
-    Parameters
-    ----------
-    part : ResidualPart
-    number : int, optional
-        Of the part, for `Stretch.part`.
-
-    Returns
-    -------
-    list of Stretch
-        In order of time.
+    Stretches come in order of time; `number` is `Stretch.part`.
     """
     piece = part.piece
     v = piece.v
-    span = float(np.ptp(v))
-    shortest = max(REST_SAMPLES, round(REST_TIME * piece.sample_rate))
-    still = _still(v, span, shortest)
-    segments = piece.segments or (Segment('', 0, piece.n),)
+    shortest = _shortest(piece.sample_rate)
+    still = [(a, b) for a, b in rests(v, piece.sample_rate) if b - a + 1 >= shortest]
     found: list[Stretch] = []
     for first, last in part.runs():
-        for s in segments:
+        for s in piece.segments or (Segment('', 0, piece.n),):
             start, stop = max(s.start, first), min(s.stop, last)
-            if stop <= start:
-                continue
             edge = start
-            for a, b in _runs(still[start:stop]):
-                # the first sample at the new level is no longer at the old one
-                a, b = start + a - (a > 0), start + b
+            for a, b in still:
+                a, b = max(a, start), min(b, stop)
+                # the last sample before the first that repeats it is at the new level already
+                a -= a > start
                 if b - a < shortest:
                     continue
                 found += _motion(v, number, s.label, edge, a, shortest)
-                step = _step_into(v, a, shortest)
+                step = float(v[a] - v[max(a - shortest, 0)])
                 found.append(Stretch(number, s.label, a, b, 'rest', step=step))
                 edge = b
             found += _motion(v, number, s.label, edge, stop, shortest)
     return found
 
 
-def _still(v: NDArray[np.float64], span: float, window: int) -> NDArray[np.bool_]:
-    """Return where the voltage rests: exactly, or but for the trembling of a measured one."""
+def _shortest(rate: float) -> int:
+    return max(REST_SAMPLES, round(REST_TIME * rate))
+
+
+def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
+    """
+    Return where a voltage rests, as the first sample that repeats the one before, and the end.
+
+    It rests where it is constant, or but for the noise of a measured voltage.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        [V]
+    rate : float
+        [Hz]
+
+    Examples
+    --------
+    >>> rests(np.array([0.0, 1.0, 1.0, 1.0, 2.0]), 1000.0)
+    [(2, 4)]
+    """
+    span, window = float(np.ptp(v)), _shortest(rate)
     d = np.concatenate([[0.0], np.diff(v)])
     still = np.abs(d) <= 1e-9 * span
     still[0] = False
-    if span == 0.0 or v.size < 2 * window or still.mean() > 0.01:
-        return np.asarray(still)
-    turns = np.concatenate([[False], d[1:] * d[:-1] < 0.0])
-    trembling = uniform_filter1d(turns.astype(np.float64), window) > TREMBLE
-    narrow = maximum_filter1d(v, window) - minimum_filter1d(v, window) < COMES_BACK * span
-    # a window that lies within the rest says so of every sample of it
-    inside = binary_dilation(trembling & narrow, iterations=window // 2)
-    return np.asarray(inside & (np.abs(d) < COMES_BACK * span))
-
-
-def _step_into(v: NDArray[np.float64], at: int, window: int) -> float:
-    return float(v[at] - v[max(at - window, 0)])
+    if span > 0.0 and v.size >= 2 * window and still.mean() <= 0.01:
+        turns = np.concatenate([[False], d[1:] * d[:-1] < 0.0])
+        trembling = uniform_filter1d(turns.astype(np.float64), window) > TREMBLE
+        narrow = maximum_filter1d(v, window) - minimum_filter1d(v, window) < COMES_BACK * span
+        # a window within the rest covers half a window to either side
+        inside = binary_dilation(trembling & narrow, iterations=window // 2)
+        still = inside & (np.abs(d) < COMES_BACK * span)
+    return runs_of(still)
 
 
 def _motion(
@@ -257,7 +272,7 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
         difference = v[period:] - v[:-period]
         matching = [
             (a, b)
-            for a, b in _runs(np.abs(difference) <= tolerance)
+            for a, b in runs_of(np.abs(difference) <= tolerance)
             if b - a >= (PERIODS - SLACK) * period
             and np.ptp(v[a : a + period]) >= 20.0 * tolerance
         ]
@@ -271,7 +286,7 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     found = []
     for _, period, matching in tried:
         for a, b in matching:
-            free = _runs(~taken[a : b + period])
+            free = runs_of(~taken[a : b + period])
             for i, j in free:
                 if j - i >= (PERIODS + 1 - SLACK) * period:
                     found.append((a + i, a + j, period))

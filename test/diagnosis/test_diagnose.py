@@ -9,6 +9,7 @@ The stages come from benchmarks/truths: their laws are not those of the candidat
 
 from dataclasses import replace
 from functools import cache
+import importlib
 from pathlib import Path
 import sys
 
@@ -16,9 +17,8 @@ import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis import rows as rows_module
-from piezo_ident.diagnosis import simulator as simulator_module
-from piezo_ident.diagnosis.fit import base_at, base_thresholds, fit_base, fit_jointly
-from piezo_ident.diagnosis.gain import gram_of, held_out_errors
+from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
+from piezo_ident.diagnosis.joint_fit import base_at, base_thresholds, fit_base, fit_jointly
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Added, retuned, Simulator, State
 from piezo_ident.excitation.program import parse_program
@@ -31,6 +31,8 @@ from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
+# the name of the package is that of the function
+diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 ROOT = Path(__file__).resolve().parents[2]
 RATE = 20_000.0
 IDENTIFICATION = """
@@ -103,37 +105,46 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
     assert after < before / 3
 
 
-@pytest.mark.parametrize('dropouts', [0, 60])
-def test_of_a_long_record_the_beginning_is_searched_and_all_is_fitted(truths, dropouts):
+def test_of_a_long_record_a_stated_part_is_searched_and_fitted(truths):
     model, record, unseen = measured('creep', 0.3, 1)
-    (piece,) = record
     most = record.n * 2 // 3
-    y = piece.y.copy()
-    lost = np.random.default_rng(4).integers(most, piece.n, dropouts)
-    y[lost] = y.min()
-    record = Record((Piece(piece.v, y, RATE, segments=piece.segments),), 'long')
     few = ('creep', 'thermal_drift', 'saturation')
     result = diagnose(model, record, DiagnosisSettings(effects=few, most_samples=most))
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     before, after = unseen_errors(result, unseen)
     assert after < before / 10
-    (said,) = [w for w in result.warnings if 'samples were searched' in w]
-    assert sum(part.piece.n for part in result.residuals) == most
-    if dropouts:
-        # they bend nothing, and are not passed over in silence
-        assert said.endswith('something changes later: give that part as a record of its own')
-    else:
-        assert 'fitted to all of them' in said and 'changes later' not in said
-        # errors are those of the model that comes back, over all
-        for percent, one in ((result.before.overall, model), (result.after.overall, result.model)):
-            whole = free_run(one, record).whole.percent
-            assert percent == pytest.approx(whole, rel=0.25)
+    (warning,) = [w for w in result.warnings if 'samples were searched' in w]
+    assert warning.startswith(f'{most:,} of {record.n:,} samples')
+    # it is as if the rest were not there
+    (piece,) = record
+    part = diagnose(model, Record((piece.cut(0, most),), record.name), DiagnosisSettings(few))
+    assert sum(r.piece.n for r in result.residuals) == most
+    assert (part.sentence, part.after) == (result.sentence, result.after)
 
 
-def test_what_is_asked_for_is_there_behind_the_beginning(truths):
+def test_a_part_that_is_too_short_is_refused_with_its_length(truths):
     model, record, _ = measured('creep', 0.3, 1)
     with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
         diagnose(model, record, DiagnosisSettings(most_samples=1000))
+
+
+@pytest.mark.parametrize('most', [1000, 1001, 3000, 4321, 6999])
+def test_of_records_the_beginnings_are_taken_in_proportion(truths, most):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record
+    other = replace(piece.cut(0, 4000), sample_rate=5 * RATE)
+    two = Record((other, piece.cut(0, 1000), piece.cut(2000, 5000)), 'two')
+    whole = [two, Record((other,), 'other rate'), Record((piece.cut(0, 3000),), 'one')]
+    parts = diagnose_module._beginnings(model, whole, most)
+    assert [part.name for part in parts] == ['two', 'one']
+    assert sum(part.n for part in parts) <= most
+    for part, pieces in zip(parts, (two.pieces[1:], whole[2].pieces), strict=True):
+        n = sum(p.n for p in pieces)
+        assert part.n == pytest.approx(n * most / 7000, abs=1)
+        np.testing.assert_array_equal(
+            np.concatenate([p.y for p in part]), np.concatenate([p.y for p in pieces])[: part.n]
+        )
+    assert diagnose_module._beginnings(model, whole, 7000) == whole
 
 
 def test_effect_outside_the_catalogue_stays_unexplained(truths):
@@ -367,7 +378,7 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
     rows = make_rows(model, [record])
     rng = np.random.default_rng(0)
     M, e = rng.standard_normal((rows.n, 4)), rng.standard_normal(rows.n)
-    errors = held_out_errors(gram_of(rows, M, e), rows.fold, np.zeros(4))
+    errors = held_out_errors(normal_equations(rows, M, e), rows.fold, np.zeros(4))
     out = (rows.fold == 2)[rows.block]
     theta = np.linalg.lstsq(M[~out], e[~out], rcond=None)[0]
     left = e[out] - M[out] @ theta
@@ -392,19 +403,6 @@ def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
     rows = make_rows(model, [record])
     assert rows.m == m
     assert rows.n == record.n // m
-
-
-@pytest.mark.parametrize('window', [1, 100, 5003])
-def test_windows_change_nothing(truths, monkeypatch, window):
-    model, record, _ = measured('creep', 0.3, 1)
-    simulator = Simulator(model, make_rows(model, [Record((record.pieces[0].cut(0, 20_000),))]))
-    added = Added('creep', ({'gain': [0.01, 0.02], 'time_constant': [0.1, 1.0]},))
-    state = State(model.hysteresis, np.zeros(1), (added,))
-    whole = simulator.remember(state)
-    monkeypatch.setattr(simulator_module, 'WINDOW', window)
-    assert simulator.run(state).tobytes() == whole.tobytes()
-    (full,) = simulator.full(state)
-    assert full.size == 20_000
 
 
 def test_what_is_kept_from_the_run_before_changes_nothing(truths):

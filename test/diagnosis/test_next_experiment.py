@@ -53,8 +53,7 @@ def test_without_data_it_is_sweeps_and_then_nothing():
 def test_a_slow_effect_without_a_hold_asks_for_holds(effect):
     wanted = next_experiment(named(effect), [shipped('diagnosis')])
     assert wanted.kind == 'holds'
-    assert wanted.reason.startswith(f'{effect}, ')
-    assert 'cannot be told apart without a hold of at least 2 s after a step' in wanted.reason
+    assert wanted.reason.startswith(effect) and 'a hold of at least 2 s' in wanted.reason
     records = [shipped('diagnosis'), shipped('holds')]
     assert next_experiment(named(effect), records) is None
 

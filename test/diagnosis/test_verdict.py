@@ -6,10 +6,10 @@
 from types import SimpleNamespace
 
 import numpy as np
-from piezo_ident.diagnosis import procedure
-from piezo_ident.diagnosis.apart import CONTAINS, experiment_for, LOOK_ALIKES, rivals_of
-from piezo_ident.diagnosis.scatter import refit_holds, standard_errors
-from piezo_ident.diagnosis.verdict import judge, takes
+from piezo_ident.diagnosis import forward_selection
+from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
+from piezo_ident.diagnosis.look_alikes import CONTAINS, LOOK_ALIKES, separating_experiment
+from piezo_ident.diagnosis.verdict import judge, rivals_of, takes
 from piezo_ident.effects import catalogue, find_effect
 import pytest
 
@@ -32,14 +32,13 @@ def rows():
     )
 
 
-def fitted(mean_square, shape=FLAT, handles=3, transfer=None):
+def fitted(mean_square, shape=FLAT, parameters=3):
     """Return a fit that leaves this mean square, spread over the blocks like a shape."""
     errors = mean_square * BLOCKS * SIZE * shape / shape.sum()
     return SimpleNamespace(
         errors=errors,
-        transfer=errors if transfer is None else transfer,
         mean_square=errors.sum() / (BLOCKS * SIZE),
-        handles=(None,) * handles,
+        parameters=(None,) * parameters,
     )
 
 
@@ -61,33 +60,33 @@ def rivals(rows, *contenders):
 
 def test_a_clear_lead_tells_apart(rows):
     best = contender('sensor_nonlinearity', 0.004)
-    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.02, handles=6))
-    assert not rivals(rows, best, contender('even_nonlinearity', 0.02, handles=3))
-    assert rivals(rows, best, contender('even_nonlinearity', 0.005, handles=3))
+    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.02, parameters=6))
+    assert not rivals(rows, best, contender('even_nonlinearity', 0.02, parameters=3))
+    assert rivals(rows, best, contender('even_nonlinearity', 0.005, parameters=3))
 
 
 def test_the_simpler_law_that_fits_is_taken_before_a_richer_one_that_fits_as_well(rows):
     best = contender('sensor_nonlinearity', 0.004)
-    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.004, handles=6))
+    assert not rivals(rows, best, contender('noncongruent_minor_loops', 0.004, parameters=6))
     # too much is left for that: neither has the form of the effect, and a tie is a tie
     best = contender('sensor_nonlinearity', 0.03)
-    rival = contender('noncongruent_minor_loops', 0.033, handles=6)
+    rival = contender('noncongruent_minor_loops', 0.033, parameters=6)
     assert rivals(rows, best, rival) == ['noncongruent_minor_loops']
 
 
 def test_a_law_that_holds_the_other_as_a_part_does_not_rival_it_by_a_tie(rows):
-    best = contender('delay_change', 0.03, handles=1)
-    assert not rivals(rows, best, contender('changed_dynamics', 0.03, handles=4))
-    assert rivals(rows, best, contender('changed_dynamics', 0.01, handles=4))
+    best = contender('delay_change', 0.03, parameters=1)
+    assert not rivals(rows, best, contender('changed_dynamics', 0.03, parameters=4))
+    assert rivals(rows, best, contender('changed_dynamics', 0.01, parameters=4))
 
 
 def test_a_rich_law_does_not_rule_out_a_simple_one_that_fits(rows):
-    best = contender('changed_dynamics', 0.001, handles=4)
-    assert rivals(rows, best, contender('amplifier_lag', 0.003, handles=1)) == ['amplifier_lag']
-    assert not rivals(rows, best, contender('amplifier_lag', 0.006, handles=1))
+    best = contender('changed_dynamics', 0.001, parameters=4)
+    assert rivals(rows, best, contender('amplifier_lag', 0.003, parameters=1)) == ['amplifier_lag']
+    assert not rivals(rows, best, contender('amplifier_lag', 0.006, parameters=1))
     # one that does not fit is ruled out by less
-    best = contender('changed_dynamics', 0.02, handles=4)
-    assert not rivals(rows, best, contender('amplifier_lag', 0.06, handles=1))
+    best = contender('changed_dynamics', 0.02, parameters=4)
+    assert not rivals(rows, best, contender('amplifier_lag', 0.06, parameters=1))
 
 
 def test_a_lead_that_one_block_makes_is_no_lead(rows):
@@ -118,7 +117,7 @@ def verdict(rows, taken, left, bent=None):
 def test_a_tie_of_laws_that_do_not_fit_is_a_class(rows):
     this = a_round(
         contender('sensor_nonlinearity', 0.03),
-        contender('noncongruent_minor_loops', 0.035, handles=6),
+        contender('noncongruent_minor_loops', 0.035, parameters=6),
     )
     found = verdict(rows, [this], 0.03)
     assert found.verdict == 'class'
@@ -137,17 +136,11 @@ def test_what_a_later_effect_explains_is_held_against_no_candidate_of_the_first(
 
 
 def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
-    linear = a_round(contender('changed_dynamics', 0.04, handles=4))
-    bent = a_round(contender('backlash', 0.02, handles=6), before=0.1 * WHOLE)
+    linear = a_round(contender('changed_dynamics', 0.04, parameters=4))
+    bent = a_round(contender('backlash', 0.02, parameters=6), before=0.1 * WHOLE)
     assert verdict(rows, [linear], 0.04).verdict == 'named'
     found = verdict(rows, [linear], 0.04, bent)
     assert found.group.names == ('changed_dynamics', 'backlash')
-
-
-def test_an_effect_that_shows_in_one_kind_alone_is_taken(rows):
-    # nothing is known of it where this kind is left out
-    best = contender('slew_limit', 0.05, transfer=1e3 * fitted(WHOLE).errors)
-    assert takes(rows, a_round(best), 0.0, WHOLE, first=True)
 
 
 def test_an_effect_that_costs_a_kind_is_not(rows):
@@ -164,19 +157,22 @@ def choose(rows, monkeypatch):
     """Return what a search starts from, given what either round leaves, and the rival it keeps."""
 
     def chosen(linear, bent):
-        search = object.__new__(procedure._Search)
+        search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
-        search._noise, search.bent = 0.0, None
+        search._noise = 0.0
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
         starts = {
             key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
             for key, this in rounds.items()
         }
-        monkeypatch.setattr(procedure, 'fit_jointly', lambda *_: starts['retuned'])
-        monkeypatch.setattr(procedure, 'replace', lambda *_, **__: None)
+        monkeypatch.setattr(forward_selection, 'fit_jointly', lambda *_: starts['retuned'])
+        monkeypatch.setattr(forward_selection, 'replace', lambda *_, **__: None)
         search._round = lambda start: rounds[next(k for k, v in starts.items() if v is start)]
-        search._from = lambda start, first: next(k for k, v in starts.items() if v is start)
-        return search.run(starts['as it is']), search.bent
+        search._from = lambda start, first, bent=None: (
+            next(k for k, v in starts.items() if v is start),
+            bent,
+        )
+        return search.run(starts['as it is'])
 
     return chosen
 
@@ -206,32 +202,28 @@ def residual(rows, rms=0.001, shift=0.0):
     return rms * signs * (1.0 + 0.1 * np.sin(rows.block)) + shift
 
 
-def refit(transfer):
-    return SimpleNamespace(transfer=np.asarray(transfer))
-
-
 def test_a_refit_that_helps_everywhere_is_kept(rows):
     e = residual(rows)
-    assert refit_holds(rows, e, refit(np.full(BLOCKS, 0.5 * 1e-6 * SIZE)))
+    assert refit_holds(rows, e, np.full(BLOCKS, 0.5 * 1e-6 * SIZE))
 
 
 def test_a_refit_that_costs_a_kind_of_excitation_is_not(rows):
     left = np.full(BLOCKS, 0.5 * 1e-6 * SIZE)
     left[rows.group == 3] = 1.3 * 1e-6 * SIZE
-    assert not refit_holds(rows, residual(rows), refit(left))
+    assert not refit_holds(rows, residual(rows), left)
 
 
 def test_what_a_shift_of_the_record_does_is_no_merit_of_a_refit(rows):
     e = residual(rows, shift=0.01)
-    assert not refit_holds(rows, e, refit(np.full(BLOCKS, 1.02e-6 * SIZE)))
-    assert refit_holds(rows, e, refit(np.full(BLOCKS, 0.5e-6 * SIZE)))
+    assert not refit_holds(rows, e, np.full(BLOCKS, 1.02e-6 * SIZE))
+    assert refit_holds(rows, e, np.full(BLOCKS, 0.5e-6 * SIZE))
 
 
 def test_a_gain_in_one_block_is_within_its_scatter(rows):
     e = residual(rows)
     e[rows.block == 11] *= 20.0
     left = np.bincount(rows.block, residual(rows) ** 2)
-    assert not refit_holds(rows, e, refit(left))
+    assert not refit_holds(rows, e, left)
 
 
 # -- what would part them ----------------------------------------------------------------------
@@ -240,17 +232,17 @@ def test_a_gain_in_one_block_is_within_its_scatter(rows):
 @pytest.mark.parametrize('group', LOOK_ALIKES)
 def test_look_alikes_come_with_an_experiment(group):
     assert set(group) <= set(catalogue())
-    assert len(experiment_for(group)) > 20
+    assert len(separating_experiment(group)) > 20
 
 
 def test_the_order_of_names_does_not_matter():
     pair = ('sensor_nonlinearity', 'noncongruent_minor_loops')
-    assert experiment_for(pair) == experiment_for(pair[::-1])
+    assert separating_experiment(pair) == separating_experiment(pair[::-1])
 
 
 def test_a_pair_that_no_rule_speaks_of_says_what_each_needs():
     pair = ('cross_coupling', 'slew_limit')
-    assert experiment_for(pair) == '; and '.join(find_effect(name).needs for name in pair)
+    assert separating_experiment(pair) == '; and '.join(find_effect(name).needs for name in pair)
 
 
 def test_a_law_is_richer_than_those_that_it_contains():

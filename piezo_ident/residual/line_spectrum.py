@@ -14,7 +14,9 @@ from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 from scipy import fft, signal
 from scipy.ndimage import maximum_filter1d, median_filter
 
-__all__ = ['FEWEST', 'Noise', 'Series', 'noise_around', 'series_of', 'spectrum_of']
+__all__ = ['FEWEST', 'Series', 'Spectrum', 'series_of']
+
+Array = NDArray[np.float64]
 
 #: the search goes to this share of half the rate after averaging, which is about this rate [Hz]
 TOP, RATE = 0.8, 2500.0
@@ -25,9 +27,6 @@ NEIGHBOURS, FEWEST = 31, 7
 #: a median of exponential variables tells as much about their scale as this share as a mean
 MEDIAN_WORTH = 0.48
 
-#: mean square of a transform around each frequency, and the averages that it is worth
-Noise = tuple[NDArray[np.float64], NDArray[np.float64]]
-
 
 @dataclass(frozen=True, eq=False)
 class Series:
@@ -35,15 +34,15 @@ class Series:
 
     record: str
     t: float
-    x: NDArray[np.float64]
-    window: NDArray[np.float64]
+    x: Array
+    window: Array
     lag: float
     offset: int
     block: int
     rate: float
-    driven: NDArray[np.float64] | None = None
+    driven: Array | None = None
 
-    def gain(self, f: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def gain(self, f: Array) -> NDArray[np.complex128]:
         """Return what the block means, and the differences, make of a wave at f."""
         x = np.pi * np.asarray(f) / self.rate
         mean = np.where(
@@ -53,7 +52,7 @@ class Series:
             return mean.astype(np.complex128)
         return np.asarray(mean * (np.exp(2j * np.pi * f * self.lag) - 1.0))
 
-    def comb(self, f: NDArray[np.float64]) -> NDArray[np.float64]:
+    def comb(self, f: Array) -> Array:
         """
         Return what the differences make of the spectrum of white noise, relative to its mean.
 
@@ -121,9 +120,7 @@ def series_of(
     return found, rate / m, TOP * 0.5 * rate / m
 
 
-def _driven(
-    v: NDArray[np.float64], x: NDArray[np.float64], window: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _driven(v: Array, x: Array, window: Array) -> Array:
     """
     Return the power that the drive may have put into a residual, were it all the drive's.
 
@@ -140,29 +137,47 @@ def _driven(
     return np.asarray(maximum_filter1d(power, 3))
 
 
-def spectrum_of(s: Series, size: int) -> NDArray[np.complex128]:
+@dataclass(frozen=True, eq=False)
+class Spectrum:
     """
-    Return the windowed transform at every f of the grid, seen from a time common to the record.
+    Windowed transform of a series on a grid of frequencies, seen from a time common to all.
 
-    On the grid a stretch may be put anywhere modulo its size.
+    Attributes
+    ----------
+    series : Series
+    values : ndarray of complex, shape (p,)
+    noise : ndarray, shape (p,)
+        Mean square of the transform around each frequency without a line.
+    worth : ndarray, shape (p,)
+        Averages that the noise is worth.
     """
-    x, offset = s.window * s.x, s.offset % size
-    placed = np.zeros(size)
-    head = min(x.size, size - offset)
-    placed[offset : offset + head] = x[:head]
-    placed[: x.size - head] = x[head:]
-    return np.asarray(fft.rfft(placed))
+
+    series: Series
+    values: NDArray[np.complex128]
+    noise: Array
+    worth: Array
+
+    @classmethod
+    def of(cls, s: Series, f: Array, size: int) -> Spectrum:
+        """Return the spectrum on the first frequencies of a transform of some size."""
+        x, offset = s.window * s.x, s.offset % size
+        # on the grid a stretch may be put anywhere modulo its size
+        placed = np.zeros(size)
+        head = min(x.size, size - offset)
+        placed[offset : offset + head] = x[:head]
+        placed[: x.size - head] = x[head:]
+        return cls(s, np.asarray(fft.rfft(placed))[: f.size], *_noise_around(s, f))
 
 
-def noise_around(s: Series, rate: float, f: NDArray[np.float64]) -> Noise:
+def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
     """
     Return the mean square of the transform around each f without a line, and its worth.
 
     The geometric mean of the medians on both sides leaves a power law as it is.  Differences over
     a lag make a comb of the noise, as deep as the window overlaps itself shifted by that lag.
-    Where the drive does not repeat, what it may have left at a frequency is no noise, but counts
-    like it.
+    Where the drive does not repeat, what it may have left at a frequency counts as noise.
     """
+    rate = s.rate
     power = np.abs(fft.rfft(s.window * s.x)) ** 2
     k = np.arange(power.size)
     power /= s.comb(k * (rate / s.x.size))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
-__all__ = ['FloorSource', 'NoiseFloor', 'noise_floor']
+__all__ = ['FloorSource', 'NoiseFloor', 'residual_noise_floor']
 
 #: a frame of differences is freed of a slow change of this order
 ORDER = 3
@@ -136,7 +136,9 @@ class _Reading:
     sample_rate: float
 
 
-def noise_floor(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> NoiseFloor:
+def residual_noise_floor(
+    parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
+) -> NoiseFloor:
     """
     Return the noise floor of some residuals.
 

@@ -6,7 +6,7 @@
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import noise_floor, NoiseFloor, ResidualPart, stretches_of
+from piezo_ident.residual import NoiseFloor, residual_noise_floor, ResidualPart, stretches_of
 from piezo_ident.residual.stretches import block_means, find_repeats
 import pytest
 from residual_data import creep, misfit, part_of, pink, RATE, V
@@ -64,7 +64,7 @@ def test_white_noise_is_measured_through_misfit_and_creep(with_misfit):
     rng = np.random.default_rng(2)
     noise = 2e-9 * rng.standard_normal(V.size)
     part = part_of(noise + with_misfit * (misfit(V) + creep(V, RATE)))
-    floor = noise_floor([part], stretches_of(part))
+    floor = residual_noise_floor([part], stretches_of(part))
     assert 'repeated periods' in floor.source
     assert floor.rms == pytest.approx(2e-9, rel=0.05)
     # of 64 samples there are 31 means in the one period that is not dropped
@@ -76,7 +76,7 @@ def test_coloured_noise_after_averaging():
     rng = np.random.default_rng(3)
     noise = 2e-9 * pink(V.size, rng)
     part = part_of(noise + misfit(V))
-    floor = noise_floor([part], stretches_of(part))
+    floor = residual_noise_floor([part], stretches_of(part))
     # what is slower than a period looks like drift: the floor may be lower, not higher
     for m in (1, 16, 64):
         truth = np.std(block_means(noise, m))
@@ -88,7 +88,7 @@ def test_rests_serve_where_nothing_repeats():
     v = np.repeat(rng.uniform(0, 10, 8), 4000)
     e = creep(v, RATE) + 2e-9 * rng.standard_normal(v.size)
     part = ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)
-    floor = noise_floor([part], stretches_of(part))
+    floor = residual_noise_floor([part], stretches_of(part))
     assert 'rests' in floor.source
     assert floor.rms == pytest.approx(2e-9, rel=0.1)
     assert floor.at(16) == pytest.approx(0.5e-9, rel=0.35)
@@ -98,7 +98,7 @@ def test_floor_is_unknown_without_either():
     rng = np.random.default_rng(5)
     v = np.cumsum(rng.standard_normal(5000))
     part = ResidualPart('r', Piece(v, v, RATE), rng.standard_normal(5000))
-    floor = noise_floor([part], stretches_of(part))
+    floor = residual_noise_floor([part], stretches_of(part))
     assert floor.rms is None
     assert floor.at(4) is None
     assert floor.share(1.0) is None
