@@ -97,24 +97,24 @@ def diagnose(
 
     Examples
     --------
-    A stage that creeps, and a model that does not know it:
+    A stage whose amplifier saturates, which its model does not know:
 
     >>> from dataclasses import replace
     >>> import numpy as np
     >>> import piezo_ident as pi
-    >>> from piezo_ident.model.stage_model import EffectSetting, Scaling
-    >>> from piezo_ident.operators.dynamics import Delay, Dynamics
-    >>> from piezo_ident.operators.hysteresis import Hysteresis
-    >>> model = pi.StageModel(
-    ...     sample_rate=2000.0,
-    ...     scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
-    ...     hysteresis=Hysteresis(np.array([0.2, 0.5]), np.array([0.3, 0.2]), -0.2, 0.9),
-    ...     dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
-    ...     delay=Delay(2),
-    ... )
-    >>> creep = EffectSetting('creep', {'gain': [0.02], 'time_constant': [0.5]})
-    >>> stage = pi.SimulatedStage(replace(model, effects=(creep,)))
-    >>> v = 5.0 + 5.0 * np.sin(np.arange(8000) * 2.0 * np.pi / 2000.0 - np.pi / 2.0)
+    >>> from piezo_ident.model.stage_model import EffectSetting
+    >>> from piezo_ident.record.record import Piece
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> stage = replace(model, effects=(EffectSetting('saturation', {'high': 0.8}),))
+    >>> t = np.arange(20_000) / 20_000
+    >>> v = 2.5 * (1 + np.floor(20 * t) % 2) * (1 - np.cos(40 * np.pi * t))
+    >>> record = pi.Record((Piece(v, stage.simulate(v), 20_000),))
+    >>> few = pi.DiagnosisSettings(effects=('saturation', 'backlash'))
+    >>> result = pi.diagnose(model, record, few)
+    >>> result.verdict, round(result.effects[0].parameters['high'].value, 2)
+    ('named', 0.8)
+    >>> result.after.overall < 0.01 * result.before.overall
+    True
     """
     settings = settings or DiagnosisSettings()
     records = [records] if isinstance(records, Record) else list(records)
