@@ -11,7 +11,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 
 .PHONY: attack netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash numbers study table-one clean distclean
+.PHONY: crash study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -52,7 +52,6 @@ bench: .venv-bench/.bench
 BENCH_SECONDS ?= 300
 bench-live: .venv/.demo
 	.venv/bin/python benchmarks/bench_live.py --seconds $(BENCH_SECONDS) --out docs/live.md
-	.venv/bin/python benchmarks/bench_stages.py --out docs/live_stages.md
 
 # twenty seeds, three noise levels, stages on and off the grid: about five minutes
 study-identification: .venv/.demo
@@ -87,12 +86,6 @@ table-one: .venv/.demo
 # every command killed while it works, on full and on read-only disks: some minutes, best as root
 crash: .venv/.test
 	.venv/bin/python benchmarks/reliability/crash.py
-	$(RUN_STUDY)/build.py
-
-# numbers that cannot be trusted; then the same data on other versions of everything
-numbers: .venv/.test
-	.venv/bin/python benchmarks/reliability/untrusted.py
-	.venv/bin/python benchmarks/reliability/versions.py
 	$(RUN_STUDY)/build.py
 
 # what a ROS workspace would do, without ROS; and every node starts from there

@@ -38,7 +38,6 @@ HERE = Path(__file__).resolve().parent
 ORDER = (
     'prediction',
     'identification',
-    'profile',
     'peers_arx',
     'peers_swarm',
     'peers_control',
