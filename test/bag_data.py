@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
+from piezo_ident.record.bags.write import BagWriter
 from piezo_ident.record.blocks import encode, Samples
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -58,3 +59,15 @@ def raw_blocks(n: int = 10**9) -> Iterator[tuple[bytes, bytes]]:
             raw(Samples(t, 5 + np.sin(t), 'noise', 'voltage')),
             raw(Samples(t, 1e-5 + 1e-6 * np.sin(t), 'noise', 'displacement')),
         )
+
+
+def recording(path: Path, storage: str = 'mcap', n: int = 40, **options) -> BagWriter:
+    """Write pairs of blocks 5 ms apart, and flush, but do not close."""
+    writer = BagWriter(path, storage, **options)
+    for topic in ('/voltage', '/displacement'):
+        writer.add_topic(topic, MESSAGE_TYPE)
+    for k, (voltage, displacement) in enumerate(raw_blocks(n)):
+        writer.write('/voltage', 10**18 + k * 5_000_000, voltage)
+        writer.write('/displacement', 10**18 + k * 5_000_000 + 100_000, displacement)
+    writer.flush()
+    return writer

@@ -31,7 +31,6 @@ from piezo_ident.common.files import UNPACKED_SIZE
 from piezo_ident.record.assemble import label_runs
 from piezo_ident.record.mat_read import read_variables
 from piezo_ident.record.record import Record
-import scipy.io
 
 __all__ = ['READERS', 'WRITERS', 'Blocks', 'Table', 'blocks_of', 'labels_of']
 
@@ -326,19 +325,10 @@ def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Pat
     starts = np.asarray(arrays['segment_start'])
     if starts.dtype.kind not in 'fiu':
         raise DataError(f'{path}: segment_start holds no numbers; save sample indices from 0')
-    names = [_text(x, path) for x in np.atleast_1d(arrays['segment_name']).reshape(-1)]
-    return Table(columns, names, starts.reshape(-1), ignored)
-
-
-def _text(value: object, path: Path) -> str:
-    # a cell of a MATLAB cell array is an array of one string, or of none
-    while isinstance(value, np.ndarray):
-        if value.size > 1:
-            break
-        value = value.reshape(-1)[0] if value.size else ''
-    if not isinstance(value, str):
+    names = np.ravel(arrays['segment_name'])
+    if names.dtype.kind != 'U':
         raise DataError(f'{path}: segment_name holds no text; save it as text (MATLAB: a cellstr)')
-    return value.strip()
+    return Table(columns, [name.strip() for name in names.tolist()], starts.ravel(), ignored)
 
 
 def write_npz(
@@ -379,6 +369,8 @@ def write_mat(
     file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
 ) -> None:
     """Write a MATLAB 5 file of column vectors."""
+    import scipy.io  # takes longer than a short command
+
     parts = list(blocks())
     arrays: dict[str, Any] = {k: np.concatenate([block[k] for block in parts]) for k in parts[0]}
     if names:

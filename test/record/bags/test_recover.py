@@ -12,31 +12,25 @@ import sqlite3
 import subprocess
 import sys
 
-from bag_data import raw_blocks
+from bag_data import raw_blocks, recording
 import numpy as np
 from piezo_ident.cli import main
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import MESSAGE_TYPE, opened_bag, read_bag, typestore
-from piezo_ident.record.bags.recover import is_unfinished
-from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount, SAMPLE_QOS, write_bag
+from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Piece, Record
 import pytest
-from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
-import yaml
 
 pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
 
-from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from mcap_ros2.decoder import DecoderFactory
 
 TEST = Path(__file__).resolve().parents[2]
 RATE = 20000.0
 STORAGES = ('mcap', 'sqlite3')
-TYPES = typestore().types
 
 # writes blocks of both topics for ever, flushes every fifth pair, says how far it is
 ENDLESS = """
@@ -56,21 +50,9 @@ for k, (voltage, displacement) in enumerate(raw_blocks()):
 """
 
 
-def write(path: Path, storage: str = 'mcap', n: int = 40, **options) -> BagWriter:
-    """Write pairs of blocks 5 ms apart, and flush, but do not close."""
-    writer = BagWriter(path, storage, **options)
-    for topic in ('/voltage', '/displacement'):
-        writer.add_topic(topic, MESSAGE_TYPE)
-    for k, (voltage, displacement) in enumerate(raw_blocks(n)):
-        writer.write('/voltage', 10**18 + k * 5_000_000, voltage)
-        writer.write('/displacement', 10**18 + k * 5_000_000 + 100_000, displacement)
-    writer.flush()
-    return writer
-
-
 def killed(path: Path, **options) -> Path:
     """Leave a bag as SIGKILL would after a flush."""
-    writer = write(path.with_name('alive'), **options)
+    writer = recording(path.with_name('alive'), **options)
     shutil.copytree(writer.path, path)
     (path / writer.file.name).rename(path / f'{path.name}{writer.file.suffix}')
     writer.abort()
@@ -85,126 +67,6 @@ def refused(path: Path) -> None:
 def truncation(record: Record) -> str:
     (fault,) = (f for f in record.faults if f.name == 'truncated_bag')
     return str(fault)
-
-
-@pytest.mark.parametrize('storage', STORAGES)
-def test_what_a_flush_uses_is_there(tmp_path, storage):
-    # internals of rosbags: should a new version lose them, this says so, and nothing is written
-    writer = write(tmp_path / 'bag', storage)
-    for name, parts in INTERNALS[storage].items():
-        for part in parts or ('__call__',):
-            assert hasattr(getattr(writer._inside, name), part)
-    size = writer.size
-    writer.write('/voltage', 2 * 10**18, b'\0' * 5000)
-    writer.flush()
-    assert writer.size > size
-    writer.abort()
-
-
-def test_a_rosbags_that_cannot_flush_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(INTERNALS, 'mcap', {'close_chunk': (), 'no_such_thing': ('flush',)})
-    with pytest.raises(DataError, match='version of rosbags'):
-        BagWriter(tmp_path / 'bag')
-
-
-@pytest.mark.parametrize('storage', STORAGES)
-def test_closed_bag(tmp_path, storage):
-    writer = write(tmp_path / 'bag', storage, custom_data={'sample_rate': '20000.0'})
-    writer.close()
-    assert not is_unfinished(tmp_path / 'bag')
-    record = read_bag(tmp_path / 'bag')
-    assert (record.n, record.pieces[0].sample_rate, record.faults) == (4000, RATE, ())
-    t = np.arange(4000) / RATE
-    np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
-    assert writer.messages == 80
-
-
-@pytest.mark.parametrize('storage', STORAGES)
-def test_metadata_as_rosbag2_of_jazzy_reads_it(tmp_path, storage):
-    # The keys that rosbag2_storage of Jazzy (metadata_io, version 9) takes with as<...>(), which
-    # throws when one is missing.
-    latched = SAMPLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
-    writer = BagWriter(tmp_path / 'bag', storage, {'sample_rate': '20000.0', 'namespace': '/a'})
-    writer.add_topic('/a/model', 'std_msgs/msg/String', [latched])
-    text = TYPES['std_msgs/msg/String']('model')
-    writer.write('/a/model', 5, bytes(typestore().serialize_cdr(text, 'std_msgs/msg/String')))
-    writer.close()
-    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    info = info['rosbag2_bagfile_information']
-    assert set(info) == {
-        'version',
-        'storage_identifier',
-        'duration',
-        'starting_time',
-        'message_count',
-        'topics_with_message_count',
-        'compression_format',
-        'compression_mode',
-        'relative_file_paths',
-        'files',
-        'custom_data',
-        'ros_distro',
-    }
-    assert (info['version'], info['storage_identifier'], info['message_count']) == (9, storage, 1)
-    assert info['starting_time'] == {'nanoseconds_since_epoch': 5}
-    assert info['duration'] == {'nanoseconds': 0}
-    assert info['custom_data'] == {'sample_rate': '20000.0', 'namespace': '/a'}
-    suffix = {'mcap': '.mcap', 'sqlite3': '.db3'}[storage]
-    assert info['relative_file_paths'] == [f'bag{suffix}']
-    assert set(info['files'][0]) == {'path', 'starting_time', 'duration', 'message_count'}
-    (topic,) = info['topics_with_message_count']
-    assert topic['message_count'] == 1
-    meta = topic['topic_metadata']
-    assert (meta['name'], meta['type']) == ('/a/model', 'std_msgs/msg/String')
-    assert meta['serialization_format'] == 'cdr'
-    # what rclpy 7.1 of Jazzy names std_msgs/msg/String
-    hash_ = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
-    assert meta['type_description_hash'] == hash_
-    forever = {'sec': 9223372036, 'nsec': 854775807}
-    assert meta['offered_qos_profiles'] == [
-        {
-            'history': 'keep_last',
-            'depth': 1,
-            'reliability': 'reliable',
-            'durability': 'transient_local',
-            'deadline': forever,
-            'lifespan': forever,
-            'liveliness': 'automatic',
-            'liveliness_lease_duration': forever,
-            'avoid_ros_namespace_conventions': False,
-        }
-    ]
-
-
-def test_another_reader_takes_a_flushed_bag(tmp_path):
-    writer = write(tmp_path / 'bag')
-    writer.write('/voltage', 2 * 10**18, next(raw_blocks(1))[0])
-    writer.close()
-    with (tmp_path / 'bag' / 'bag.mcap').open('rb') as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        assert reader.get_summary().statistics.chunk_count == 2
-        got = [(c.topic, m.log_time, ros) for _, c, m, ros in reader.iter_decoded_messages()]
-    assert len(got) == 81
-    assert got[0][:2] == ('/voltage', 10**18)
-    assert got[0][2].layout.dim[1].label == 't,voltage'
-
-
-def test_names_are_numbered(tmp_path):
-    for want in ('bag', 'bag_1', 'bag_2'):
-        writer = BagWriter(tmp_path / 'bag')
-        assert writer.path == tmp_path / want
-        assert writer.file.name == f'{want}.mcap'
-        writer.close()
-    (tmp_path / 'file').write_text('')
-    with pytest.raises(DataError, match='cannot be written'):
-        BagWriter(tmp_path / 'file' / 'bag')
-
-
-def test_unknown_type_is_refused(tmp_path):
-    writer = BagWriter(tmp_path / 'bag')
-    with pytest.raises(DataError, match='type lab_msgs/msg/Odd is not known'):
-        writer.add_topic('/odd', 'lab_msgs/msg/Odd')
-    writer.abort()
 
 
 @pytest.mark.parametrize('storage', STORAGES)
@@ -267,7 +129,7 @@ def test_a_lone_file_and_a_bag_without_metadata(tmp_path, storage):
     else:
         # all of it is committed: as a file of its own nothing is amiss
         assert read_record(file, recover=True).faults == ()
-    write(tmp_path / 'good', storage).close()
+    recording(tmp_path / 'good', storage).close()
     (tmp_path / 'good' / 'metadata.yaml').unlink()
     record = read_record(tmp_path / 'good', recover=True)
     assert record.n == 4000
@@ -277,7 +139,7 @@ def test_a_lone_file_and_a_bag_without_metadata(tmp_path, storage):
 
 def test_several_files(tmp_path):
     for i, part in enumerate(('bag_0', 'bag_1')):
-        write(tmp_path / part).close()
+        recording(tmp_path / part).close()
         folder = tmp_path / 'bag'
         folder.mkdir(exist_ok=True)
         (tmp_path / part / f'{part}.mcap').rename(folder / f'bag_{i}.mcap')
@@ -290,7 +152,7 @@ def test_several_files(tmp_path):
 
 
 def test_a_stray_file_is_no_part_of_a_bag(tmp_path):
-    write(tmp_path / 'bag').close()
+    recording(tmp_path / 'bag').close()
     (tmp_path / 'bag' / 'stray.mcap').write_bytes(b'')
     assert read_bag(tmp_path / 'bag').faults == ()
 
@@ -317,7 +179,7 @@ def test_truncated_mcap_file(tmp_path, share, metadata):
 
 
 def test_truncated_database(tmp_path):
-    write(tmp_path / 'b', 'sqlite3').close()
+    recording(tmp_path / 'b', 'sqlite3').close()
     file = tmp_path / 'b' / 'b.db3'
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     refused(tmp_path / 'b')
@@ -373,7 +235,7 @@ def test_a_database_that_is_no_bag(tmp_path):
 
 def test_write_ahead_log(tmp_path):
     # rosbag2 can be told to write sqlite3 so; what is only in the log counts
-    write(tmp_path / 'bag', 'sqlite3').close()
+    recording(tmp_path / 'bag', 'sqlite3').close()
     file = tmp_path / 'bag' / 'bag.db3'
     database = sqlite3.connect(file)
     database.execute('PRAGMA journal_mode=WAL').fetchone()
@@ -391,7 +253,7 @@ def test_write_ahead_log(tmp_path):
 def test_both_ways_of_reading_agree(tmp_path):
     for storage in STORAGES:
         path = tmp_path / storage
-        write(path, storage).close()
+        recording(path, storage).close()
         with Reader(path) as reader:
             want = [(c.topic, stamp, bytes(data)) for c, stamp, data in reader.messages()]
             qos = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
@@ -409,17 +271,3 @@ def test_a_name_that_no_disk_takes_is_refused(tmp_path):
         opened_bag(tmp_path / ('x' * 300)),
     ):
         pass
-
-
-def test_lost_messages_are_counted():
-    losses = LossCount()
-    for number in (1, 2, 3, 7, 8):
-        losses.note(number)
-    assert losses.lost == 3
-    # a publisher that starts over, and one far ahead that was there before
-    for number in (1, 2, 90000, 90001):
-        losses.note(number)
-    assert losses.lost == 3
-    # of one that is known to be the same a long silence is a loss
-    losses.note(95001, alone=True)
-    assert losses.lost == 3 + 4999

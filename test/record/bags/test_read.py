@@ -10,7 +10,7 @@ import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
 from piezo_ident.record.bags.write import SAMPLE_QOS, write_bag
-from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples
+from piezo_ident.record.blocks import Dimension, Samples
 from piezo_ident.record.capture import APPLIED, Capture
 from piezo_ident.record.join import join
 from piezo_ident.record.record import Piece, Record, Segment
@@ -40,39 +40,6 @@ def interleave(pairs: Iterable[tuple[Samples, Samples]]) -> list[tuple[str, Samp
 
 def faults(got: Record) -> dict[str, int]:
     return {f.name: f.count for f in got.faults}
-
-
-def test_layout_of_a_block():
-    data, dims = encode(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0]), 'hold:4V', 'voltage'))
-    assert data.tolist() == [0.0, 5.0, 0.1, 6.0]
-    assert dims == (Dimension('sample:hold:4V', 2, 4), Dimension('t,voltage', 2, 2))
-    back = decode(data, dims)
-    assert (back.segment, back.quantity) == ('hold:4V', 'voltage')
-    assert back.t.tolist() == [0.0, 0.1]
-    assert decode(np.r_[9.0, data], dims, data_offset=1).values.tolist() == [5.0, 6.0]
-
-
-@pytest.mark.parametrize(
-    ('dims', 'reason'),
-    [
-        ((), 'is not'),
-        ((Dimension('sample:', 2, 4),), 'is not'),
-        ((Dimension('sample:', 3, 6), Dimension('t,voltage', 2, 2)), 'announces 3 x 2'),
-        ((Dimension('sample:', 2, 4), Dimension('t,voltage', 3, 3)), 'layout 2 x 3'),
-        ((Dimension('sample:', 2, 2), Dimension('t,voltage', 2, 2)), 'strides 2, 2'),
-        ((Dimension('row', 2, 4), Dimension('t,voltage', 2, 2)), "first dimension is 'row'"),
-    ],
-)
-def test_layouts_that_do_not_fit(dims, reason):
-    with pytest.raises(DataError, match=reason):
-        decode(np.zeros(4), dims)
-
-
-def test_no_block_spans_two_segments():
-    got = list(cut_blocks(1050, record().pieces[0].segments))
-    assert got[:4] == [(0, 100, ''), (100, 130, ''), (130, 230, 'noise'), (230, 330, 'noise')]
-    assert got[-1] == (1000, 1050, 'sine:50Hz')
-    assert [b[0] for b in got[1:]] == [b[1] for b in got[:-1]]
 
 
 @pytest.mark.parametrize('start', [0.0, -2.5, 100.0])

@@ -1,0 +1,44 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Blocks of samples as they travel."""
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples
+from piezo_ident.record.record import Segment
+import pytest
+
+
+def test_layout_of_a_block():
+    data, dims = encode(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0]), 'hold:4V', 'voltage'))
+    assert data.tolist() == [0.0, 5.0, 0.1, 6.0]
+    assert dims == (Dimension('sample:hold:4V', 2, 4), Dimension('t,voltage', 2, 2))
+    back = decode(data, dims)
+    assert (back.segment, back.quantity) == ('hold:4V', 'voltage')
+    assert back.t.tolist() == [0.0, 0.1]
+    assert decode(np.r_[9.0, data], dims, data_offset=1).values.tolist() == [5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ('dims', 'reason'),
+    [
+        ((), 'is not'),
+        ((Dimension('sample:', 2, 4),), 'is not'),
+        ((Dimension('sample:', 3, 6), Dimension('t,voltage', 2, 2)), 'announces 3 x 2'),
+        ((Dimension('sample:', 2, 4), Dimension('t,voltage', 3, 3)), 'layout 2 x 3'),
+        ((Dimension('sample:', 2, 2), Dimension('t,voltage', 2, 2)), 'strides 2, 2'),
+        ((Dimension('row', 2, 4), Dimension('t,voltage', 2, 2)), "first dimension is 'row'"),
+    ],
+)
+def test_layouts_that_do_not_fit(dims, reason):
+    with pytest.raises(DataError, match=reason):
+        decode(np.zeros(4), dims)
+
+
+def test_no_block_spans_two_segments():
+    segments = (Segment('noise', 130, 400), Segment('sine:50Hz', 400, 1050))
+    got = list(cut_blocks(1050, segments))
+    assert got[:4] == [(0, 100, ''), (100, 130, ''), (130, 230, 'noise'), (230, 330, 'noise')]
+    assert got[-1] == (1000, 1050, 'sine:50Hz')
+    assert [b[0] for b in got[1:]] == [b[1] for b in got[:-1]]
