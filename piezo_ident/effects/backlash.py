@@ -13,6 +13,7 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.kernels import held
 
 __all__ = ['Backlash']
 
@@ -22,10 +23,7 @@ def _play(x: NDArray[np.float64], width: float, state: float) -> NDArray[np.floa
     out = np.empty(x.size)
     p = state
     for k in range(x.size):
-        if p < x[k] - width:
-            p = x[k] - width
-        if p > x[k] + width:
-            p = x[k] + width
+        p = held(p, x[k] - width, x[k] + width)
         out[k] = p
     return out
 

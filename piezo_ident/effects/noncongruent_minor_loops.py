@@ -15,6 +15,7 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
 from piezo_ident.operators.chain import Block, Slot
 from piezo_ident.operators.hysteresis import HysteresisOperator
+from piezo_ident.operators.kernels import held
 from piezo_ident.operators.play import initial_memory
 
 __all__ = ['NoncongruentMinorLoops']
@@ -35,10 +36,7 @@ def _tilted(
         w = 0.0
         bent = 0.0
         for i in range(r.size):
-            f = memory[i]
-            f = x if f > x else f
-            low = x - r[i]
-            f = low if f < low else f
+            f = held(memory[i], x - r[i], x)
             memory[i] = f
             w += slope[i] * f
             bent += bend[i] * f * f

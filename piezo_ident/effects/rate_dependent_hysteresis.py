@@ -13,6 +13,7 @@ from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.chain import Block, Slot
 from piezo_ident.operators.hysteresis import HysteresisOperator
+from piezo_ident.operators.kernels import held
 
 __all__ = ['RateDependentHysteresis']
 
@@ -40,18 +41,12 @@ def _widened(
         ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
         w = 0.0
         for i in range(n_r):
-            low = x - r[i]
-            g = still[i]
-            g = x if g > x else g
-            g = low if g < low else g
+            g = held(still[i], x - r[i], x)
             still[i] = g
             width = r[i] * wide + more
             low = x - (width if width > 0.0 else 0.0)
             high = x + r[i] * ahead_wide + ahead
-            high = low if high < low else high
-            f = memory[i]
-            f = high if f > high else f
-            f = low if f < low else f
+            f = held(memory[i], low, low if high < low else high)
             memory[i] = f
             w += q[i] * (f - g)
         out[k] = w

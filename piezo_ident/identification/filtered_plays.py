@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.kernel import alive, ordered_kernel
+from piezo_ident.common.kernel import alive, ordered_kernel, STILL
 from piezo_ident.operators.dynamics import Dynamics
-from piezo_ident.operators.kernels import dies_away
 
 __all__ = ['filtered_plays']
 
@@ -98,6 +97,16 @@ def _backward(a: NDArray[np.float64], y: NDArray[np.float64], n: int) -> None:
 
 
 @ordered_kernel
+def _dies_away(y: NDArray[np.float64], start: int, n: int) -> bool:
+    # counted, not looked for: that runs in vector lanes
+    count = 0
+    for k in range(start, start + n):
+        x = y[np.uintp(k)]
+        count += (abs(x) < STILL) & (x != 0.0)
+    return count > 0
+
+
+@ordered_kernel
 def _backward_to_rest(a: NDArray[np.float64], y: NDArray[np.float64], n: int) -> None:
     # the same, number by number; what has died away is zero to the next
     na = np.uintp(a.size)
@@ -138,7 +147,7 @@ def _four_columns(
         _play(v[start : start + n], r, f, w[past_w:])
         _forward(b, w, y[past_y:], n)
         _backward(a, y, n)
-        if dies_away(y, past_y, 4 * n):
+        if _dies_away(y, past_y, 4 * n):
             _forward(b, w, y[past_y:], n)
             _backward_to_rest(a, y, n)
         at = start

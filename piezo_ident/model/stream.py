@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.operators.chain import Block, Chain
-from piezo_ident.operators.fused import fused, FusedOperator
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
+from piezo_ident.operators.hysteresis import HysteresisOperator
+from piezo_ident.operators.kernels import cascade
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
@@ -33,31 +35,30 @@ class Stream:
 
     def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
         self.model = model
-        self._chain = fused(model.chain(memory))
+        self._chain = model.chain(memory)
         self._count = 0
-        # a chain that is one kernel needs no block to pass along, and knows the scaling itself
-        match self._chain.operators:
-            case (FusedOperator() as alone,):
-                s = model.scaling
-                self._alone: FusedOperator | None = alone.scaled(s.v0, s.V, s.y0, s.Y)
-                self._chain = Chain((self._alone,))
-            case _:
-                self._alone = None
         self._started = False
+        self._cascade: _Cascade | None = None
+        match self._chain.operators:
+            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z):
+                self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:
         """Come to rest at a voltage [V] and return the displacement there [m]."""
         u0 = float(self.model.scaling.u(v0))
         self._count, self._started = 0, True
+        if self._cascade is not None:
+            return self._cascade.reset(u0)
         return float(self.model.scaling.y(self._chain.reset(u0, u0)))
 
     def follow(self, piece: Piece) -> NDArray[np.float64]:
         """Return the displacement [m] for the next samples, which are a piece or a part of one."""
-        if self._alone is not None:
-            return self.process(piece.v)
         y = np.empty(piece.n)
         for start in range(0, piece.n, CHUNK):
             cut = slice(start, start + CHUNK)
+            if self._cascade is not None:
+                y[cut] = self.process(piece.v[cut])
+                continue
             channels = {name: x[cut] for name, x in piece.channels.items()}
             y[cut] = self.process(piece.v[cut], piece.time(cut.start, cut.stop), channels)
         return y
@@ -86,8 +87,8 @@ class Stream:
             Voltage [V] and time [s]; the stage was at rest before the first sample.
         """
         self.reset(float(v[0]))
-        if self._alone is not None:
-            self._alone.run(v)
+        if self._cascade is not None:
+            self._cascade.run(v)
             return
         u = self.model.scaling.u(v)
         block = Block(t=t, v=u, x=u)
@@ -121,8 +122,8 @@ class Stream:
             return np.empty(0)
         if not self._started:
             self.reset(float(x[0]))
-        if self._alone is not None:
-            return self._alone.run(x)
+        if self._cascade is not None:
+            return self._cascade.run(x)
         if t is None:
             time = (self._count + np.arange(x.size)) / self.model.sample_rate
         else:
@@ -131,3 +132,44 @@ class Stream:
         u = self.model.scaling.u(x)
         block = self._chain.process(Block(t=time, v=u, x=u, channels=channels or {}))
         return self.model.scaling.y(block.x)
+
+
+class _Cascade:
+    """H, G and z^-d of a model without other effects, in one compiled loop."""
+
+    def __init__(
+        self, model: StageModel, H: HysteresisOperator, G: DynamicsOperator, z: DelayOperator
+    ) -> None:
+        s, h = model.scaling, model.hysteresis
+        self._H, self._G, self._delay = H, G, z.delay
+        self._scale = np.array([s.v0, s.V, s.y0, s.Y])
+        self._hysteresis = np.array(h.thresholds), np.array(h.weights), h.p1, h.p2
+        self._past_w = np.empty(G.b.size - 1)
+        self._past_y = np.empty(max(G.a.size, z.delay.samples + 1))
+
+    def reset(self, u0: float) -> float:
+        """Come to rest and return the displacement there [m]."""
+        w0 = self._H.reset(u0, u0)
+        rest = self._G.reset(u0, w0)
+        self._past_w[:], self._past_y[:] = w0, rest
+        y0, Y = self._scale[2:]
+        return float(y0 + Y * rest)
+
+    def run(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacement [m] for the next samples, shape (n,)."""
+        out = np.empty(v.size)
+        cascade(
+            # a frozen array would be another type to the compiler
+            np.require(v, requirements=['C', 'W']),
+            self._scale,
+            *self._hysteresis,
+            self._H.memory,
+            self._G.b,
+            self._G.a,
+            self._past_w,
+            self._past_y,
+            self._delay.samples,
+            self._delay.fraction,
+            out,
+        )
+        return out

@@ -19,7 +19,7 @@ from piezo_ident.common.arrays import frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.kernels import coefficients, recursion
+from piezo_ident.operators.kernels import dynamics as run_dynamics
 
 __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
 
@@ -190,13 +190,13 @@ def filter_arx(
     -------
     ndarray, shape (n,)
     """
-    n_w, n_y = b.size - 1, a.size
-    w, y = np.empty(n_w + x.size), np.empty(n_y + x.size)
-    w[n_w:] = x
-    w[:n_w] = x[0] if at_rest else 0.0
-    y[:n_y] = x[0] * _static_gain(b, a) if at_rest else 0.0
-    recursion(*coefficients(b, a), w, y)
-    return y[n_y:]
+    past_w, past_y = b.size - 1, a.size
+    w, y = np.empty(past_w + x.size), np.empty(past_y + x.size)
+    w[past_w:] = x
+    w[:past_w] = x[0] if at_rest else 0.0
+    y[:past_y] = x[0] * _static_gain(b, a) if at_rest else 0.0
+    run_dynamics(w, b[::-1].copy(), a[::-1].copy(), y)
+    return y[past_y:]
 
 
 @kernel
@@ -221,12 +221,19 @@ def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:
 
 
 class DynamicsOperator:
-    """G as a link of the chain, with its state."""
+    """
+    G as a link of the chain.
+
+    Attributes
+    ----------
+    b, a : ndarray, shape (nb,) and (na,)
+        Coefficients from the oldest sample to the newest.
+    """
 
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics = dynamics
-        self._coefficients = coefficients(dynamics.b, dynamics.a)
-        self._past_w, self._past_y = np.zeros(dynamics.b.size - 1), np.zeros(dynamics.a.size)
+        self.b, self.a = dynamics.b[::-1].copy(), dynamics.a[::-1].copy()
+        self._past_w, self._past_y = np.zeros(self.b.size - 1), np.zeros(self.a.size)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to equilibrium with a constant signal."""
@@ -236,12 +243,13 @@ class DynamicsOperator:
 
     def process(self, block: Block) -> Block:
         """Return the block filtered."""
+        n, na = block.x.size, self.a.size
         w = np.concatenate([self._past_w, block.x])
-        y = np.empty(self._past_y.size + block.x.size)
-        y[: self._past_y.size] = self._past_y
-        recursion(*self._coefficients, w, y)
-        self._past_w, self._past_y = w[block.x.size :].copy(), y[block.x.size :].copy()
-        return block.with_signal(y[self._past_y.size :])
+        y = np.empty(na + n)
+        y[:na] = self._past_y
+        run_dynamics(w, self.b, self.a, y)
+        self._past_w, self._past_y = w[n:].copy(), y[n:].copy()
+        return block.with_signal(y[na:])
 
 
 @dataclass(frozen=True)

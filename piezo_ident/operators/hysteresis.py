@@ -122,6 +122,11 @@ class HysteresisOperator:
     def __init__(self, hysteresis: Hysteresis, memory: ArrayLike | None = None) -> None:
         self.hysteresis = hysteresis
         self._given = None if memory is None else np.array(memory, np.float64)
+        if self._given is not None and self._given.shape != hysteresis.thresholds.shape:
+            raise ModelError(
+                f'hysteresis: {self._given.size} play outputs at the start for '
+                f'{hysteresis.thresholds.size} thresholds; give one each'
+            )
         self.memory = hysteresis.initial_memory(0.0)
 
     def reset(self, v0: float, x0: float) -> float:

@@ -2,45 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Play operators in compiled kernels.
+Play operators.
 
     F_r[v](t) = max(v(t) - r, min(v(t), F_r[v](t-)))        r >= 0                       (eqs. 1-2)
 
 of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.  This is the one-sided play: F_r
-stays within [v - r, v], and F_0[v] = v.  The kernels release the interpreter lock.
+stays within [v - r, v], and F_0[v] = v.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.kernel import kernel
-from piezo_ident.operators.kernels import sum_of_plays
+from piezo_ident.operators.kernels import hysteresis, plays
 
 __all__ = ['initial_memory', 'play', 'play_columns', 'weighted_plays']
-
-# Comparisons are written out: the NaN rules of max() and min() would keep the compiler from
-# vectorising over the thresholds.
-
-
-@kernel
-def _columns(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    for i in range(r.size):
-        f = memory[i]
-        width = r[i]
-        for k in range(v.size):
-            x = v[k]
-            if f > x:
-                f = x
-            if f < x - width:
-                f = x - width
-            out[i, k] = f
-        memory[i] = f
 
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
@@ -87,7 +63,7 @@ def play_columns(
     r = np.ascontiguousarray(thresholds, dtype=np.float64)
     start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
     out = np.empty((r.size, x.size))
-    _columns(x, r, start, out)
+    plays(x, r, start, out)
     return out
 
 
@@ -129,5 +105,5 @@ def weighted_plays(
     x = np.ascontiguousarray(v)
     end = memory.copy()
     out = np.empty(x.size)
-    sum_of_plays(x, thresholds, weights, p1, p2, end, out)
+    hysteresis(x, thresholds, weights, p1, p2, end, out)
     return out, end
