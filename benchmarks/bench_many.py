@@ -31,12 +31,12 @@ for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
 
 from distributed import LocalCluster
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.record.io import write_record
 from side_by_side import markdown, ratio, take_turns
 
 HOME = Path(__file__).resolve().parents[1]
@@ -93,7 +93,7 @@ def make_records(folder: Path, n: int) -> None:
     sequence = parse_program(PROGRAM).build(RATE)
     for i, stage in enumerate(stages(n)):
         path = folder / f'stage_{i + 1:03d}.npz'
-        write_record(stage.play(sequence, np.random.default_rng(i)), path)
+        pi.write(stage.play(sequence, np.random.default_rng(i)), path)
     broken = folder / f'stage_{2 * n // 3:03d}.npz'
     broken.write_bytes(broken.read_bytes()[:20_000])
 

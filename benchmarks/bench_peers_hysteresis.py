@@ -34,12 +34,12 @@ import warnings
 
 from numba import njit
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Record
 from side_by_side import markdown, seconds, take_turns, Turn, versions
 
@@ -409,7 +409,7 @@ def measured(quick: bool) -> str:
             f'Not run: {MEASURED} is not in {DATA.name}/; set `PIEZO_IDENT_DATA` to the folder of '
             'measured records.'
         )
-    record = read_record(path)
+    record = pi.read(path)
     (piece,) = record.pieces
     rate = piece.sample_rate
     n_fit = piece.n - round(HELD * rate)

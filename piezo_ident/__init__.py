@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from piezo_ident.model.free_run import free_run, FreeRun
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
-    from piezo_ident.record.io import read_record as read
-    from piezo_ident.record.io import write_record as write
+    from piezo_ident.record.io import read, write
     from piezo_ident.record.record import Record
     from piezo_ident.report.folder import write_report
 
@@ -70,8 +69,8 @@ _HOMES = {
     'free_run': 'model.free_run',
     'identify': 'identification.identify',
     'load': 'model.files',
-    'read': 'record.io:read_record',
-    'write': 'record.io:write_record',
+    'read': 'record.io',
+    'write': 'record.io',
     'write_report': 'report.folder',
 }
 

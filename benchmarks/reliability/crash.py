@@ -37,11 +37,11 @@ import warnings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.cli import main as piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.figures import draw  # noqa: F401 - loaded once, not in every copy
 from piezo_ident.report.folder import put_in_place
@@ -120,7 +120,7 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
     """
     stage, samples = inputs / 'model.yaml', inputs / 'record.npz'
     SimulatedStage.load('stage_paper').model.save(stage)
-    write_record(record(60_000), samples, overwrite=True)
+    pi.write(record(60_000), samples, overwrite=True)
 
     def command(*words: object) -> Callable[[Path], int]:
         return lambda folder: piezo_ident([str(w).replace('OUT', str(folder)) for w in words])
@@ -162,7 +162,7 @@ def digest(path: Path) -> str:
     if not path.exists():
         return 'nothing'
     if path.is_dir() or path.suffix in ('.mcap', '.db3', '.npz', '.mat'):
-        record = read_record(path)
+        record = pi.read(path)
         return hashlib.sha1(b''.join(p.v.tobytes() + p.y.tobytes() for p in record)).hexdigest()
     if path.suffix == '.png' and path.parent.name != 'report':
         data = path.read_bytes()
@@ -288,7 +288,7 @@ def old_outputs(folder: Path, works: list[Job]) -> None:
             path = folder / name
             path.parent.mkdir(exist_ok=True)
             if name in FORMATS:
-                write_record(old, path, overwrite=True)
+                pi.write(old, path, overwrite=True)
             else:
                 path.write_text('old\n')
 

@@ -20,7 +20,7 @@ from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.record.io import write_record
+from piezo_ident.record import io as record_io
 
 __all__ = ['run']
 
@@ -60,7 +60,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
     with interrupts.waiting():
-        losses = write_record(
+        losses = record_io.write(
             record,
             out,
             overwrite=args.overwrite,
@@ -85,7 +85,7 @@ def convert_command(args: argparse.Namespace, console: Console) -> None:
     check_record_output(args)
     record = read(args.record, args)
     with interrupts.waiting():
-        losses = write_record(record, args.out, overwrite=args.overwrite, storage=args.storage)
+        losses = record_io.write(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
         f'{record.duration:.6g} s'

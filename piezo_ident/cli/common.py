@@ -17,7 +17,8 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.many.run import MARK
-from piezo_ident.record.io import read_record
+from piezo_ident.record import io as record_io
+from piezo_ident.record.assemble import ReadOptions
 from piezo_ident.record.record import Record
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     'expand',
     'expand_apart',
     'naming',
+    'options_of',
     'read',
     'read_all',
     'say_faults',
@@ -156,19 +158,20 @@ def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
 def read(path: Path, args: argparse.Namespace) -> Record:
     """Read one record as the options say."""
     check_bag_options([path], args)
-    return read_record(path, **_reading(args))
+    return record_io.read(path, options_of(args))
 
 
-def _reading(args: argparse.Namespace) -> dict[str, Any]:
-    return {
-        'displacement_unit': args.displacement_unit,
-        'voltage_limits': check_limits(args),
-        'namespace': args.namespace,
-        'voltage_topic': args.voltage_topic,
-        'displacement_topic': args.displacement_topic,
+def options_of(args: argparse.Namespace) -> ReadOptions:
+    """Return how records are to be read."""
+    return ReadOptions(
+        displacement_unit=args.displacement_unit,
+        voltage_limits=check_limits(args),
+        namespace=args.namespace,
+        voltage_topic=args.voltage_topic,
+        displacement_topic=args.displacement_topic,
         # saving what is whole of a bag is for convert; the others send there
-        'recover': args.verb == 'convert',
-    }
+        recover=args.verb == 'convert',
+    )
 
 
 def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
@@ -178,7 +181,7 @@ def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
     records = []
     for path in paths:
         try:
-            record = read_record(path, **_reading(args))
+            record = record_io.read(path, options_of(args))
             records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
         except DataError as error:
             if len(paths) == 1 or '--displacement-unit' not in str(error):

@@ -8,10 +8,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from piezo_ident.cli.common import check_bag_options, check_limits, expand
+from piezo_ident.cli.common import check_bag_options, expand, options_of
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import temporary_output
@@ -51,7 +50,7 @@ def check_each(args: argparse.Namespace) -> None:
 
 def identify_each(args: argparse.Namespace, settings: Settings, console: Console) -> None:
     """Run ``piezo_ident identify RECORD... --each DIR``."""
-    _each(args, Identify(settings, _reading(args)), console)
+    _each(args, Identify(settings, options_of(args)), console)
 
 
 def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console: Console) -> None:
@@ -59,17 +58,7 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     if not args.model_file.is_dir():
         # a bad model is one error, not one a record
         load(args.model_file)
-    _each(args, Diagnose(args.model_file.absolute(), settings, _reading(args)), console)
-
-
-def _reading(args: argparse.Namespace) -> dict[str, Any]:
-    return {
-        'displacement_unit': args.displacement_unit,
-        'voltage_limits': check_limits(args),
-        'namespace': args.namespace,
-        'voltage_topic': args.voltage_topic,
-        'displacement_topic': args.displacement_topic,
-    }
+    _each(args, Diagnose(args.model_file.absolute(), settings, options_of(args)), console)
 
 
 def _each(args: argparse.Namespace, task: Task, console: Console) -> None:

@@ -14,8 +14,9 @@ __all__ = ['frozen_array', 'robust_range']
 
 #: numbers taken together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
-#: share of the range by which numbers may leave it without a neighbour
-_LONE = 0.25
+#: share of the range, and multiple of the usual step between two numbers, by which one without
+#: neighbours may leave the range
+_LONE, _STEPS = 0.25, 4.0
 
 
 def frozen_array(values: ArrayLike) -> NDArray[np.float64]:
@@ -33,8 +34,8 @@ def robust_range(parts: Iterable[NDArray[np.float64]]) -> tuple[float, float]:
     Return the smallest and largest of measured numbers, but for wild ones.
 
     What three samples in a row reach belongs to the range; one or two alone may leave it by a
-    quarter of its width at most, and are left out beyond.  So the range of sound data is that from
-    their minimum to their maximum.
+    quarter of its width and four times the usual step from sample to sample, and are left out
+    beyond.  So the range of sound data, noise included, is that from minimum to maximum.
 
     Parameters
     ----------
@@ -48,19 +49,21 @@ def robust_range(parts: Iterable[NDArray[np.float64]]) -> tuple[float, float]:
 
     Examples
     --------
-    >>> robust_range([np.array([0.0, 1.0, 2.0, 3.0, 2.0, 90.0, 1.0, 0.0])])
+    >>> import numpy as np
+    >>> robust_range([np.array([0.0, 0.0, 1.0, 3.0, 3.0, 3.0, 90.0, 2.0, 1.0, 0.0])])
     (0.0, 3.0)
     """
     filled = [x for x in parts if x.size]
     if not filled:
         return 0.0, 0.0
-    low, high = np.inf, -np.inf
+    low, high, step = np.inf, -np.inf, 0.0
     for x in _chunks(filled, overlap=2):
         if x.size >= 3:
+            step = max(step, float(np.median(np.abs(np.diff(x)))))
             high = max(high, float(np.minimum(np.minimum(x[:-2], x[1:-1]), x[2:]).max()))
             low = min(low, float(np.maximum(np.maximum(x[:-2], x[1:-1]), x[2:]).min()))
     if low <= high:
-        slack = _LONE * (high - low)
+        slack = _LONE * (high - low) + _STEPS * step
         low, high = low - slack, high + slack
     else:  # fewer than three, or no three alike
         low, high = -np.inf, np.inf

@@ -10,7 +10,7 @@ nothing but the same folders.  A record that fails is a row with a reason; it st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
 import json
@@ -29,7 +29,8 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.many.table import diagnosed, identified, natural, Row
 from piezo_ident.many.workers import completed, dask, processes
 from piezo_ident.model.files import load
-from piezo_ident.record.io import read_record
+from piezo_ident.record import io as record_io
+from piezo_ident.record.assemble import ReadOptions
 
 __all__ = ['Diagnose', 'Identify', 'Task', 'run_many']
 
@@ -44,17 +45,16 @@ class Identify:
     Attributes
     ----------
     settings : Settings
-    reading : mapping
-        Options of `piezo_ident.read`.
+    reading : ReadOptions
     """
 
     settings: Settings = field(default_factory=Settings)
-    reading: Mapping[str, Any] = field(default_factory=dict)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     verb = 'identify'
 
     def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
         """Identify a record, write its model and its report, and return its row."""
-        record = read_record(path, **self.reading)
+        record = record_io.read(path, self.reading)
         result = identify(record, self.settings)
         result.model.save(model_file)
         if report is not None:
@@ -75,13 +75,12 @@ class Diagnose:
         A model file for all records, or a folder with ``NAME.yaml`` for each, such as the folder
         that an identification of many records wrote.
     settings : DiagnosisSettings
-    reading : mapping
-        Options of `piezo_ident.read`.
+    reading : ReadOptions
     """
 
     models: Path
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
-    reading: Mapping[str, Any] = field(default_factory=dict)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     verb = 'diagnose'
 
     def model_of(self, name: str) -> Path:
@@ -94,7 +93,7 @@ class Diagnose:
     def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
         """Diagnose a record, write the refined model and the report, and return its row."""
         given = self.model_of(name)
-        record = read_record(path, **self.reading)
+        record = record_io.read(path, self.reading)
         result = diagnose(load(given), record, self.settings)
         result.model.save(model_file)
         if report is not None:

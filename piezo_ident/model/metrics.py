@@ -23,8 +23,8 @@ def percent(rms: float, stroke: float) -> float:
     """
     Return ``100 rms / stroke``; infinite when the stroke is zero and the error is not.
 
-    >>> percent(0.5e-6, 50e-6), percent(1e-9, 0.0)
-    (1.0, inf)
+    >>> percent(2.0, 50.0), percent(1e-9, 0.0)
+    (4.0, inf)
     """
     if stroke == 0.0:
         return 0.0 if rms == 0.0 else float('inf')

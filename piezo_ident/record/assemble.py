@@ -12,7 +12,7 @@ out.  What would need a guess is refused, and the message says what to do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import itertools
 
 import numpy as np
@@ -22,7 +22,7 @@ from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.ordering import at_times, in_order, Rows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 
-__all__ = ['UNITS', 'SegmentStarts', 'assemble', 'label_runs']
+__all__ = ['UNITS', 'ReadOptions', 'SegmentStarts', 'assemble', 'label_runs']
 
 #: label of each stretch and the row at which it begins; it lasts until the next begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
@@ -50,6 +50,42 @@ MAX_NOT_FINITE = 0.01
 MAX_TIME = 1e11
 
 
+@dataclass(frozen=True)
+class ReadOptions:
+    """
+    How records are read; what does not concern a format is not looked at.
+
+    Parameters
+    ----------
+    displacement_unit : {'m', 'mm', 'um', 'nm'}
+        Unit of the displacement in the file.
+    voltage_limits : tuple of float, optional
+        Smallest and largest voltage [V] that may occur.
+    namespace, voltage_topic, displacement_topic : str, optional
+        Which topics of a bag to take, when it holds several stages.
+    recover : bool, optional
+        Read an unfinished bag as far as it goes instead of refusing it.
+
+    Raises
+    ------
+    DataError
+        When the unit is unknown.
+    """
+
+    displacement_unit: str = 'm'
+    voltage_limits: tuple[float, float] | None = None
+    namespace: str | None = None
+    voltage_topic: str | None = None
+    displacement_topic: str | None = None
+    recover: bool = False
+
+    def __post_init__(self) -> None:
+        if self.displacement_unit not in UNITS:
+            raise DataError(
+                f'unknown displacement unit {self.displacement_unit!r}; use m, mm, um or nm'
+            )
+
+
 def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
     """
     Return the label of each stretch and the row at which it begins, from one label a row.
@@ -73,8 +109,7 @@ def assemble(
     channels: Mapping[str, ArrayLike] | None = None,
     *,
     name: str,
-    displacement_unit: str = 'm',
-    voltage_limits: tuple[float, float] | None = None,
+    options: ReadOptions | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
 ) -> Record:
@@ -87,17 +122,15 @@ def assemble(
     Parameters
     ----------
     t, v, y : array_like, shape (n,)
-        Time [s], command voltage [V] and displacement [`displacement_unit`].
+        Time [s], command voltage [V] and displacement [``options.displacement_unit``].
     segments : tuple of (names, starts), optional
         Label of each stretch and the row at which it begins; an empty label means none.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals.
     name : str
         What errors call the data, and the record's name.
-    displacement_unit : {'m', 'mm', 'um', 'nm'}
-        Unit of `y`.
-    voltage_limits : tuple of float, optional
-        Smallest and largest voltage [V] that may occur.
+    options : ReadOptions, optional
+        Unit of `y`, and limits of `v`.
     sample_rate : float, optional
         Rate that the file names [Hz]; the stamps must agree with it.
     faults : iterable of Fault
@@ -113,21 +146,18 @@ def assemble(
     DataError
         For data that cannot be used without a guess.
     """
+    options = options or ReadOptions()
     met = list(faults)
     table = _table(t, v, y, segments, channels or {}, name)
-    if displacement_unit not in UNITS:
-        raise DataError(
-            f'{name}: unknown displacement unit {displacement_unit!r}; use m, mm, um or nm'
-        )
     table = _drop_not_finite(table, name, met)
     if not table.t.size:
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
-    if UNITS[displacement_unit] != 1.0:
-        scaled = table.columns['y'] / UNITS[displacement_unit]
+    if UNITS[options.displacement_unit] != 1.0:
+        scaled = table.columns['y'] / UNITS[options.displacement_unit]
         table = replace(table, columns={**table.columns, 'y': scaled})
-    _check_limits(table, voltage_limits, name)
-    _check_ranges(table, displacement_unit, name)
+    _check_limits(table, options.voltage_limits, name)
+    _check_ranges(table, options.displacement_unit, name)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
 

@@ -20,7 +20,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.assemble import assemble
+from piezo_ident.record.assemble import assemble, ReadOptions
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.join import join
 from piezo_ident.record.ordering import at_times
@@ -58,8 +58,7 @@ def record_of_streams(
     *,
     name: str,
     tolerance: float | None = None,
-    displacement_unit: str = 'm',
-    voltage_limits: tuple[float, float] | None = None,
+    options: ReadOptions | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
 ) -> Record:
@@ -78,7 +77,7 @@ def record_of_streams(
     tolerance : float, optional
         Difference of command and applied voltage that counts as none [V]; a thousandth of the
         range when absent.
-    displacement_unit, voltage_limits, sample_rate, faults
+    options, sample_rate, faults
         As for `piezo_ident.record.assemble.assemble`.
 
     Raises
@@ -128,8 +127,7 @@ def record_of_streams(
         segments,
         {key[2:]: x for key, x in columns.items()},
         name=name,
-        displacement_unit=displacement_unit,
-        voltage_limits=voltage_limits,
+        options=options,
         sample_rate=sample_rate,
         faults=met,
     )

@@ -6,34 +6,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 import re
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
-from piezo_ident.record.assemble import assemble
+from piezo_ident.record.assemble import assemble, ReadOptions
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.tables import blocks_of, labels_of, READERS, WRITERS
 
-__all__ = ['read_record', 'write_record']
+__all__ = ['read', 'write']
 
 _FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 
 
-def read_record(
-    path: str | Path,
-    *,
-    displacement_unit: str = 'm',
-    voltage_limits: tuple[float, float] | None = None,
-    namespace: str | None = None,
-    voltage_topic: str | None = None,
-    displacement_topic: str | None = None,
-    recover: bool = False,
-) -> Record:
+def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
     """
     Read a record of any format.
 
@@ -41,14 +34,11 @@ def read_record(
     ----------
     path : path
         A bag folder, .mcap, .db3, .csv, .npz or .mat.
-    displacement_unit : {'m', 'mm', 'um', 'nm'}
-        Unit of the displacement in the file.
-    voltage_limits : tuple of float, optional
-        Smallest and largest voltage [V] that may occur.
-    namespace, voltage_topic, displacement_topic : str, optional
-        Which topics of a bag to take, when it holds several stages.
-    recover : bool, optional
-        Read an unfinished bag as far as it goes instead of refusing it.
+    options : ReadOptions, optional
+    **choices
+        Fields of `ReadOptions`, in place of those of `options`: ``displacement_unit='um'``,
+        ``voltage_limits=(0, 10)``; for bags ``namespace``, ``voltage_topic``,
+        ``displacement_topic``, and ``recover=True`` for an unfinished one.
 
     Returns
     -------
@@ -59,22 +49,26 @@ def read_record(
     ------
     DataError
         When the file cannot be used; the message names the file, the place and the cure.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> v = np.sin(0.01 * np.arange(2000))
+    >>> pi.write(pi.Record.from_arrays(v, 7.5e-6 * v, sample_rate=1000.0), 'record.csv')
+    ()
+    >>> record = pi.read('record.csv', displacement_unit='m', voltage_limits=(-1.0, 1.0))
+    >>> record.n, round(1e6 * record.stroke)
+    (2000, 15)
     """
+    options = replace(options or ReadOptions(), **choices)
     path = Path(path)
     suffix = path.suffix.lower()
     broken = broken_link(path)
     if broken:
         raise DataError(f'{path}: {broken}')
     if path.is_dir() or suffix in ('.mcap', '.db3'):
-        return read_bag(
-            path,
-            namespace=namespace,
-            voltage_topic=voltage_topic,
-            displacement_topic=displacement_topic,
-            displacement_unit=displacement_unit,
-            voltage_limits=voltage_limits,
-            recover=recover,
-        )
+        return read_bag(path, options)
     if not path.exists():
         raise DataError(f'{path}: does not exist; check the name')
     check_regular(path)
@@ -93,13 +87,12 @@ def read_record(
         (table.names, table.starts),
         {name[2:]: x for name, x in columns.items()},
         name=str(path),
-        displacement_unit=displacement_unit,
-        voltage_limits=voltage_limits,
+        options=options,
         faults=[Fault('ignored_column', repr(c), 1, 'not read') for c in table.ignored],
     ).renamed(path.name)
 
 
-def write_record(
+def write(
     record: Record,
     path: str | Path,
     *,
@@ -132,6 +125,16 @@ def write_record(
     ------
     DataError
         When the record does not fit into a file, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('minor_loops'))
+    >>> pi.write(record, 'minor_loops.npz')
+    ()
+    >>> pi.read('minor_loops.npz').n == record.n
+    True
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -10,12 +10,13 @@ sample is unusable, a new piece begins, because the stage's memory at its start 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array, robust_range
 from piezo_ident.common.errors import DataError
 
@@ -213,6 +214,69 @@ class Record:
         """Iterate over the pieces."""
         return iter(self.pieces)
 
+    @classmethod
+    def from_arrays(
+        cls,
+        *arrays: ArrayLike,
+        sample_rate: float | None = None,
+        segments: tuple[Sequence[str], ArrayLike] | None = None,
+        channels: Mapping[str, ArrayLike] | None = None,
+        displacement_unit: str = 'm',
+        voltage_limits: tuple[float, float] | None = None,
+        name: str = 'record',
+    ) -> Record:
+        """
+        Return the record of measured arrays, checked as those of a file are.
+
+        Parameters
+        ----------
+        *arrays : array_like, shape (n,)
+            ``t, v, y``, or ``v, y`` with a `sample_rate`: time [s], voltage [V], and displacement
+            [`displacement_unit`].
+        sample_rate : float, optional
+            Samples a second [Hz]; with `t` the rate that its stamps must agree with.
+        segments : tuple of (names, starts), optional
+            Label of each stretch and the sample at which it begins; an empty label means none.
+        channels : mapping of str to array_like, shape (n,), optional
+            Further measured signals.
+        displacement_unit : {'m', 'mm', 'um', 'nm'}
+        voltage_limits : tuple of float, optional
+            Smallest and largest voltage [V] that may occur.
+        name : str
+
+        Returns
+        -------
+        Record
+            In SI units; its `faults` say what was wrong with the data and what was done about it.
+
+        Raises
+        ------
+        DataError
+            When the arrays cannot be used.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import piezo_ident as pi
+        >>> v = 5 + 5 * np.sin(2 * np.pi * np.arange(20000) / 20000)
+        >>> record = pi.Record.from_arrays(v, 7.5 * v, sample_rate=20e3, displacement_unit='um')
+        >>> record.n, record.duration, round(1e6 * record.stroke)
+        (20000, 1.0, 75)
+        """
+        from piezo_ident.record.assemble import assemble, ReadOptions
+
+        if sample_rate is not None and not 0.0 < sample_rate < float('inf'):
+            raise DataError(f'{name}: sample_rate must be positive, got {sample_rate} Hz')
+        if sample_rate is not None and len(arrays) == 2:
+            arrays = (np.arange(np.size(arrays[0])) / sample_rate, *arrays)
+        if len(arrays) != 3:
+            raise DataError(f'{name}: give t, v and y, or v and y with sample_rate')
+        options = ReadOptions(displacement_unit, voltage_limits)
+        t, v, y = arrays
+        return assemble(
+            t, v, y, segments, channels, name=name, options=options, sample_rate=sample_rate
+        )
+
     @property
     def n(self) -> int:
         """Number of samples in all pieces."""
@@ -242,6 +306,20 @@ class Record:
     def find(self, kind: str) -> list[Piece]:
         """Return every segment of a kind, or of a full label, as a piece of its own."""
         return [p.cut(s.start, s.stop) for p in self for s in p.find(kind)]
+
+    def _repr_html_(self) -> str:
+        rates = ', '.join(f'{rate:g}' for rate in dict.fromkeys(p.sample_rate for p in self))
+        low, high = self.voltage_range
+        rows = [
+            ('samples', f'{self.n} in {len(self.pieces)} pieces'),
+            ('duration', f'{self.duration:.4g} s at {rates} Hz'),
+            ('voltage', f'{low:.4g} .. {high:.4g} V'),
+            ('stroke', f'{1e6 * self.stroke:.4g} \u00b5m'),
+            *([('segments', ', '.join(self.labels))] if self.labels else []),
+            *(('fault', str(fault)) for fault in self.faults),
+        ]
+        cells = ''.join(f'<tr><th>{name}</th><td>{escape(x)}</td></tr>' for name, x in rows)
+        return f'<table><caption>{escape(self.name)}</caption>{cells}</table>'
 
     def renamed(self, name: str) -> Record:
         """Return the same record under another name."""

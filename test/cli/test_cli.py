@@ -17,6 +17,7 @@ import sys
 import time
 
 import numpy as np
+import piezo_ident as pi
 from piezo_ident import __version__
 from piezo_ident.cli import main
 from piezo_ident.cli.common import expand
@@ -26,7 +27,6 @@ from piezo_ident.cli.outputs import check_file, check_folder
 from piezo_ident.common.config import find_config, shipped_names
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.model.files import load
-from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record
 import pytest
 import yaml
@@ -153,7 +153,7 @@ def test_simulate_is_repeatable_and_its_seed_counts(capsys, tmp_path, made):
         out = tmp_path / name
         files = ['--config', made / 'stage.yaml', '--program', made / 'sine.yaml']
         succeed(capsys, 'simulate', *files, *more, out)
-        return read_record(out).pieces[0].y
+        return pi.read(out).pieces[0].y
 
     first = simulated('a.csv')
     np.testing.assert_array_equal(simulated('b.mat'), first)
@@ -165,7 +165,7 @@ def test_simulate_json(capsys, tmp_path, made):
     files = ['--config', made / 'stage.yaml', '--program', made / 'program.yaml']
     data = json.loads(succeed(capsys, 'simulate', *files, '--json', tmp_path / 'r.npz'))
     assert data['seed'] == 7
-    assert data['samples'] == read_record(tmp_path / 'r.npz').n
+    assert data['samples'] == pi.read(tmp_path / 'r.npz').n
     assert {'noise', 'triangle', 'step'} <= set(data['labels'])
 
 
@@ -180,7 +180,7 @@ def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made
     assert picture.read_bytes().startswith(b'\x89PNG')
     table = np.genfromtxt(out, delimiter=',', names=True)
     assert table.dtype.names == ('t', 'v', 'y', 'y_hat')
-    piece = read_record(made / 'sine.csv').pieces[0]
+    piece = pi.read(made / 'sine.csv').pieces[0]
     np.testing.assert_array_equal(table['y'], piece.y)
     np.testing.assert_array_equal(table['y_hat'], model.predict_piece(piece))
     data = json.loads(succeed(capsys, *argv[:3], '--json', '--out', tmp_path / 'y.npz'))
@@ -195,9 +195,9 @@ def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made
 
 
 def test_predict_estimates_an_unknown_start_and_says_so(capsys, tmp_path, made):
-    piece = read_record(made / 'sine.csv').pieces[0]
+    piece = pi.read(made / 'sine.csv').pieces[0]
     cut = Record((piece.cut(piece.n // 2 + 130, piece.n),))
-    write_record(cut, tmp_path / 'cut.npz')
+    pi.write(cut, tmp_path / 'cut.npz')
     argv = ['predict', made / 'model.yaml', tmp_path / 'cut.npz']
     text = succeed(capsys, *argv)
     assert 'start forgotten' in text
@@ -211,14 +211,14 @@ def test_predict_estimates_an_unknown_start_and_says_so(capsys, tmp_path, made):
 def test_predict_warns_outside_the_identified_range(capsys, tmp_path, made):
     t = np.arange(2000) / 2000.0
     v = 14.0 * np.sin(np.pi * t) ** 2
-    write_record(Record((Piece(v, 7e-6 * v, 2000.0),)), tmp_path / 'far.csv')
+    pi.write(Record((Piece(v, 7e-6 * v, 2000.0),)), tmp_path / 'far.csv')
     text = succeed(capsys, 'predict', made / 'model.yaml', tmp_path / 'far.csv')
     assert 'outside the identified range' in text
 
 
 def test_predict_tells_an_offset_from_a_bad_model(capsys, tmp_path, made):
-    piece = read_record(made / 'sine.csv').pieces[0]
-    write_record(Record((replace(piece, y=piece.y + 5e-6),)), tmp_path / 'shifted.npz')
+    piece = pi.read(made / 'sine.csv').pieces[0]
+    pi.write(Record((replace(piece, y=piece.y + 5e-6),)), tmp_path / 'shifted.npz')
     argv = ['predict', made / 'model.yaml', tmp_path / 'shifted.npz']
     text = succeed(capsys, *argv)
     assert '% after removing a mean of 5.00' in text
@@ -246,8 +246,8 @@ def test_summary_of_a_stage_that_retracts(capsys, tmp_path, made):
     rows = {line.split(',')[0]: line.split() for line in text.splitlines() if ', held out' in line}
     assert rows['record.npz idle'][-2] == '–'
     assert float(rows['record.npz ramp'][-2]) > 99
-    piece = read_record(made / 'record.npz').pieces[0]
-    write_record(Record((replace(piece, y=-piece.y),)), tmp_path / 'r.npz')
+    piece = pi.read(made / 'record.npz').pieces[0]
+    pi.write(Record((replace(piece, y=-piece.y),)), tmp_path / 'r.npz')
     text = succeed(capsys, 'identify', tmp_path / 'r.npz', *FAST)
     assert 'direction     retracts with rising voltage\n' in text
 
@@ -255,7 +255,7 @@ def test_summary_of_a_stage_that_retracts(capsys, tmp_path, made):
 def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
     folder = tmp_path / 'in'
     folder.mkdir()
-    write_record(read_record(made / 'record.npz'), folder / 'bag')
+    pi.write(pi.read(made / 'record.npz'), folder / 'bag')
     (folder / 'notes.txt').write_text('not a record')
     model, report = tmp_path / 'm.yaml', tmp_path / 'deep' / 'report'
     model.write_text('an older one')
@@ -273,12 +273,12 @@ def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
 
 @pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3', 'bag'])
 def test_convert_round_trip(capsys, tmp_path, made, name):
-    record = read_record(made / 'record.npz')
+    record = pi.read(made / 'record.npz')
     there, back = tmp_path / name, tmp_path / 'back.npz'
     data = json.loads(succeed(capsys, 'convert', '--json', made / 'record.npz', there))
     assert (data['faults'], data['not_kept']) == ([], [])
     succeed(capsys, 'convert', there, back)
-    again = read_record(back)
+    again = pi.read(back)
     np.testing.assert_array_equal(again.pieces[0].y, record.pieces[0].y)
     assert again.labels == record.labels
 
@@ -290,7 +290,7 @@ def test_convert_refuses_to_replace_unless_told(capsys, tmp_path, made):
     refuse(capsys, tmp_path, argv, out, '--overwrite')
     assert out.read_text() == 'precious'
     succeed(capsys, *argv, '--overwrite')
-    assert read_record(out).n == read_record(made / 'record.npz').n
+    assert pi.read(out).n == pi.read(made / 'record.npz').n
 
 
 def test_convert_keeps_its_input(capsys, tmp_path, made):
@@ -383,7 +383,7 @@ def test_a_unit_converts(capsys, tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text(csv_text(y=7.5 * table()['v']))
     succeed(capsys, 'convert', '--displacement-unit', 'µm', path, tmp_path / 'r.npz')
-    assert read_record(tmp_path / 'r.npz').stroke == pytest.approx(75e-6, rel=1e-3)
+    assert pi.read(tmp_path / 'r.npz').stroke == pytest.approx(75e-6, rel=1e-3)
 
 
 def test_one_unit_for_all_records(capsys, tmp_path, made):
@@ -415,7 +415,7 @@ def test_truncated_bag(capsys, tmp_path, made, storage):
     refuse(capsys, tmp_path, ['identify', bag], bag, 'piezo_ident convert')
     out = succeed(capsys, 'convert', bag, tmp_path / 'r.csv')
     assert 'truncated_bag' in out
-    assert 1000 < read_record(tmp_path / 'r.csv').n < read_record(made / 'record.npz').n
+    assert 1000 < pi.read(tmp_path / 'r.csv').n < pi.read(made / 'record.npz').n
 
 
 def test_bag_without_the_topics(capsys, tmp_path, made):

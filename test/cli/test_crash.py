@@ -10,10 +10,10 @@ import os
 from pathlib import Path
 import sys
 
+import piezo_ident as pi
 from piezo_ident.common import files as output
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
-from piezo_ident.record.io import read_record, write_record
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +52,7 @@ def test_no_room_and_no_right(tmp_path, works, options):
 @pytest.mark.parametrize('swaps', [True, False])
 def test_a_bag_is_replaced_at_once(tmp_path, monkeypatch, swaps):
     bag = tmp_path / 'bag'
-    write_record(crash.record(50), bag)
+    pi.write(crash.record(50), bag)
     there = []
 
     def watched(new, old):
@@ -63,9 +63,9 @@ def test_a_bag_is_replaced_at_once(tmp_path, monkeypatch, swaps):
 
     exchanged = output._exchanged
     monkeypatch.setattr(output, '_exchanged', watched)
-    write_record(crash.record(60), bag, overwrite=True)
+    pi.write(crash.record(60), bag, overwrite=True)
     assert there == [True, True]
-    assert read_record(bag).n == 60
+    assert pi.read(bag).n == 60
     assert os.listdir(tmp_path) == ['bag']
 
 
@@ -86,5 +86,5 @@ def test_a_full_disk_is_said_for_databases_too(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Sqlite3Writer, 'close', full)
     with pytest.raises(DataError, match=r'cannot be written \(database or disk is full\)'):
-        write_record(crash.record(40), tmp_path / 'r.db3')
+        pi.write(crash.record(40), tmp_path / 'r.db3')
     assert os.listdir(tmp_path) == []

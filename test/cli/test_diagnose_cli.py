@@ -14,13 +14,13 @@ import time
 from diagnosis_examples import base_model, example, measured, RATE, refined_model
 import jsonschema
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.cli import diagnose_command as module
 from piezo_ident.cli import effects_command, main
 from piezo_ident.diagnosis.diagnosis_json import diagnosis_schema
 from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run
-from piezo_ident.record.io import write_record
 from piezo_ident.record.record import Record
 import pytest
 
@@ -57,11 +57,11 @@ def made(tmp_path) -> Path:
     """Return a folder with a model that knows no creep, and records of a stage that creeps."""
     base_model().save(tmp_path / 'model.yaml')
     record = measured('val.npz')
-    write_record(record, tmp_path / 'val.npz')
+    pi.write(record, tmp_path / 'val.npz')
     (piece,) = record.pieces
     # another part of the same stage's life
     late = piece.cut(round(2.6 * RATE), piece.n)
-    write_record(Record((late,), 'unseen.npz'), tmp_path / 'unseen.npz')
+    pi.write(Record((late,), 'unseen.npz'), tmp_path / 'unseen.npz')
     return tmp_path
 
 
@@ -249,12 +249,12 @@ def test_models_and_records_that_do_not_fit(capsys, made):
     refuse(capsys, made, ['diagnose', made / 'no.yaml', record], 'no.yaml', 'check the name')
     (piece,) = measured().pieces
     fast = Record((replace(piece, sample_rate=4000.0),))
-    write_record(fast, made / 'fast.npz')
+    pi.write(fast, made / 'fast.npz')
     refuse(capsys, made, ['diagnose', model, made / 'fast.npz', *ONLY], 'fast.npz', '4000')
     # what is looked at in the end is tried at the start
     argv = ['diagnose', model, record, '--validation', made / 'fast.npz']
     refuse(capsys, made, argv, 'fast.npz', '4000')
-    write_record(Record((piece.cut(600, 900),)), made / 'short.npz')
+    pi.write(Record((piece.cut(600, 900),)), made / 'short.npz')
     refuse(capsys, made, ['diagnose', model, made / 'short.npz'], 'short.npz', 'longer')
 
 

@@ -11,6 +11,7 @@ import struct
 import zipfile
 
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.cli import main
 from piezo_ident.common import files
 from piezo_ident.common.config import find_config
@@ -20,7 +21,6 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load, model_from_dict
 from piezo_ident.model.simulated_stage import stage_from_dict
 from piezo_ident.record.blocks import decode, Dimension
-from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 import scipy.io
@@ -55,20 +55,20 @@ def file_of(path):
 @pytest.mark.parametrize('name', FORMATS)
 def test_empty_truncated_and_foreign_files(tmp_path, record, name):
     path = tmp_path / name
-    write_record(record, path)
+    pi.write(record, path)
     file = file_of(path)
     whole = file.read_bytes()
     for data in (b'', whole[: len(whole) // 2], b'\x89PNG' + bytes(300), bytes(1000)):
         file.write_bytes(data)
         if file.suffix == '.csv' and data == whole[: len(whole) // 2]:
             continue  # half a table may be a table
-        refused(lambda: read_record(path), path.name, kind=DataError)
+        refused(lambda: pi.read(path), path.name, kind=DataError)
 
 
 @pytest.mark.parametrize('name', FORMATS)
 def test_damaged_files(tmp_path, record, name):
     path, rng = tmp_path / name, random.Random(0)
-    write_record(record, path)
+    pi.write(record, path)
     file = file_of(path)
     whole = file.read_bytes()
     for _ in range(6 if name == 'r.mat' else 60):
@@ -78,7 +78,7 @@ def test_damaged_files(tmp_path, record, name):
         file.write_bytes(data[: rng.choice([None, rng.randrange(len(data))])])
         for recover in (False, True):
             try:
-                read_record(path, recover=recover)
+                pi.read(path, recover=recover)
             except PiezoIdentError as error:
                 assert str(error).isprintable() and len(str(error)) < 1000
 
@@ -86,7 +86,7 @@ def test_damaged_files(tmp_path, record, name):
 @pytest.mark.parametrize('suffix', ['.csv', '.npz', '.mat', '.mcap', '.db3', '.yaml'])
 def test_devices_and_folders_are_not_read(tmp_path, suffix):
     path = tmp_path / f'r{suffix}'
-    read = load if suffix == '.yaml' else read_record
+    read = load if suffix == '.yaml' else pi.read
     path.symlink_to('/dev/zero')
     refused(lambda: read(path), path.name)
     path.unlink()
@@ -99,10 +99,10 @@ def test_no_right_to_read(tmp_path, record, monkeypatch, capsys):
         raise PermissionError(13, 'Permission denied')
 
     for name in FORMATS[:3]:
-        write_record(record, tmp_path / name)
+        pi.write(record, tmp_path / name)
         monkeypatch.setattr(Path, 'open', denied)
         monkeypatch.setattr(zipfile, 'ZipFile', denied)
-        refused(lambda n=name: read_record(tmp_path / n), name, 'Permission denied')
+        refused(lambda n=name: pi.read(tmp_path / n), name, 'Permission denied')
         assert main(['convert', str(tmp_path / name), str(tmp_path / 'out.csv')]) == 2
         monkeypatch.undo()
     assert capsys.readouterr().err.count('\n') == 3
@@ -112,9 +112,9 @@ def test_no_right_to_read(tmp_path, record, monkeypatch, capsys):
 
 
 def test_more_than_a_file_may_hold(tmp_path, record, monkeypatch):
-    write_record(record, tmp_path / 'r.npz')
+    pi.write(record, tmp_path / 'r.npz')
     monkeypatch.setattr('piezo_ident.record.tables.UNPACKED_SIZE', 1000)
-    refused(lambda: read_record(tmp_path / 'r.npz'), 'unpacks to more', kind=DataError)
+    refused(lambda: pi.read(tmp_path / 'r.npz'), 'unpacks to more', kind=DataError)
     assert files.UNPACKED_SIZE > 2**32
 
 
@@ -123,9 +123,9 @@ def test_a_mat_file_that_ends_its_reader(tmp_path, record, monkeypatch):
     crash = 'import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n'
     (tmp_path / 'scipy').mkdir()
     (tmp_path / 'scipy' / '__init__.py').write_text(crash)
-    write_record(record, tmp_path / 'r.mat')
+    pi.write(record, tmp_path / 'r.mat')
     monkeypatch.syspath_prepend(tmp_path)
-    refused(lambda: read_record(tmp_path / 'r.mat'), 'r.mat', '-11', kind=DataError)
+    refused(lambda: pi.read(tmp_path / 'r.mat'), 'r.mat', '-11', kind=DataError)
 
 
 def test_a_mat_file_that_announces_too_much(tmp_path):
@@ -135,7 +135,7 @@ def test_a_mat_file_that_announces_too_much(tmp_path):
     body = element(6, struct.pack('<II', 6, 0)) + element(5, struct.pack('<2i', 2**31 - 1, 9))
     matrix = element(14, body + element(1, b't') + element(9, bytes(8)))
     (tmp_path / 'r.mat').write_bytes(b'MATLAB'.ljust(124) + b'\x00\x01IM' + matrix)
-    refused(lambda: read_record(tmp_path / 'r.mat'), 'r.mat', kind=DataError)
+    refused(lambda: pi.read(tmp_path / 'r.mat'), 'r.mat', kind=DataError)
 
 
 @pytest.mark.parametrize('packed', [False, True])
@@ -146,11 +146,11 @@ def test_other_variables_of_a_workspace_are_left_alone(tmp_path, packed):
     t = np.arange(9) / 10
     path = tmp_path / 'r.mat'
     scipy.io.savemat(path, {**others, 't': t, 'v': t, 'y': 1e-6 * t}, do_compression=packed)
-    read = read_record(path)
+    read = pi.read(path)
     assert read.n == 9
     assert {f.where for f in read.faults} == {repr(k) for k in others}
     scipy.io.savemat(path, {'t': t, 'v': deep, 'y': 1e-6 * t})
-    refused(lambda: read_record(path), 'v holds', kind=DataError)
+    refused(lambda: pi.read(path), 'v holds', kind=DataError)
 
 
 # --- programs, models, blocks ---------------------------------------------------------------
@@ -202,6 +202,6 @@ def test_markup_in_a_label_is_carried_as_text(tmp_path):
     label = '<script>alert(1)</script>'
     rows = ''.join(f'{i / 10},{i},{i}e-6,{label}\n' for i in range(9))
     (tmp_path / 'r.csv').write_text(f't,v,y,segment\n{rows}')
-    write_record(read_record(tmp_path / 'r.csv'), tmp_path / 'bag')
-    assert read_record(tmp_path / 'bag').labels == (label,)
+    pi.write(pi.read(tmp_path / 'r.csv'), tmp_path / 'bag')
+    assert pi.read(tmp_path / 'bag').labels == (label,)
     assert sorted(os.listdir(tmp_path)) == ['bag', 'r.csv']

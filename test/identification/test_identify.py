@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_array_equal
+import piezo_ident as pi
 from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import three_steps
@@ -20,7 +21,6 @@ from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, Scaling
-from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
@@ -294,7 +294,7 @@ def measured(name: str) -> Record:
     path = DATA / name
     if not path.is_file():
         pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA to the folder of measured records')
-    return read_record(path)
+    return pi.read(path)
 
 
 @pytest.mark.parametrize(('settings', 'limit'), [({'thresholds': 10}, 0.30), ({}, 0.17)])

@@ -15,6 +15,7 @@ import time
 
 from diagnosis_examples import base_model, measured
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.cli import main
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import parse_program
@@ -26,7 +27,6 @@ from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.record.io import write_record
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,7 +65,7 @@ def records(tmp_path_factory) -> list[Path]:
     sequence = parse_program(PROGRAM).build(RATE)
     for i, (name, stroke) in enumerate(STROKES.items()):
         record = stage(stroke).play(sequence, np.random.default_rng(i))
-        write_record(record, folder / f'{name}.npz')
+        pi.write(record, folder / f'{name}.npz')
     (folder / 'stage_3.npz').write_bytes(b'a cable was loose')
     return [folder / f'stage_{i}.npz' for i in (1, 2, 10, 3)]
 
@@ -157,7 +157,7 @@ def test_diagnosis_with_a_model_for_each(tmp_path):
     record = measured()
     paths = [tmp_path / 'records' / f'{name}.npz' for name in ('a', 'b')]
     for path in paths:
-        write_record(record, path)
+        pi.write(record, path)
     base_model().save(tmp_path / 'given/a.yaml')
     first, second = run_many(paths, tmp_path / 'out', Diagnose(tmp_path / 'given'), jobs=1)
     assert first.is_good, first.reason

@@ -28,7 +28,7 @@ def rows(*parts: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def read(c: list[np.ndarray], **options: object) -> Record:
-    return assemble(*c, name='data', **options)  # type: ignore[arg-type]
+    return Record.from_arrays(*c, name='data', **options)  # type: ignore[arg-type]
 
 
 def faults(record: Record) -> dict[str, int]:

@@ -11,9 +11,9 @@ import zipfile
 from hypothesis import given, HealthCheck, Phase, settings
 from hypothesis import strategies as st
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
-from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 import scipy.io
@@ -92,8 +92,8 @@ def assert_equal(a: Record, b: Record) -> None:
 @pytest.mark.parametrize('name', FORMATS)
 def test_round_trip_is_exact(tmp_path_factory, name, record):
     path = tmp_path_factory.mktemp('r') / name
-    assert write_record(record, path, storage=storage(name)) == ()
-    back = read_record(path)
+    assert pi.write(record, path, storage=storage(name)) == ()
+    back = pi.read(path)
     assert_equal(back, record)
     assert back.name == name
     assert {f.name for f in back.faults} <= {'gap', 'restart'}
@@ -118,7 +118,7 @@ def csv_text(**columns: object) -> str:
 
 def refuse(path: Path, *words: str) -> str:
     with pytest.raises(DataError) as caught:
-        read_record(path)
+        pi.read(path)
     message = str(caught.value)
     assert '\n' not in message
     for word in (str(path), *words):
@@ -132,10 +132,10 @@ def test_losses_are_said(tmp_path):
     first = Piece(c['v'], c['y'], 1000.0)
     lone = Piece([1.0], [0.0], 1000.0, start_time=9.0)
     joint = Record((first, Piece(c['v'], c['y'], 1000.0, start_time=0.3), lone))
-    (note,) = write_record(joint, tmp_path / 'r.csv')
+    (note,) = pi.write(joint, tmp_path / 'r.csv')
     assert note == '3 pieces with 601 samples read back as 1 with 600'
     bad = Record((first, Piece(c['v'], c['y'], 1000.0, start_time=0.2)))
-    (note,) = write_record(bad, tmp_path / 'bad.csv')
+    (note,) = pi.write(bad, tmp_path / 'bad.csv')
     assert 'reading refuses it' in note
 
 
@@ -143,23 +143,23 @@ def test_what_cannot_be_written_is_refused(tmp_path):
     c = table()
     piece = Piece(c['v'], c['y'], 1000.0, segments=(Segment('a\nb', 0, 9),))
     with pytest.raises(DataError, match='segment label'):
-        write_record(Record((piece,)), tmp_path / 'r.csv')
+        pi.write(Record((piece,)), tmp_path / 'r.csv')
     piece = Piece(c['v'], c['y'], 1000.0, channels={'a b': c['v']})
     with pytest.raises(DataError, match='channel name'):
-        write_record(Record((piece,)), tmp_path / 'r.csv')
+        pi.write(Record((piece,)), tmp_path / 'r.csv')
     with pytest.raises(DataError, match='unknown format'):
-        write_record(record(), tmp_path / 'r.xls')
+        pi.write(record(), tmp_path / 'r.xls')
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize('name', FORMATS)
 def test_existing_output_is_kept_unless_asked(tmp_path, name):
     path = tmp_path / name
-    write_record(record(), path, storage=storage(name))
+    pi.write(record(), path, storage=storage(name))
     with pytest.raises(DataError, match='exists already'):
-        write_record(record(), path, storage=storage(name))
-    write_record(record(), path, storage=storage(name), overwrite=True)
-    assert_equal(read_record(path), record())
+        pi.write(record(), path, storage=storage(name))
+    pi.write(record(), path, storage=storage(name), overwrite=True)
+    assert_equal(pi.read(path), record())
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
@@ -167,29 +167,29 @@ def test_a_folder_that_is_no_bag_is_never_replaced(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').touch()
     with pytest.raises(DataError, match='no bag'):
-        write_record(record(), tmp_path / 'home', overwrite=True)
+        pi.write(record(), tmp_path / 'home', overwrite=True)
     assert (tmp_path / 'home' / 'thesis.tex').exists()
     # others call their files metadata.yaml, too
     for text in ('author: me', '[', ''):
         (tmp_path / 'home' / 'metadata.yaml').write_text(text)
         with pytest.raises(DataError, match='no bag'):
-            write_record(record(), tmp_path / 'home', overwrite=True)
+            pi.write(record(), tmp_path / 'home', overwrite=True)
     assert (tmp_path / 'home' / 'thesis.tex').exists()
 
 
 @pytest.mark.parametrize('name', ['notes.txt', 'model.yaml', 'pictures'])
 def test_a_bag_with_something_beside_it_is_never_replaced(tmp_path, name):
     bag = tmp_path / 'bag'
-    write_record(record(), bag)
+    pi.write(record(), bag)
     for part in ('bag.db3-wal', 'bag_1.mcap.zstd'):
         (bag / part).touch()
-    write_record(record(), bag, overwrite=True)
+    pi.write(record(), bag, overwrite=True)
     if name == 'pictures':
         (bag / name).mkdir()
     else:
         (bag / name).touch()
     with pytest.raises(DataError, match=f'holds {name}, which is no part of a bag'):
-        write_record(record(), bag, overwrite=True)
+        pi.write(record(), bag, overwrite=True)
     assert (bag / name).exists()
 
 
@@ -197,7 +197,7 @@ def test_a_bag_with_something_beside_it_is_never_replaced(tmp_path, name):
 def test_unwritable_place(tmp_path, name):
     path = tmp_path / 'missing' / name
     with pytest.raises(DataError, match='cannot be written') as caught:
-        write_record(record(), path, storage=storage(name))
+        pi.write(record(), path, storage=storage(name))
     assert str(path) in str(caught.value)
 
 
@@ -219,7 +219,7 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
     text = csv_text(segment=[' noise '] * 300, x_temp=[21.5] * 300, comment=['-'] * 300)
     text = text.replace('t,v,y', ' t, "v" ,y', 1).replace(' "v" ', 'v ')
     path.write_bytes(b'\xef\xbb\xbf' + text.replace('\n', '\r\n').encode() + b'\r\n')
-    got = read_record(path)
+    got = pi.read(path)
     assert got.pieces[0].segments == (Segment('noise', 0, 300),)
     assert list(got.pieces[0].channels) == ['temp']
     assert [(f.name, f.where) for f in got.faults] == [('ignored_column', "'comment'")]
@@ -270,7 +270,7 @@ def test_bad_csv(tmp_path, text, words):
 def test_comments_above_the_header(tmp_path, above):
     path = tmp_path / 'r.csv'
     path.write_text(csv_text().replace('t,v,y\n', above, 1), encoding='utf-8')
-    got = read_record(path)
+    got = pi.read(path)
     np.testing.assert_array_equal(got.pieces[0].y, table()['y'])
     assert got.faults == ()
 
@@ -304,7 +304,7 @@ def save(path: Path, arrays: dict) -> None:
 def test_columns_of_any_orientation(tmp_path, name, shape):
     save(tmp_path / name, {k: x.reshape(shape) for k, x in table().items()})
     c = table()
-    assert_equal(read_record(tmp_path / name), Record((Piece(c['v'], c['y'], 1000.0),)))
+    assert_equal(pi.read(tmp_path / name), Record((Piece(c['v'], c['y'], 1000.0),)))
 
 
 @pytest.mark.parametrize('name', ['r.npz', 'r.mat'])
@@ -312,7 +312,7 @@ def test_segments_by_start(tmp_path, name):
     names = np.array(['noise', 'sine:50Hz'])
     save(tmp_path / name, {**table(), 'segment_name': names, 'segment_start': [10, 200]})
     want = (Segment('noise', 10, 200), Segment('sine:50Hz', 200, 300))
-    assert read_record(tmp_path / name).pieces[0].segments == want
+    assert pi.read(tmp_path / name).pieces[0].segments == want
 
 
 @pytest.mark.parametrize('name', ['r.npz', 'r.mat'])
@@ -362,7 +362,7 @@ def test_damaged_files(tmp_path, name):
     path.write_bytes(np.random.default_rng(0).bytes(5000))
     refuse(path)
     path.unlink()
-    write_record(record(), path)
+    pi.write(record(), path)
     whole = path.read_bytes()
     if name != 'r.csv':
         for share in (0.1, 0.5, 0.9, 0.99):
@@ -395,7 +395,7 @@ def test_links_that_lead_nowhere(tmp_path, name):
     (tmp_path / 'there.csv').write_text(csv_text())
     path = tmp_path / 'link.csv'
     path.symlink_to('there.csv')
-    assert read_record(path).n == 300
+    assert pi.read(path).n == 300
 
 
 # --- measured files
@@ -413,10 +413,10 @@ def test_measured_files(tmp_path, name, rates, sizes):
     path = DATA / name
     if not path.is_file():
         pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA')
-    measured = read_record(path)
+    measured = pi.read(path)
     assert [p.sample_rate for p in measured] == rates
     assert [p.n for p in measured] == sizes
     assert {f.name for f in measured.faults} <= {'rate_change'}
     for out in FORMATS:
-        assert write_record(measured, tmp_path / out, storage=storage(out)) == ()
-        assert_equal(read_record(tmp_path / out), measured)
+        assert pi.write(measured, tmp_path / out, storage=storage(out)) == ()
+        assert_equal(pi.read(tmp_path / out), measured)

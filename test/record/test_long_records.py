@@ -4,13 +4,13 @@
 """Long bags: their samples are spooled to memory maps, and give the record of a short one."""
 
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record import stream
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
-from piezo_ident.record.io import read_record, write_record
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
@@ -62,8 +62,8 @@ def test_a_long_bag_lies_in_memory_maps_and_reads_as_a_short_one(bag, monkeypatc
 @pytest.mark.parametrize('name', ['o.csv', 'o.npz', 'o.mat', 'o', 'o.db3'])
 def test_a_long_record_is_written_and_read_back(bag, tmp_path, name):
     record = read_bag(bag)
-    assert write_record(record, tmp_path / name) == ()
-    back = read_record(tmp_path / name)
+    assert pi.write(record, tmp_path / name) == ()
+    back = pi.read(tmp_path / name)
     for one, other in zip(record, back, strict=True):
         assert one.segments == other.segments
         np.testing.assert_array_equal(one.t, other.t)

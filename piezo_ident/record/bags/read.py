@@ -14,11 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
+from dataclasses import replace
 import functools
 from pathlib import Path
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.record.assemble import ReadOptions
 from piezo_ident.record.bags.recover import (
     Bag,
     damage_as_data_error,
@@ -110,16 +112,7 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
     return Bag(path, reader.connections, messages, start, end)
 
 
-def read_bag(
-    path: str | Path,
-    *,
-    namespace: str | None = None,
-    voltage_topic: str | None = None,
-    displacement_topic: str | None = None,
-    displacement_unit: str = 'm',
-    voltage_limits: tuple[float, float] | None = None,
-    recover: bool = False,
-) -> Record:
+def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file.
 
@@ -130,15 +123,9 @@ def read_bag(
     ----------
     path : path
         The folder or file.
-    namespace : str, optional
-        Take only topics below this namespace, for bags of several stages.
-    voltage_topic, displacement_topic : str, optional
-        Take these topics, whatever else the bag holds.
-    displacement_unit, voltage_limits
-        As for `piezo_ident.record.assemble.assemble`.
-    recover : bool, optional
-        Read a bag whose recorder was killed as far as it goes, with a fault that says so, instead
-        of refusing it.
+    options : ReadOptions, optional
+    **choices
+        Fields of `ReadOptions`, in place of those of `options`.
 
     Raises
     ------
@@ -147,22 +134,22 @@ def read_bag(
         carries the voltage or the displacement, and for all that `assemble` refuses.
     """
     path = Path(path)
+    options = replace(options or ReadOptions(), **choices)
     with opened_bag(path) as bag:
-        if bag.faults and not recover:
+        if bag.faults and not options.recover:
             raise DataError(
                 f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
                 f"'piezo_ident convert {path} OUT' saves what is whole of it"
             )
-        asked = {'voltage': voltage_topic, 'displacement': displacement_topic}
-        topics = _choose(carried_quantities(bag), asked, namespace, path)
+        asked = {'voltage': options.voltage_topic, 'displacement': options.displacement_topic}
+        topics = _choose(carried_quantities(bag), asked, options.namespace, path)
         streams = {quantity: Stream(spooled=True) for quantity in topics}
         for quantity, samples, stamp in _blocks(bag, topics):
             streams[quantity].append(samples, stamp)
     return record_of_streams(
         streams,
         name=str(path),
-        displacement_unit=displacement_unit,
-        voltage_limits=voltage_limits,
+        options=options,
         sample_rate=_sample_rate(path),
         faults=bag.faults,
     ).renamed(path.name)

@@ -14,11 +14,11 @@ import sys
 
 from bag_data import raw_blocks, recording
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.cli import main
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import MESSAGE_TYPE, opened_bag, read_bag, typestore
 from piezo_ident.record.bags.write import write_bag
-from piezo_ident.record.io import read_record
 from piezo_ident.record.record import Piece, Record
 import pytest
 from rosbags.rosbag2 import Reader
@@ -113,7 +113,7 @@ def test_convert_says_so_and_recovers(tmp_path, storage, capsys):
     assert 'met: truncated_bag' in said
     assert 'recovered the 80 messages' in said
     assert 'is unknown' in said
-    whole = read_record(tmp_path / 'whole', recover=True)
+    whole = pi.read(tmp_path / 'whole', recover=True)
     assert (whole.n, whole.faults) == (4000, ())
     assert main(['convert', '--json', str(tmp_path / 'bag'), str(tmp_path / 'out.npz')]) == 0
     story = json.loads(capsys.readouterr().out)
@@ -125,13 +125,13 @@ def test_a_lone_file_and_a_bag_without_metadata(tmp_path, storage):
     killed(tmp_path / 'bag', storage=storage)
     (file,) = (tmp_path / 'bag').iterdir()
     if storage == 'mcap':
-        assert 'the end of bag.mcap is missing' in truncation(read_record(file, recover=True))
+        assert 'the end of bag.mcap is missing' in truncation(pi.read(file, recover=True))
     else:
         # all of it is committed: as a file of its own nothing is amiss
-        assert read_record(file, recover=True).faults == ()
+        assert pi.read(file, recover=True).faults == ()
     recording(tmp_path / 'good', storage).close()
     (tmp_path / 'good' / 'metadata.yaml').unlink()
-    record = read_record(tmp_path / 'good', recover=True)
+    record = pi.read(tmp_path / 'good', recover=True)
     assert record.n == 4000
     assert 'recovered the 80 messages' in truncation(record)
     assert 'metadata.yaml is missing' in truncation(record)
@@ -211,16 +211,16 @@ def test_compressed_bags_of_other_writers(tmp_path, compression, crc):
                 writer.add_message(i, 10**18 + k, data, 10**18 + k)
         writer.finish()
     data = file.read_bytes()
-    assert read_record(tmp_path / 'bag', recover=True).n == 5000
+    assert pi.read(tmp_path / 'bag', recover=True).n == 5000
     file.write_bytes(data[: len(data) // 2])
-    record = read_record(tmp_path / 'bag', recover=True)
+    record = pi.read(tmp_path / 'bag', recover=True)
     assert 1000 < record.n < 5000
     # a byte within a later chunk
     broken = bytearray(data[: len(data) // 2])
     broken[-len(data) // 4] ^= 0xFF
     file.write_bytes(broken)
     if crc:
-        assert 0 < read_record(tmp_path / 'bag', recover=True).n < record.n
+        assert 0 < pi.read(tmp_path / 'bag', recover=True).n < record.n
 
 
 def test_a_database_that_is_no_bag(tmp_path):

@@ -5,12 +5,12 @@
 
 from bag_data import raw, raw_blocks, recording
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import opened_bag, read_bag, typestore
 from piezo_ident.record.bags.recover import is_unfinished
 from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount, SAMPLE_QOS
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.io import read_record
 import pytest
 from rosbags.interfaces import QosDurability
 import yaml
@@ -213,7 +213,7 @@ def test_without_a_size_there_is_one_bag_without_part(tmp_path):
     writer = recorded(tmp_path / 'bag', 'mcap', 0)
     writer.close()
     assert writer.parts == [tmp_path / 'bag']
-    assert read_record(tmp_path / 'bag').n == 6000
+    assert pi.read(tmp_path / 'bag').n == 6000
     info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     assert 'part' not in info['rosbag2_bagfile_information']['custom_data']
 

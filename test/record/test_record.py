@@ -1,0 +1,55 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Records from arrays, and what they say of themselves."""
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.record import Piece, Record
+import pytest
+
+RATE = 1000.0
+V = 5 + 5 * np.sin(0.02 * np.arange(2000))
+Y = 7.5e-6 * V
+
+
+def test_arrays_with_a_rate_are_those_with_times():
+    one = Record.from_arrays(np.arange(V.size) / RATE, V, 1e6 * Y, displacement_unit='um')
+    other = Record.from_arrays(V, Y, sample_rate=RATE)
+    (a,), (b,) = one.pieces, other.pieces
+    assert (a.sample_rate, a.start_time) == (b.sample_rate, b.start_time) == (RATE, 0.0)
+    np.testing.assert_allclose(a.y, b.y, rtol=1e-15)
+
+
+def test_arrays_are_checked_as_a_file_is():
+    t, y = np.arange(V.size) / RATE, Y.copy()
+    t[1000:] += 0.5
+    y[100] = np.nan
+    record = Record.from_arrays(t, V, y, segments=(['noise'], [0]), channels={'heat': V})
+    assert [p.n for p in record] == [100, 899, 1000]
+    assert {f.name for f in record.faults} == {'not_finite', 'gap'}
+    assert record.labels == ('noise',)
+    assert list(record.pieces[0].channels) == ['heat']
+    with pytest.raises(DataError, match='displacement-unit'):
+        Record.from_arrays(V, 1e6 * Y, sample_rate=RATE)
+
+
+@pytest.mark.parametrize(
+    ('arrays', 'rate'), [((V, Y), None), ((V, Y, Y, V), RATE), ((V, Y), 0.0), ((V,), RATE)]
+)
+def test_arrays_without_their_time_are_refused(arrays, rate):
+    with pytest.raises(DataError, match='sample_rate'):
+        Record.from_arrays(*arrays, sample_rate=rate)
+
+
+def test_stroke_does_not_count_single_wild_samples():
+    y = Y.copy()
+    y[[300, 301, 900]] = 5e-3
+    assert Record((Piece(V, y, RATE),)).stroke == pytest.approx(np.ptp(Y), rel=1e-9)
+    assert Record((Piece(V, Y, RATE),)).stroke == np.ptp(Y)
+
+
+def test_html_names_what_it_holds_and_escapes_it():
+    page = Record((Piece(V, Y, RATE),), '<b>')._repr_html_()
+    assert '&lt;b&gt;' in page
+    assert '75' in page
