@@ -11,7 +11,7 @@ from pathlib import Path
 import tempfile
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.files import broken_link, check_replaceable
+from piezo_ident.common.files import broken_link, check_replaceable, unwritable
 
 __all__ = [
     'check_apart',
@@ -82,7 +82,7 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
             raise DataError(f'{path}: there is no folder {path.parent}; make it first')
         _try(path.parent)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise unwritable(path, error) from None
 
 
 def check_folder(path: Path) -> None:
@@ -103,7 +103,7 @@ def check_folder(path: Path) -> None:
             here = here.parent
         _try(here)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise unwritable(path, error) from None
 
 
 def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
@@ -138,11 +138,3 @@ def _try(folder: Path) -> None:
     # root passes every permission bit, and a read-only file system shows only when written to
     with tempfile.TemporaryFile(dir=folder, prefix='.piezo_ident.'):
         pass
-
-
-def _unwritable(path: Path, error: OSError) -> DataError:
-    reason = error.strerror or str(error)
-    return DataError(
-        f'{path}: cannot be written ({reason}); choose a folder that exists, with room and the '
-        'right to write'
-    )

@@ -33,6 +33,7 @@ __all__ = [
     'load_yaml',
     'parse_yaml',
     'temporary_output',
+    'unwritable',
     'write_text',
     'write_together',
 ]
@@ -259,6 +260,15 @@ def check_replaceable(folder: Path) -> None:
         )
 
 
+def unwritable(path: Path, error: Exception) -> DataError:
+    """Return the error for a place that the disk refuses."""
+    reason = getattr(error, 'strerror', None) or str(error)
+    return DataError(
+        f'{path}: cannot be written ({reason}); choose a folder that exists, with room and the '
+        'right to write'
+    )
+
+
 @contextmanager
 def _work_folder(path: Path, parent: Path, name: str) -> Iterator[Path]:
     """Yield a temporary folder in `parent`; an error of the disk is one about `path`."""
@@ -272,11 +282,7 @@ def _work_folder(path: Path, parent: Path, name: str) -> Iterator[Path]:
             shutil.rmtree(work, ignore_errors=True)
     # a full disk is an error of its own to SQLite
     except (OSError, sqlite3.Error) as error:
-        reason = getattr(error, 'strerror', None) or str(error)
-        raise DataError(
-            f'{path}: cannot be written ({reason}); choose a folder that exists, with room and '
-            'the right to write'
-        ) from None
+        raise unwritable(path, error) from None
 
 
 def _put_in_place(new: Path, target: Path, replaced: Path) -> None:

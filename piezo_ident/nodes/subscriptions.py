@@ -20,7 +20,8 @@ from typing import Any
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import LogClock
 from piezo_ident.nodes.wire import LATCHED, LATCHED_TOPICS, SAMPLE_TOPICS, STREAM
-from piezo_ident.record.bags.write import knows_type, LossCount
+from piezo_ident.record.bags.write import knows_type
+from piezo_ident.record.stream import LossCount
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node

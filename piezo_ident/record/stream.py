@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['SPOOLED', 'Stream']
+__all__ = ['SPOOLED', 'LossCount', 'Stream']
 
 #: numbers in a chunk of a stream
 CHUNK = 1 << 17
@@ -149,3 +149,32 @@ class Stream:
                 starts.append(row)
             row += size
         return names, np.array(starts, dtype=np.int64)
+
+
+class LossCount:
+    """
+    Counts what is missing in the numbers of a topic's messages, whoever of several sent them.
+
+    >>> losses = LossCount()
+    >>> for number in (7, 8, 1, 9, 2, 5):
+    ...     losses.note(number)
+    >>> losses.lost
+    2
+    """
+
+    #: among several publishers a larger gap is another one, joined late
+    GAP = 1000
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._last: list[int] = []
+
+    def note(self, number: int, *, alone: bool = False) -> None:
+        """Take note of a number; `alone`: of who gave the one before, and is the only one."""
+        before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
+        if not before:
+            self._last.append(number)
+            return
+        nearest = max(before)
+        self.lost += number - nearest - 1
+        self._last[self._last.index(nearest)] = number

@@ -11,15 +11,15 @@ are looked for before the first message, and `setup.py` bounds the version.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import sqlite3
 from typing import Any
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output
+from piezo_ident.common.files import temporary_output, unwritable
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
 from piezo_ident.record.record import Record
@@ -35,7 +35,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
-__all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'LossCount', 'knows_type', 'write_bag']
+__all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'knows_type', 'write_bag']
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 #: what `flush` uses inside of rosbags: storage -> attribute -> what that must have
@@ -70,9 +70,8 @@ class BagWriter:
     """
     An open bag, or several one after the other; all calls must come from one thread.
 
-    Where a size is given, a bag that is large enough is closed and the next one begun.  The parts
-    have the name of the first with a number behind it; each is a whole bag with all topics, and
-    its custom data say which ``part`` of which ``recording`` it is.
+    With a `max_size`, each part is a whole bag with all topics, named as the first one with a
+    number behind it; its custom data say which ``part`` of which ``recording`` it is.
 
     Parameters
     ----------
@@ -83,8 +82,7 @@ class BagWriter:
     custom_data : mapping of str to str, optional
         For the bag's metadata.
     max_size : int, optional
-        Bytes on disk from which the next part is begun, looked at when the bag is flushed; 0 for
-        one bag without end.
+        Bytes on disk from which `flush` closes the bag and begins the next; 0 for one bag.
 
     Attributes
     ----------
@@ -163,10 +161,7 @@ class BagWriter:
             except (OSError, sqlite3.Error) as error:
                 with suppress(OSError):
                     place.rmdir()
-                raise DataError(
-                    f'{place}: cannot be written ({_reason(error)}); choose a place with room and '
-                    'the right to write'
-                ) from None
+                raise unwritable(place, error) from None
             self._number = number
             return writer
         raise DataError(f'{path}: this name and {NAMES} numbered ones are taken; choose another')
@@ -222,12 +217,10 @@ class BagWriter:
 
     def _connect(self, topic: str) -> None:
         message_type, qos = self._topics[topic]
-        try:
+        with self._disk_errors():
             self._connections[topic] = self._writer.add_connection(
                 topic, message_type, typestore=typestore(), offered_qos_profiles=list(qos)
             )
-        except (OSError, sqlite3.Error) as error:
-            raise self._failure(error) from None
 
     def write(self, topic: str, stamp: int, raw: bytes) -> None:
         """
@@ -247,10 +240,8 @@ class BagWriter:
         DataError
             When the bag cannot be written any more.
         """
-        try:
+        with self._disk_errors():
             self._writer.write(self._connections[topic], stamp, raw)
-        except (OSError, sqlite3.Error) as error:
-            raise self._failure(error) from None
         self.messages += 1
 
     def flush(self) -> None:
@@ -264,10 +255,8 @@ class BagWriter:
         DataError
             When the bag cannot be written any more, or the next one not be made.
         """
-        try:
+        with self._disk_errors():
             self._hand_over()
-        except (OSError, sqlite3.Error) as error:
-            raise self._failure(error) from None
         is_full = self.max_size and self._size_here() >= self.max_size
         if is_full and self.messages > self._closed_messages:
             self.close()
@@ -293,10 +282,11 @@ class BagWriter:
             When that cannot be written; what was written before can be recovered.
         """
         try:
-            self._writer.close()
-        except (OSError, sqlite3.Error) as error:
+            with self._disk_errors():
+                self._writer.close()
+        except DataError:
             self.abort()
-            raise self._failure(error) from None
+            raise
 
     def abort(self) -> None:
         """Let go of the file as it is."""
@@ -305,15 +295,16 @@ class BagWriter:
         with suppress(Exception):
             self._writer.abort()
 
-    def _failure(self, error: Exception) -> DataError:
-        return DataError(
-            f'{self.path}: cannot be written any more ({_reason(error)}); make room, and convert '
-            'it: what was written can be recovered'
-        )
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, 'strerror', None) or str(error)
+    @contextmanager
+    def _disk_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise DataError(
+                f'{self.path}: cannot be written any more ({reason}); make room, and convert it: '
+                'what was written can be recovered'
+            ) from None
 
 
 def write_bag(
@@ -416,32 +407,3 @@ def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
         writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
 
     return send
-
-
-class LossCount:
-    """
-    Counts what is missing in the numbers of a topic's messages, whoever of several sent them.
-
-    >>> losses = LossCount()
-    >>> for number in (7, 8, 1, 9, 2, 5):
-    ...     losses.note(number)
-    >>> losses.lost
-    2
-    """
-
-    #: among several publishers a larger gap is another one, joined late
-    GAP = 1000
-
-    def __init__(self) -> None:
-        self.lost = 0
-        self._last: list[int] = []
-
-    def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of a number; `alone`: of who gave the one before, and is the only one."""
-        before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
-        if not before:
-            self._last.append(number)
-            return
-        nearest = max(before)
-        self.lost += number - nearest - 1
-        self._last[self._last.index(nearest)] = number

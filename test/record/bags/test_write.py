@@ -9,7 +9,7 @@ import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import opened_bag, read_bag, typestore
 from piezo_ident.record.bags.recover import is_unfinished
-from piezo_ident.record.bags.write import BagWriter, INTERNALS, LossCount, SAMPLE_QOS
+from piezo_ident.record.bags.write import BagWriter, INTERNALS, SAMPLE_QOS
 from piezo_ident.record.blocks import Samples
 import pytest
 from rosbags.interfaces import QosDurability
@@ -143,20 +143,6 @@ def test_unknown_type_is_refused(tmp_path):
     with pytest.raises(DataError, match='type lab_msgs/msg/Odd is not known'):
         writer.add_topic('/odd', 'lab_msgs/msg/Odd')
     writer.abort()
-
-
-def test_lost_messages_are_counted():
-    losses = LossCount()
-    for number in (1, 2, 3, 7, 8):
-        losses.note(number)
-    assert losses.lost == 3
-    # a publisher that starts over, and one far ahead that was there before
-    for number in (1, 2, 90000, 90001):
-        losses.note(number)
-    assert losses.lost == 3
-    # of one that is known to be the same a long silence is a loss
-    losses.note(95001, alone=True)
-    assert losses.lost == 3 + 4999
 
 
 # --- parts -----------------------------------------------------------------------------------
