@@ -25,7 +25,7 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=[package_name, f'{package_name}.*']),
-    package_data={package_name: ['py.typed', 'schemas/*.json']},
+    package_data={package_name: ['py.typed', 'report/templates/*.html', 'schemas/*.json']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
@@ -37,6 +37,7 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'PyYAML>=6,<7',
+        'jinja2>=3.1,<4',
         'matplotlib>=3.6,<4',
         # for bags of a killed recorder; package.xml cannot name it, and it need not be there
         'mcap>=1.2.1,<2',

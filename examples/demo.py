@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
-from piezo_ident.report import write_diagnosis_report
 from tqdm import tqdm
 
 try:
@@ -328,8 +327,8 @@ def offline(out: Path, progress: Progress) -> tuple[Residual, Residual]:
     after = _residual(diagnosis.model, again)
     progress.say(f'the same motions: residual of the model {after.text}')
     progress.show('reports', 0.0)
-    pi.write_report(identification, record, out / 'reports')
-    write_diagnosis_report(diagnosis, out / 'reports' / 'diagnosis')
+    pi.write_report(identification, out / 'reports')
+    pi.write_report(diagnosis, out / 'reports' / 'diagnosis')
     return before, after
 
 

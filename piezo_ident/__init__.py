@@ -20,7 +20,7 @@ import importlib
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from piezo_ident import effects
+    from piezo_ident import effects, report
     from piezo_ident.common.errors import (
         Cancelled,
         ConfigError,
@@ -70,6 +70,7 @@ _HOMES = {
     'identify': 'identification.identify',
     'load': 'model.files',
     'read': 'record.io',
+    'report': 'report',
     'write': 'record.io',
     'write_report': 'report.folder',
 }
@@ -99,6 +100,7 @@ __all__ = [
     'identify',
     'load',
     'read',
+    'report',
     'write',
     'write_report',
 ]

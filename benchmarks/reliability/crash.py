@@ -43,8 +43,9 @@ from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.report.figures import draw  # noqa: F401 - loaded once, not in every copy
+from piezo_ident.report.figures import identification  # noqa: F401 - loaded once, not per copy
 from piezo_ident.report.folder import put_in_place
+from piezo_ident.report.html import Shown
 from reliability.rows import write_rows
 
 #: kills of a whole study
@@ -97,11 +98,11 @@ def _save(model: Path) -> Callable[[Path], int]:
 
 def _report(model: Path) -> Callable[[Path], int]:
     def run(folder: Path) -> int:
-        loaded = load(model)
-        shown = [('loops', 'loops', '', bytes(300_000))]
-        texts = {'report.html': '<p>' + 'x' * 300_000, 'identification.json': '{}\n'}
+        shown = [Shown('loops', 'loops', '', bytes(300_000))]
+        texts = {'identification.json': '{}\n', 'model.yaml': model.read_text()}
+        texts['report.html'] = '<p>' + 'x' * 300_000
         for _ in range(40):
-            put_in_place(folder, texts, loaded, shown, ())
+            put_in_place(folder, texts, shown, ())
         return 0
 
     return run

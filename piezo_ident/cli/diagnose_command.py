@@ -18,20 +18,17 @@ from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import check_order, MODEL_FILES
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.diagnosis import diagnose, DiagnosisSettings
-from piezo_ident.diagnosis.diagnosis_json import to_json
+from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
-from piezo_ident.model.free_run import free_run, sine_errors
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Record
 from piezo_ident.report import (
     changes,
-    check_diagnosis_folder,
-    diagnosis_summary,
-    Unseen,
-    write_diagnosis_report,
+    check_report_folder,
+    diagnosis_text,
+    to_json,
+    validated,
+    write_report,
 )
 
 __all__ = ['diagnose_command']
@@ -62,26 +59,25 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
         console.progress() as progress,
     ):
         found = diagnose(given, records, settings, progress=progress)
-    unseen = [_unseen(given, found.model, record) for record in validation]
+    found = validated(found, validation)
     page = None
     with interrupts.waiting():
         if args.report is not None:
-            page = write_diagnosis_report(
+            page = write_report(
                 found,
                 args.report,
-                unseen=unseen,
                 progress=lambda step, share: interrupts.check(),
             )
         if args.model is not None:
             found.model.save(args.model)
-    console.say(diagnosis_summary(found, unseen))
+    console.say(diagnosis_text(found))
     changed = changes(given, found.model)
     _say_files(args, page, changed, console)
     console.result(
         {
             **to_json(found),
             'model_changes': list(changed),
-            'validation': [{'formula': FORMULA, **asdict(x)} for x in unseen],
+            'validation': [{'formula': FORMULA, **asdict(x)} for x in found.unseen],
             'files': {
                 'model': None if args.model is None else str(args.model),
                 'report': None if page is None else str(page),
@@ -120,23 +116,7 @@ def _check_outputs(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
             )
         for name in ('model.yaml', 'diagnosis.json', 'report.html'):
             check_distinct(args.report / name, inputs)
-        check_diagnosis_folder(args.report)
-
-
-def _unseen(given: StageModel, refined: StageModel, record: Record) -> Unseen:
-    """Return the errors of both models on a record that took no part in the diagnosis."""
-    runs = [free_run(model, record) for model in (given, refined)]
-    before, after = (run.errors_after_start or run.errors for run in runs)
-    sines = zip(*(sine_errors(model, record) for model in (given, refined)), strict=True)
-    return Unseen(
-        record=record.name,
-        before=before.percent,
-        after=after.percent,
-        before_centred=before.percent_without_offset,
-        after_centred=after.percent_without_offset,
-        n=after.n,
-        sines=tuple((a.frequency, a.percent, b.percent) for a, b in sines),
-    )
+        check_report_folder(args.report, Diagnosis)
 
 
 def _say_files(

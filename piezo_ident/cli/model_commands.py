@@ -27,7 +27,7 @@ from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, ch
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun
 from piezo_ident.model.metrics import FORMULA
@@ -75,7 +75,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
             )
         with interrupts.quitting():
             from piezo_ident.report import check_report_folder
-        check_report_folder(args.report)
+        check_report_folder(args.report, Identification)
     everything = read_all([*paths, *further], args)
     records, validation = everything[: len(paths)], everything[len(paths) :]
     with naming(*(record.name for record in records)), console.progress() as progress:
@@ -90,13 +90,12 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         if args.report is not None:
             page = report.write_report(
                 result,
-                [*records, *validation],
                 args.report,
                 progress=lambda step, share: interrupts.check(),
             )
         if args.model is not None:
             result.model.save(args.model)
-    console.say(report.text_summary(result))
+    console.say(report.identification_text(result))
     for check in checks:
         console.say()
         console.say('\n'.join(check.text))
@@ -111,7 +110,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
         )
     console.result(
         {
-            **report.to_json(result, records),
+            **report.to_json(result),
             'validation': [check.data for check in checks],
             'files': {
                 'model': None if args.model is None else str(args.model),
@@ -169,10 +168,10 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
             rows = blocks_of(record, y_hat=run.pieces)
             WRITERS[args.out.suffix.lower()](file, rows, (), ())
     if args.plot is not None:
-        from piezo_ident.report.figures import write_prediction_plot
+        from piezo_ident.report import save_plot
 
         with interrupts.waiting():
-            write_prediction_plot(run, args.plot)
+            save_plot(run, args.plot)
     console.say(f'{args.model} on {record.name}, free run:')
     console.say('\n'.join(_error_lines(run)))
     say_faults(record, (), console)
@@ -206,7 +205,7 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 
 def _error_lines(run: FreeRun) -> list[str]:
-    from piezo_ident.report.numbers import length
+    from piezo_ident.report import length
 
     lines = []
     rows = [('whole record', run.errors)]

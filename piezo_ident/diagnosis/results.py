@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Piece
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     'FORMULA',
@@ -26,6 +30,7 @@ __all__ = [
     'FoundParameter',
     'Residual',
     'Unexplained',
+    'Unseen',
     'Untestable',
 ]
 
@@ -173,6 +178,34 @@ class Errors:
     by_frequency: Mapping[str, float]
 
 
+@dataclass(frozen=True)
+class Unseen:
+    """
+    Errors on a record that took no part in a diagnosis, % of its stroke.
+
+    Attributes
+    ----------
+    record : str
+    before, after : float
+        Of the model as given and of the refined one; of a record that does not start at rest,
+        behind the part from which its start is estimated.
+    before_centred, after_centred : float
+        The same without the mean of the error: a sensor may have been set to zero anew.
+    n : int
+        Samples judged.
+    sines : tuple of (float, float, float)
+        Frequency [Hz] and errors before and after, in steady state.
+    """
+
+    record: str
+    before: float
+    after: float
+    before_centred: float
+    after_centred: float
+    n: int
+    sines: tuple[tuple[float, float, float], ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Residual:
     """
@@ -232,6 +265,8 @@ class Diagnosis:
         How many blocks were held out in turn.
     warnings : tuple of str
     settings : DiagnosisSettings
+    unseen : tuple of Unseen
+        Errors on records that took no part.
     """
 
     verdict: str
@@ -255,3 +290,15 @@ class Diagnosis:
     blocks: int
     warnings: tuple[str, ...]
     settings: DiagnosisSettings
+    unseen: tuple[Unseen, ...] = ()
+
+    def plot(self) -> Figure:
+        """Draw the residual before and after, of the piece that the model misses most."""
+        import piezo_ident as pi
+
+        return pi.report.plot(self)
+
+    def _repr_html_(self) -> str:
+        import piezo_ident as pi
+
+        return pi.report.to_html(self)

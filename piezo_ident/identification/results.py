@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from scipy.optimize import OptimizeResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     'DelayResult',
@@ -343,3 +347,14 @@ class Identification:
 
     def _driven(self, data: str) -> list[ErrorRow]:
         return [row for row in self.errors if row.data == data and row.driven]
+
+    def plot(self) -> Figure:
+        """Draw the hysteresis loop, measured and modelled, with the error below."""
+        import piezo_ident as pi
+
+        return pi.report.plot(self)
+
+    def _repr_html_(self) -> str:
+        import piezo_ident as pi
+
+        return pi.report.to_html(self)

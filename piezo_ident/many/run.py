@@ -60,7 +60,7 @@ class Identify:
         if report is not None:
             from piezo_ident.report import write_report
 
-            write_report(result, record, report)
+            write_report(result, report)
         return Row(name, identified(result, record))
 
 
@@ -97,9 +97,9 @@ class Diagnose:
         result = diagnose(load(given), record, self.settings)
         result.model.save(model_file)
         if report is not None:
-            from piezo_ident.report import write_diagnosis_report
+            from piezo_ident.report import write_report
 
-            write_diagnosis_report(result, report)
+            write_report(result, report)
         return Row(name, {'model': given.name, **diagnosed(result, record)})
 
 

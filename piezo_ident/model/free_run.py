@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,9 @@ from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_
 from piezo_ident.model.metrics import nrmse_fit, percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     'DIVERGES',
@@ -117,16 +120,16 @@ class FreeRun:
         """Measured displacement of all pieces [m], shape (n,)."""
         return np.concatenate([piece.y for piece in self.record])
 
+    def plot(self) -> Figure:
+        """Draw the longest piece over time, measured and predicted, with the error."""
+        import piezo_ident as pi
+
+        return pi.report.plot(self)
+
     def _repr_html_(self) -> str:
-        e = self.errors
-        rows = [
-            ('error', f'{e.percent:.3g} % of stroke'),
-            ('fit', f'{e.fit:.4g} %'),
-            ('samples', f'{e.n}'),
-            *(('warning', warning) for warning in self.warnings),
-        ]
-        cells = ''.join(f'<tr><th>{name}</th><td>{escape(x)}</td></tr>' for name, x in rows)
-        return f'<table><caption>Free run on {escape(self.record.name)}</caption>{cells}</table>'
+        import piezo_ident as pi
+
+        return pi.report.to_html(self)
 
 
 def free_run(model: StageModel, record: Record) -> FreeRun:

@@ -1,27 +1,29 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an identification or a diagnosis found, for people and for programs."""
+"""Results for people and for programs: a folder with a page, a summary, a picture, JSON."""
 
-from piezo_ident.report.diagnosis_folder import check_diagnosis_folder, write_diagnosis_report
-from piezo_ident.report.diagnosis_tables import changes, Unseen
-from piezo_ident.report.diagnosis_text import diagnosis_summary
+from piezo_ident.report.diagnosis import changes, diagnosis_text, validated
 from piezo_ident.report.folder import check_report_folder, write_report
-from piezo_ident.report.numbers import steps_to_json, to_json, verdict
-from piezo_ident.report.text import error_table_for_sines, table_one, text_summary
+from piezo_ident.report.identification import headline, identification_text, table_one
+from piezo_ident.report.picture import plot, save_plot, to_html
+from piezo_ident.report.table import length
+from piezo_ident.report.to_json import json_text, steps_to_json, to_json
 
 __all__ = [
-    'Unseen',
     'changes',
-    'check_diagnosis_folder',
     'check_report_folder',
-    'diagnosis_summary',
-    'error_table_for_sines',
+    'diagnosis_text',
+    'headline',
+    'identification_text',
+    'json_text',
+    'length',
+    'plot',
+    'save_plot',
     'steps_to_json',
     'table_one',
-    'text_summary',
+    'to_html',
     'to_json',
-    'verdict',
-    'write_diagnosis_report',
+    'validated',
     'write_report',
 ]

@@ -1,164 +1,167 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report folder: the page, the pictures, the numbers and the model."""
+"""The report of a result: a folder with the page, the pictures, the numbers and the model."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-import io
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import write_together
+from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification, Progress, silent
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs, sines_of
-from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Record
-from piezo_ident.report.html import Shown
-from piezo_ident.report.numbers import to_json
-from piezo_ident.report.page import page
+from piezo_ident.report.diagnosis import diagnosis_page
+from piezo_ident.report.html import page_html, Shown
+from piezo_ident.report.identification import identification_page
+from piezo_ident.report.to_json import to_json
 
 if TYPE_CHECKING:
-    from piezo_ident.report.figures import Picture
+    from piezo_ident.report.figures.style import Drawn
 
-__all__ = [
-    'PAGE',
-    'check_own',
-    'check_report_folder',
-    'put_in_place',
-    'rendered',
-    'write_report',
-]
+__all__ = ['check_report_folder', 'put_in_place', 'write_report']
 
-PAGE, NUMBERS, MODEL = 'report.html', 'identification.json', 'model.yaml'
+PAGE, MODEL = 'report.html', 'model.yaml'
+#: the numbers, by which an earlier report is known
+NUMBERS: Mapping[type, str] = {
+    Identification: 'identification.json',
+    Diagnosis: 'diagnosis.json',
+}
+
+Result = Identification | Diagnosis
 
 
 def write_report(
-    identification: Identification,
-    records: Sequence[Record] | Record,
+    result: Result,
     folder: str | os.PathLike[str],
     *,
     progress: Progress = silent,
 ) -> Path:
     """
-    Write a report.
-
-    Every file is written under a temporary name first; the page is put in place last.
+    Write the report of an identification or a diagnosis.
 
     Parameters
     ----------
-    identification : Identification
-    records : sequence of Record, or Record
-        Those that were identified.
+    result : Identification or Diagnosis
     folder : path
-        Made when it does not exist.  Files of an earlier report there are replaced.
+        Made when it does not exist.  The files of an earlier report there are replaced, all of
+        them or none; other files stay.
     progress : callable, optional
-        Called with what is done and the share of it; may raise `Cancelled` as long as nothing is
-        written.
+        Called with the name of the step and the share of it that is done; may raise `Cancelled`
+        as long as nothing is written.
 
     Returns
     -------
     Path
-        The page, ``report.html``; beside it ``identification.json``, ``model.yaml`` and the
-        pictures.
+        The page, ``report.html``; beside it the pictures, ``model.yaml`` (of a diagnosis the
+        refined model) and ``identification.json`` or ``diagnosis.json``.
 
     Raises
     ------
     DataError
-        When the folder cannot be written.
-    """
-    # matplotlib takes half a second to import, and most commands draw nothing
-    from piezo_ident.report.figures import draw, NAMES
+        When the folder cannot be written, or holds such files that are of no earlier report.
 
-    records = [records] if isinstance(records, Record) else list(records)
-    runs = piece_runs(identification.model, records, identification.memories)
-    drawn = draw(identification, runs, lambda share: progress('drawing', 0.4 * share))
-    shown = rendered(drawn.pictures, lambda share: progress('drawing', 0.4 + 0.5 * share))
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('identification'))  # doctest: +SKIP
+    >>> pi.write_report(pi.identify(record), 'report/').name  # doctest: +SKIP
+    'report.html'
+    """
+    if isinstance(result, Diagnosis):
+        data, page, shown = _diagnosis(result, progress)
+    else:
+        data, page, shown = _identified(result, progress)
     progress('writing', 0.9)
-    html = page(identification, records, sines_of(runs), shown, drawn.left_out)
-    numbers = json.dumps(
-        to_json(identification, records, runs), indent=2, ensure_ascii=False, allow_nan=False
-    )
-    texts = {NUMBERS: numbers + '\n', PAGE: html}
-    return put_in_place(folder, texts, identification.model, shown, NAMES)
+    numbers = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
+    texts = {NUMBERS[type(result)]: numbers + '\n', MODEL: model_to_yaml(result.model), PAGE: page}
+    return put_in_place(folder, texts, shown, _names(type(result)))
 
 
-def check_report_folder(folder: str | os.PathLike[str]) -> None:
-    """
-    Refuse a folder in which `write_report` would lay hands on what is of no earlier report.
+def _identified(
+    result: Identification, progress: Progress
+) -> tuple[dict[str, Any], str, list[Shown]]:
+    # matplotlib takes half a second to import, and most commands draw nothing
+    from piezo_ident.report.figures.identification import draw_identification
 
-    Raises
-    ------
-    DataError
-    """
-    from piezo_ident.report.figures import NAMES
-
-    check_own(folder, (NUMBERS, PAGE), NAMES)
+    runs = piece_runs(result.model, result.records, result.memories)
+    drawn = draw_identification(result, runs, lambda x: progress('drawing', 0.45 * x))
+    shown = _rendered(drawn, progress)
+    page = identification_page(result, sines_of(runs), shown, drawn.left_out)
+    return to_json(result, runs), page_html(page), shown
 
 
-def rendered(pictures: Sequence[Picture], tick: Callable[[float], None]) -> list[Shown]:
-    """
-    Return pictures as PNG.
+def _diagnosis(result: Diagnosis, progress: Progress) -> tuple[dict[str, Any], str, list[Shown]]:
+    from piezo_ident.report.figures.diagnosis import draw_diagnosis
 
-    Parameters
-    ----------
-    pictures : sequence of Picture
-    tick : callable
-        Called with the share done; may raise to stop it.
-    """
-    from piezo_ident.report.figures import DPI
+    drawn = draw_diagnosis(result, lambda x: progress('drawing', 0.45 * x))
+    shown = _rendered(drawn, progress)
+    page = diagnosis_page(result, shown, drawn.left_out)
+    return to_json(result), page_html(page), shown
+
+
+def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:
+    from piezo_ident.report.figures.style import png
 
     shown = []
-    for i, picture in enumerate(pictures):
-        tick(i / len(pictures))
-        buffer = io.BytesIO()
-        picture.figure.savefig(buffer, format='png', dpi=DPI)
-        shown.append((picture.name, picture.title, picture.caption, buffer.getvalue()))
+    for i, picture in enumerate(drawn.pictures):
+        progress('drawing', 0.45 + 0.45 * i / len(drawn.pictures))
+        shown.append(Shown(picture.name, picture.title, picture.caption, png(picture.figure)))
     return shown
 
 
-def check_own(
-    folder: str | os.PathLike[str], texts: Collection[str], names: Collection[str]
-) -> None:
+def _names(kind: type) -> Sequence[str]:
+    """Return the names of all pictures that a report of a kind may have."""
+    if kind is Diagnosis:
+        from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES
+
+        return DIAGNOSIS_NAMES
+    from piezo_ident.report.figures.identification import IDENTIFICATION_NAMES
+
+    return IDENTIFICATION_NAMES
+
+
+def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     """
-    Refuse to replace or take away files of no earlier report, which is known by its numbers.
+    Refuse a folder in which `write_report` would replace a file that is of no earlier report.
 
     Parameters
     ----------
     folder : path
         Need not exist.
-    texts : collection of str
-        File names of the page and of the numbers.
-    names : collection of str
-        As for `put_in_place`.
+    kind : {Identification, Diagnosis}
+        Of the result.
 
     Raises
     ------
     DataError
     """
-    target = Path(folder)
-    if any((target / name).exists() for name in texts if name != PAGE):
+    _refuse_foreign(Path(folder), (NUMBERS[kind], PAGE, MODEL), _names(kind))
+
+
+def _refuse_foreign(target: Path, texts: Sequence[str], names: Sequence[str]) -> None:
+    if any((target / name).exists() for name in texts if name in NUMBERS.values()):
         return
-    for name in (*texts, MODEL, *(f'{name}.png' for name in names)):
+    for name in (*texts, *(f'{name}.png' for name in names)):
         if (target / name).exists():
             raise DataError(
-                f'{target / name}: is there already, and of no earlier report; choose another '
-                'folder'
+                f'{target / name}: exists and is of no earlier report; choose another folder'
             )
 
 
 def put_in_place(
     folder: str | os.PathLike[str],
     texts: Mapping[str, str],
-    model: StageModel,
     pictures: Sequence[Shown],
-    names: Collection[str],
+    names: Sequence[str],
 ) -> Path:
     """
     Write the files of a report, all of them or none.
@@ -168,12 +171,10 @@ def put_in_place(
     folder : path
         Made when it does not exist.
     texts : mapping of str to str
-        By file name; one of them is the page, which is put in place last.
-    model : StageModel
-        Becomes ``model.yaml``.
-    pictures : sequence of (name, title, caption, png)
-    names : collection of str
-        Names of pictures that a report of this kind may have; an earlier one's are taken away.
+        By file name: the numbers, by which a report is known, come first.
+    pictures : sequence of Shown
+    names : sequence of str
+        Of all pictures that a report of this kind may have; those of an earlier one are deleted.
 
     Returns
     -------
@@ -186,14 +187,13 @@ def put_in_place(
         When the folder cannot be written, or holds such files that are of no earlier report.
     """
     target = Path(folder)
-    check_own(target, texts, names)
-    # the numbers first: they tell that the files after them belong to a report
+    _refuse_foreign(target, list(texts), names)
     # file names need not be Unicode
     files = {name: text.encode('utf-8', 'replace') for name, text in texts.items()}
-    html = files.pop(PAGE)
-    files |= {f'{name}.png': png for name, _, _, png in pictures}
-    write_together(target, {**files, MODEL: model_to_yaml(model).encode(), PAGE: html})
-    for name in set(names) - {name for name, *_ in pictures}:
+    page = files.pop(PAGE)
+    files |= {f'{picture.name}.png': picture.png for picture in pictures}
+    write_together(target, {**files, PAGE: page})
+    for name in set(names) - {picture.name for picture in pictures}:
         with suppress(OSError):
             (target / f'{name}.png').unlink()
     return target / PAGE

@@ -11,28 +11,11 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece
-from piezo_ident.report.figures.residual import (
-    residual_errors_figure,
-    residual_spectrum_figure,
-    residual_time_figure,
-)
-from piezo_ident.report.figures.residual_signature import (
-    residual_correlation_figure,
-    residual_dependence_figure,
-)
-from piezo_ident.report.figures.style import NothingToDraw
 from piezo_ident.residual import analyse, ResidualPart
 import pytest
 from residual_data import creep, misfit, part_of, RATE, T, V
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
-FIGURES = [
-    residual_time_figure,
-    residual_spectrum_figure,
-    residual_dependence_figure,
-    residual_correlation_figure,
-    residual_errors_figure,
-]
 
 
 def noise(seed: int = 0) -> np.ndarray:
@@ -69,27 +52,6 @@ def test_survey_with_creep(survey):
     assert [row.frequency for row in found.frequencies] == [1.0, 1.0, 80.0, 80.0]
     # 60 s at 20 kHz; 1.1 s alone on one core
     assert seconds < 4.0
-
-
-@pytest.mark.parametrize('figure', FIGURES)
-def test_pictures_of_the_survey(survey, figure, tmp_path):
-    found, _ = survey
-    after = analyse([part_of(noise())])
-    # another analysis of other records stands for a missing counterpart
-    for other in (None, after):
-        figure(found, other).savefig(tmp_path / 'picture.png', dpi=40)
-        assert (tmp_path / 'picture.png').stat().st_size > 5000
-
-
-def test_pictures_that_cannot_be_drawn_say_why():
-    piece = Piece(np.zeros(50), np.zeros(50), RATE)
-    empty = analyse([ResidualPart('r', piece, np.zeros(50))])
-    with pytest.raises(NothingToDraw, match='spectrum'):
-        residual_spectrum_figure(empty)
-    with pytest.raises(NothingToDraw, match='curve'):
-        residual_dependence_figure(empty)
-    with pytest.raises(NothingToDraw, match='too few'):
-        residual_correlation_figure(empty)
 
 
 def test_nothing_but_noise_depends_on_nothing():

@@ -20,7 +20,6 @@ import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
-from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
@@ -32,13 +31,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.capture import refuse_incomplete, Snapshot
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.report import (
-    steps_to_json,
-    to_json,
-    verdict,
-    write_diagnosis_report,
-    write_report,
-)
+from piezo_ident.report import headline, json_text, steps_to_json, write_report
 
 __all__ = [
     'DiagnosisOutcome',
@@ -180,8 +173,8 @@ def _identify(
     runs = piece_runs(result.model, records, result.memories)
     tick('report', 0.99)
     return IdentificationOutcome(
-        message=verdict(result),
-        report=json.dumps(to_json(result, records, runs)),
+        message=headline(result),
+        report=json_text(result, runs),
         warnings=len(result.warnings),
         steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
         identification=result,
@@ -275,7 +268,7 @@ def _diagnose(
     return DiagnosisOutcome(
         result,
         message=result.sentence,
-        report=json_text(result, indent=None),
+        report=json_text(result),
         model=model_to_yaml(result.model),
         wanted=next_experiment(result, records, asked),
     )
@@ -312,13 +305,11 @@ def _save(
     share = 0.5 if identified and diagnosis else 1.0
     written = []
     if identified:
-        result, record = identified
-        page = write_report(
-            result, record, folder, progress=lambda step, done: tick(step, share * done)
-        )
+        result, _ = identified
+        page = write_report(result, folder, progress=lambda step, done: tick(step, share * done))
         written.append(str(page))
     if diagnosis:
-        page = write_diagnosis_report(
+        page = write_report(
             diagnosis,
             Path(folder, FOLDER),
             progress=lambda step, done: tick(step, 1.0 - share + share * done),

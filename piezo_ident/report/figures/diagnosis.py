@@ -1,36 +1,50 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pictures of a diagnosis."""
+"""Pictures of a diagnosis: errors before and after, ranking of the candidates, all in order."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
+import textwrap
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.report.figures import Drawn
-from piezo_ident.report.figures.refinement_bars import (
-    errors_figure,
-    frequencies_figure,
-    ranking_figure,
-)
-from piezo_ident.report.figures.residual import residual_spectrum_figure
-from piezo_ident.report.figures.residual_signature import (
+from piezo_ident.diagnosis.results import Diagnosis, Errors, Residual
+from piezo_ident.report.figures.free_run import finish_frequencies
+from piezo_ident.report.figures.residual import (
+    differ,
     residual_correlation_figure,
     residual_dependence_figure,
+    residual_figure,
+    residual_spectrum_figure,
+    STATES,
 )
-from piezo_ident.report.figures.residual_traces import differ, residual_figure
-from piezo_ident.report.figures.style import NothingToDraw, Picture
+from piezo_ident.report.figures.style import (
+    COLOURS,
+    draw_each,
+    Drawn,
+    figure,
+    GREY,
+    legend_above,
+    NothingToDraw,
+    safe,
+    SMALL,
+    tidy,
+    Wanted,
+)
 from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
 
-__all__ = ['DIAGNOSIS_NAMES', 'draw_diagnosis']
+__all__ = ['DIAGNOSIS_NAMES', 'draw_diagnosis', 'errors_figure', 'ranking_figure', 'worst_pieces']
 
 #: at most so many pieces get a picture of their own
 TRACES = 4
+#: segments and candidates that are shown, at most, and characters in a line of a reason
+SEGMENTS, CANDIDATES, REASON = 18, 20, 66
 #: names of all pictures that `draw_diagnosis` can give
 DIAGNOSIS_NAMES = (
     'errors',
@@ -44,31 +58,6 @@ DIAGNOSIS_NAMES = (
 SAME = 'Before: H refitted, nothing added; after: the refined model.'
 
 
-def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis | None]:
-    """
-    Return what the residual shows before, and after where something was added.
-
-    Raises
-    ------
-    NothingToDraw
-        When there is no residual that could be looked at.
-    """
-
-    def analysed(name: str) -> ResidualAnalysis:
-        return analyse(
-            [
-                ResidualPart(r.record, r.piece, getattr(r, name), r.sound)
-                for r in diagnosis.residuals
-            ]
-        )
-
-    try:
-        after = analysed('after') if differ(diagnosis.residuals) else None
-        return analysed('before'), after
-    except DataError as error:
-        raise NothingToDraw(str(error)) from None
-
-
 def draw_diagnosis(
     diagnosis: Diagnosis, tick: Callable[[float], None] = lambda share: None
 ) -> Drawn:
@@ -80,12 +69,8 @@ def draw_diagnosis(
     diagnosis : Diagnosis
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
-
-    Returns
-    -------
-    Drawn
     """
-    wanted: list[tuple[str, str, str, Callable[[], Figure]]] = [
+    wanted: list[Wanted] = [
         (
             'errors',
             'Error before and after',
@@ -97,21 +82,17 @@ def draw_diagnosis(
             'error_frequencies',
             'Error over frequency',
             'The same errors for the sines among the segments.',
-            lambda: frequencies_figure(diagnosis),
+            lambda: _frequencies_figure(diagnosis),
         ),
     ]
-    # those that miss the most say the most
-    worst = sorted(diagnosis.residuals, key=lambda r: -float(np.sum(r.before[r.sound] ** 2)))[
-        :TRACES
-    ]
-    for i, residual in enumerate(r for r in diagnosis.residuals if any(r is w for w in worst)):
+    for i, residual in enumerate(worst_pieces(diagnosis), 1):
         wanted.append(
             (
-                f'residual_{i + 1}',
+                f'residual_{i}',
                 f'Residual: {residual.record}',
                 'Measured minus predicted, free run, both on one scale; segments are shaded in '
                 'turn. Each column of a long trace shows its smallest and largest sample.',
-                lambda residual=residual: residual_figure(residual),  # type: ignore[misc]
+                partial(residual_figure, residual),
             )
         )
     analyses = cache(lambda: _analyses(diagnosis))
@@ -146,11 +127,133 @@ def draw_diagnosis(
             lambda: ranking_figure(diagnosis),
         ),
     ]
-    pictures, left_out = [], []
-    for i, (name, title, caption, make) in enumerate(wanted):
-        tick(i / len(wanted))
-        try:
-            pictures.append(Picture(name, title, caption, make()))
-        except NothingToDraw as reason:
-            left_out.append((title, str(reason)))
-    return Drawn(tuple(pictures), tuple(left_out))
+    return draw_each(wanted, tick)
+
+
+def worst_pieces(diagnosis: Diagnosis, most: int = TRACES) -> list[Residual]:
+    """Return the pieces that the model misses most, in the order in which they were measured."""
+    missed = [-float(np.sum(r.before[r.sound] ** 2)) for r in diagnosis.residuals]
+    return [diagnosis.residuals[i] for i in sorted(np.argsort(missed, kind='stable')[:most])]
+
+
+def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis | None]:
+    """Return what the residual shows before, and after where something was added."""
+
+    def analysed(name: str) -> ResidualAnalysis:
+        return analyse(
+            [
+                ResidualPart(r.record, r.piece, getattr(r, name), r.sound)
+                for r in diagnosis.residuals
+            ]
+        )
+
+    try:
+        after = analysed('after') if differ(diagnosis.residuals) else None
+        return analysed('before'), after
+    except DataError as error:
+        raise NothingToDraw(str(error)) from None
+
+
+def _states(diagnosis: Diagnosis) -> list[tuple[Errors, str, str]]:
+    """Return the errors that are compared, with their names and colours."""
+    errors = (diagnosis.before, diagnosis.refit, diagnosis.after)
+    shown = 3 if differ(diagnosis.residuals) else 2
+    return [
+        (e, name, colour) for e, (_, name, colour) in zip(errors, STATES[:shown], strict=False)
+    ]
+
+
+def errors_figure(diagnosis: Diagnosis) -> Figure:
+    """Draw the error overall and of every segment as bars, before and after."""
+    states = _states(diagnosis)
+    by_segment = diagnosis.before.by_segment
+    worst = sorted(by_segment, key=lambda label: -by_segment[label])[:SEGMENTS]
+    # in the order in which they were measured
+    labels = [label for label in by_segment if label in worst]
+    fig = figure(0.9 + 0.36 * (1 + len(labels)))
+    axes = fig.subplots()
+    place = np.arange(1 + len(labels), dtype=np.float64)
+    place[1:] += 0.4
+    height = 0.8 / len(states)
+    for i, (errors, name, colour) in enumerate(states):
+        values = [errors.overall, *(errors.by_segment.get(label, np.nan) for label in labels)]
+        at = place + (i - 0.5 * (len(states) - 1)) * height
+        axes.barh(at, values, 0.92 * height, color=colour, label=name)
+        for y, value in zip(at, values, strict=True):
+            if np.isfinite(value):
+                _number(axes, f'{value:.2g}', value, y, SMALL - 1.5)
+    axes.set_yticks(place, ['overall', *map(safe, labels)])
+    axes.invert_yaxis()
+    if diagnosis.noise_floor is not None:
+        floor = diagnosis.noise_floor
+        axes.axvline(floor, color=GREY, linestyle=':', linewidth=1.4, label='noise')
+    tidy(axes, 'rms error / % of stroke')
+    axes.grid(False, axis='y')
+    axes.margins(x=0.08, y=0.02)
+    legend_above(axes)
+    return fig
+
+
+def _number(axes: Axes, text: str, x: float, y: float, size: float) -> None:
+    """Write a number beside the end of a bar."""
+    offset: dict[str, Any] = {'xytext': (3, 0), 'textcoords': 'offset points', 'va': 'center'}
+    axes.annotate(text, (x, y), fontsize=size, color='#333333', **offset)
+
+
+def _frequencies_figure(diagnosis: Diagnosis) -> Figure:
+    """Draw the error over the frequency of the sines, before and after."""
+    keys = sorted(diagnosis.before.by_frequency, key=float)
+    if len(keys) < 2:
+        raise NothingToDraw('the records hold sines of less than two frequencies')
+    fig = figure(3.0, 5.2)
+    axes = fig.subplots()
+    f = np.array([float(key) for key in keys])
+    for (errors, name, colour), shape in zip(
+        _states(diagnosis), ('^:', 's--', 'o-'), strict=False
+    ):
+        values = [errors.by_frequency.get(key, np.nan) for key in keys]
+        axes.loglog(f, values, shape, color=colour, markersize=5, linewidth=1.3, label=name)
+    finish_frequencies(axes, f, diagnosis.noise_floor, 'noise')
+    return fig
+
+
+def ranking_figure(diagnosis: Diagnosis) -> Figure:
+    """
+    Draw the share that every candidate explains, and why it was not added.
+
+    Raises
+    ------
+    NothingToDraw
+        Without effects and candidates.
+    """
+    alike = () if diagnosis.group is None else diagnosis.group.names
+    rows = [(e.name, e.share, 'added to the model', COLOURS['model']) for e in diagnosis.effects]
+    added = {name for name, *_ in rows}
+    rows += [
+        (c.name, c.share, c.why_not, COLOURS['mark'] if c.name in alike else COLOURS['band'])
+        for c in diagnosis.candidates
+        if c.name not in added
+    ]
+    if not rows:
+        raise NothingToDraw('there was nothing to be explained, so no candidate was tried')
+    rows = rows[:CANDIDATES]
+    reasons = [textwrap.wrap(safe(why, 1000), REASON) or [''] for _, _, why, _ in rows]
+    size = np.array([max(1.5, len(lines)) for lines in reasons])
+    place = np.cumsum(size) - 0.5 * size
+    fig = figure(0.75 + 0.145 * float(size.sum()))
+    axes, side = fig.subplots(1, 2, sharey=True, gridspec_kw={'width_ratios': [1.0, 1.55]})
+    shares = [100.0 * min(1.0, max(0.0, share)) for _, share, _, _ in rows]
+    axes.barh(place, shares, 0.95, color=[colour for *_, colour in rows])
+    for y, value, lines in zip(place, shares, reasons, strict=True):
+        _number(axes, f'{value:.0f}', value, y, SMALL - 1.0)
+        text = side.text(0.0, y, '\n'.join(lines), va='center', fontsize=SMALL - 1)
+        text.set_in_layout(False)
+    axes.set_yticks(place, [safe(name) for name, *_ in rows])
+    axes.set_xlim(0.0, 108.0)
+    axes.set_xticks([0, 25, 50, 75, 100])
+    tidy(axes, 'share of the explainable part / %')
+    axes.grid(False, axis='y')
+    axes.set_ylim(float(size.sum()), 0.0)
+    side.set_axis_off()
+    side.set_xlim(0.0, 1.0)
+    return fig

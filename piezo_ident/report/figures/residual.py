@@ -1,192 +1,168 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A residual before and after an effect was added: over time and frequency, by segment."""
+"""Pictures of the residual before and after: over time, frequency, voltage, speed and lag."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.diagnosis.results import Residual
+from piezo_ident.record.record import Piece
 from piezo_ident.report.figures.style import (
+    axis_limit,
     BLUE,
     COLOURS,
     envelope,
     figure,
     GREEN,
-    GREY,
     legend,
     legend_above,
     length_unit,
-    line,
-    NORMAL,
+    name_above,
     note,
     NothingToDraw,
     percent_axis,
     plain_log,
-    safe,
     SMALL,
+    symmetric,
     tidy,
     VERMILION,
+    ZERO,
 )
-from piezo_ident.residual import ResidualAnalysis, ResidualPart
+from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
 from scipy import fft, signal
 
 __all__ = [
-    'residual_errors_figure',
+    'STATES',
+    'differ',
+    'residual_correlation_figure',
+    'residual_dependence_figure',
+    'residual_figure',
     'residual_spectrum_figure',
-    'residual_time_figure',
 ]
 
-BEFORE, AFTER = VERMILION, BLUE
-#: at most so many segments are named over a trace, and have bars
-NAMES, BARS = 24, 24
+#: attribute of `Residual`, name, colour
+STATES = (
+    ('given', 'as given', '#9A9A9A'),
+    ('before', 'H refitted, nothing added', COLOURS['static']),
+    ('after', 'refined', COLOURS['model']),
+)
+#: segments named above a picture, and characters of such a name, at most
+NAMED, SHORT = 14, 20
+#: two segments side by side
+TINTS = ('#E9EEF3', '#F4F0E6')
+#: so many times smaller, the rest is drawn once more on a scale of its own
+ENLARGED = 4.0
 #: points of a spectrum in a decade; longest stretch that is transformed [samples]
 PER_DECADE, LONGEST = 150, 2**21
+#: title of the axis of each quantity
+AXES = {
+    'v': 'voltage / V',
+    'dv/dt': 'dv/dt / V s$^{-1}$',
+    'time since the turn': 'time since the turn / s',
+    'time since the step': 'time since the step / s',
+}
 
 
-def _limits(residuals: Sequence[NDArray[np.float64]]) -> tuple[float, float, float]:
-    """Return the ends of an axis for some residuals, and the largest; rare spikes may be cut."""
-    low = high = largest = 0.0
-    for e in residuals:
-        bottom, top = np.quantile(e, [0.0005, 0.9995])
-        wide = 0.3 * (top - bottom)
-        low = min(low, max(float(e.min()), float(bottom - wide)))
-        high = max(high, min(float(e.max()), float(top + wide)))
-        largest = max(largest, float(np.abs(e).max()))
-    room = 0.06 * (high - low) or 1e-12
-    return low - room, high + room, largest
+def differ(residuals: Sequence[Residual]) -> bool:
+    """Return whether the refined model is neither the one given nor the same with H refitted."""
+    return not any(
+        all(np.array_equal(getattr(r, name), r.after) for r in residuals)
+        for name in ('given', 'before')
+    )
 
 
-def _matching(after: ResidualAnalysis | None, part: ResidualPart) -> ResidualPart | None:
-    """Return the part of another analysis that comes from the same piece."""
-    for other in after.parts if after is not None else ():
-        same = other.record == part.record and other.piece.n == part.piece.n
-        if same and other.piece.start_time == part.piece.start_time:
-            return other
-    return None
-
-
-def residual_time_figure(
-    before: ResidualAnalysis, after: ResidualAnalysis | None = None, part: int | None = None
-) -> Figure:
+def residual_figure(residual: Residual) -> Figure:
     """
-    Draw the residual over time, with the segments shaded.
-
-    Parameters
-    ----------
-    before : ResidualAnalysis
-    after : ResidualAnalysis, optional
-        Of the refined model on the same records.
-    part : int, optional
-        Number of the part; the longest when absent.
+    Draw the residual of a piece before and after, on one scale, its segments shaded.
 
     Raises
     ------
     NothingToDraw
-        When the part has no sound sample.
+        When no sample counts.
     """
-    shown = max(before.parts, key=lambda p: p.piece.n) if part is None else before.parts[part]
-    if not shown.mask.any():
-        raise NothingToDraw('no sample of this record is sound')
-    other = _matching(after, shown)
-    t, v = shown.piece.t, shown.piece.v
-    fig = figure(4.2)
-    drive, axes = fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [1.0, 2.4]})
-    line(drive, t, v, COLOURS['measured'], linewidth=0.8)
-    low, high, largest = _limits([p.e[p.mask] for p in (shown, other) if p is not None])
-    limit = max(-low, high)
-    unit, scale = length_unit(limit)
-    for each, colour, name in ((shown, BEFORE, 'before'), (other, AFTER, 'after')):
-        if each is not None:
-            e = np.where(each.mask, scale * each.e, np.nan)
-            rms = scale * float(np.sqrt(np.mean(each.e[each.mask] ** 2)))
-            label = f'{name if other is not None else "residual"}: rms {rms:.3g} {unit}'
-            _broken_line(axes, t, e, colour, label)
-    if before.floor.rms is not None and before.floor.rms > 0.01 * limit:
-        floor = scale * before.floor.rms
-        axes.axhspan(
-            -2 * floor,
-            2 * floor,
-            color=COLOURS['band'],
-            alpha=0.7,
-            zorder=2.6,
-            linewidth=0,
-            label='± 2 noise floors',
-        )
-    tidy(drive, '', 'voltage / V')
-    tidy(axes, 'time / s', f'residual / {unit}')
-    axes.set_ylim(scale * low, scale * high)
-    axes.axhline(0.0, color='#555555', linewidth=0.6, zorder=1)
+    if not residual.sound.any():
+        raise NothingToDraw(f'{residual.record}: no sample counts')
+    piece, stroke = residual.piece, float(np.ptp(residual.piece.y))
+    e = {name: getattr(residual, name)[residual.sound] for name, _, _ in STATES}
+    limit, largest = axis_limit(np.concatenate(list(e.values())))
+    rows: list[tuple[tuple[str, ...], float, str]] = [(('given', 'before'), limit, '')]
+    if differ([residual]):
+        rows.append((('after',), limit, 'on the same scale'))
+        small, _ = axis_limit(e['after'])
+        if 0.0 < small < limit / ENLARGED:
+            rows.append((('after',), small, f'{limit / small:.2g} times enlarged'))
+    fig = figure(1.2 + 1.6 * len(rows))
+    ratios = {'height_ratios': [0.8, *[1.5] * len(rows)]}
+    axes = fig.subplots(1 + len(rows), 1, sharex=True, gridspec_kw=ratios)
+    k = envelope(piece.v)
+    axes[0].plot(piece.t[k], piece.v[k], color=COLOURS['measured'], linewidth=1.0)
+    tidy(axes[0], '', 'voltage / V')
+    _shade(list(axes), piece)
+    for ax, (names, end, remark) in zip(axes[1:], rows, strict=True):
+        unit, scale = length_unit(end)
+        for name, label, colour in STATES:
+            if name in names:
+                _trace(ax, residual, name, scale, colour, label)
+        symmetric(ax, scale * end)
+        tidy(ax, 'time / s' if ax is axes[-1] else '', f'residual / {unit}')
+        percent_axis(ax, scale * stroke)
+        legend_above(ax)
+        note(ax, remark)
     if largest > limit:
-        note(axes, f'axis cut; largest {scale * largest:.3g} {unit}')
-    drive.margins(x=0.005)
-    _shade_segments(drive, axes, shown)
-    percent_axis(axes, scale * before.stroke)
-    legend_above(axes)
-    fig.align_ylabels([drive, axes])
+        note(axes[1], f'axis cut; largest {1e6 * largest:.3g} µm')
+    axes[0].margins(x=0.005)
+    fig.align_ylabels(list(axes))
     return fig
 
 
-def _broken_line(
-    axes: Axes, t: NDArray[np.float64], e: NDArray[np.float64], colour: str, label: str
+def _trace(
+    axes: Axes, residual: Residual, name: str, scale: float, colour: str, label: str
 ) -> None:
-    """Draw the sound stretches of a trace by their envelopes."""
-    known = np.isfinite(e)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(np.int8), [0]])))
-    stretches = list(zip(edges[::2], edges[1::2], strict=True))
-    points = max(20, 6000 // max(len(stretches), 1))
-    for i, (a, b) in enumerate(stretches):
-        share = max(20, int(points * len(stretches) * (b - a) / e.size))
-        _envelope_line(axes, t[a:b], e[a:b], colour, label if i == 0 else None, share)
+    # samples that do not count leave a gap
+    e, good = scale * getattr(residual, name), np.flatnonzero(residual.sound)
+    k = envelope(np.interp(np.arange(e.size), good, e[good]))
+    y = np.where(residual.sound, e, np.nan)[k]
+    width = 2.2 if name == 'given' else 0.8
+    axes.plot(residual.piece.t[k], y, color=colour, linewidth=width, label=label)
 
 
-def _envelope_line(
-    axes: Axes,
-    t: NDArray[np.float64],
-    e: NDArray[np.float64],
-    colour: str,
-    label: str | None,
-    points: int,
-) -> None:
-    k = envelope(e, points)
-    axes.plot(t[k], e[k], color=colour, linewidth=0.6, label=label)
+def _shade(axes: Sequence[Axes], piece: Piece) -> None:
+    """Shade the segments that drive the stage, and name them above the first of the axes."""
+    stretches = [(s.label, s.start, s.stop) for s in piece.segments]
+    if len(stretches) > NAMED:
+        # many short ones of a kind are shown as one
+        groups = [list(group) for _, group in groupby(piece.segments, key=lambda s: s.kind)]
+        stretches = [
+            (g[0].label if len(g) == 1 else f'{len(g)} × {g[0].kind}', g[0].start, g[-1].stop)
+            for g in groups
+        ]
+    longest = sorted(stretches, key=lambda s: s[1] - s[2])[:NAMED]
+    driven = [s for s in stretches if s[0].partition(':')[0] not in ('idle', 'ramp')]
+    for i, (label, start, stop) in enumerate(driven):
+        first, last = piece.t[start], piece.t[stop - 1] + piece.dt
+        for each in axes:
+            each.axvspan(first, last, color=TINTS[i % 2], linewidth=0.0, zorder=0)
+        if (label, start, stop) in longest:
+            short = label if len(label) <= SHORT else f'{label[: SHORT - 1]}…'
+            name_above(axes[0], short, 0.5 * (first + last))
 
 
-def _shade_segments(drive: Axes, axes: Axes, part: ResidualPart) -> None:
-    """Shade every other segment, and name those that are long enough to carry a name."""
-    segments = part.piece.segments
-    t = part.piece.t
-    whole = float(t[-1] - t[0]) or 1.0
-    last = -np.inf
-    shaded = False
-    for s in segments:
-        start, stop = float(t[s.start]), float(t[s.stop - 1])
-        shaded = not shaded and s.kind not in ('idle', 'ramp')
-        if shaded:
-            for each in (drive, axes):
-                each.axvspan(start, stop, color='#EFEFEF', linewidth=0, zorder=0)
-        named = s.kind not in ('idle', 'ramp')
-        # names stand at an angle: the next one needs some way to the right
-        middle = 0.5 * (start + stop)
-        if not named or middle - last < 0.03 * whole:
-            continue
-        last = middle
-        drive.annotate(
-            safe(s.label),
-            (middle, 1.0),
-            xycoords=('data', 'axes fraction'),
-            xytext=(0, 2),
-            textcoords='offset points',
-            ha='left',
-            va='bottom',
-            rotation=35,
-            rotation_mode='anchor',
-            fontsize=SMALL - 1.0,
-        )
+def _both(
+    before: ResidualAnalysis, after: ResidualAnalysis | None
+) -> list[tuple[ResidualAnalysis, str, str]]:
+    """Return what is compared, with colours and names."""
+    if after is None:
+        return [(before, VERMILION, 'residual')]
+    return [(before, VERMILION, 'before'), (after, BLUE, 'after')]
 
 
 def _density(part: ResidualPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -198,62 +174,48 @@ def _density(part: ResidualPart) -> tuple[NDArray[np.float64], NDArray[np.float6
     size = fft.next_fast_len(x.size, real=True)
     power = 2.0 * np.abs(fft.rfft(window * x, size)) ** 2 / (rate * float(window @ window))
     f = np.arange(power.size) * rate / size
-    # the first two bins are what is left of the trend
+    # the first two bins hold the rest of the trend
     f, power = f[2:-1], power[2:-1]
     k = np.floor(PER_DECADE * np.log10(f / f[0])).astype(np.int64)
     count = np.bincount(k)
     used = count > 0
     # the mean of a bin keeps its power, so a narrow line still stands out
-    return (
-        (np.bincount(k, f)[used] / count[used]),
-        np.sqrt(np.bincount(k, power)[used] / count[used]),
-    )
+    means = [np.bincount(k, values)[used] / count[used] for values in (f, power)]
+    return means[0], np.sqrt(means[1])
 
 
 def residual_spectrum_figure(
-    before: ResidualAnalysis, after: ResidualAnalysis | None = None, part: int | None = None
+    before: ResidualAnalysis, after: ResidualAnalysis | None = None
 ) -> Figure:
     """
-    Draw the amplitude density of the residual, the noise floor, and the lines found.
-
-    Parameters
-    ----------
-    before : ResidualAnalysis
-    after : ResidualAnalysis, optional
-    part : int, optional
-        Number of the part; the longest when absent.
+    Draw the amplitude density of the longest residual, the noise floor, and the lines in it.
 
     Raises
     ------
     NothingToDraw
         When no stretch is long enough for a spectrum.
     """
-    shown = max(before.parts, key=lambda p: p.piece.n) if part is None else before.parts[part]
+    i = max(range(len(before.parts)), key=lambda i: before.parts[i].piece.n)
+    shown = before.parts[i]
     if max((b - a for a, b in shown.runs()), default=0) < 64 or not np.any(shown.e):
         raise NothingToDraw('no stretch is long enough for a spectrum')
-    other = _matching(after, shown)
     fig = figure(3.6)
     axes = fig.subplots()
     top, bottom, first, last = 0.0, np.inf, np.inf, 0.0
-    for each, colour, name in ((shown, BEFORE, 'before'), (other, AFTER, 'after')):
-        if each is None or not np.any(each.e):
+    for analysis, colour, label in _both(before, after):
+        if not np.any(analysis.parts[i].e):
             continue
-        f, density = _density(each)
-        label = name if other is not None else 'residual'
+        f, density = _density(analysis.parts[i])
         axes.loglog(f, 1e9 * density, color=colour, linewidth=0.8, label=label)
         top, bottom = max(top, density.max()), min(bottom, float(np.quantile(density, 0.01)))
         first, last = min(first, f[0]), max(last, f[-1])
     floor = before.floor
     if floor.frequency.size > 2:
-        axes.loglog(
-            floor.frequency[1:-1],
-            1e9 * np.sqrt(floor.density[1:-1]),
-            color='black',
-            linewidth=1.0,
-            linestyle='--',
-            label='noise floor',
-        )
-    _mark_lines(axes, before)
+        noise = 1e9 * np.sqrt(floor.density[1:-1])
+        axes.loglog(floor.frequency[1:-1], noise, 'k--', linewidth=1.0, label='noise floor')
+    for each in before.lines.lines:
+        for order, found in [(1, each), *each.harmonics]:
+            _mark_line(axes, found.frequency, found.amplitude, order)
     tidy(axes, 'frequency / Hz', 'residual / nm Hz$^{-1/2}$')
     axes.set_xlim(first, last)
     # room for the names of the lines
@@ -266,119 +228,156 @@ def residual_spectrum_figure(
     return fig
 
 
-def _mark_lines(axes: Axes, analysis: ResidualAnalysis) -> None:
-    for each in analysis.lines.lines:
-        marks = [(1, each), *each.harmonics]
-        for order, found in marks:
-            axes.axvline(found.frequency, color=GREEN, linewidth=0.8, linestyle=':', zorder=1)
-            text = f'{found.frequency:.4g} Hz, {1e9 * found.amplitude:.2g} nm'
-            axes.annotate(
-                text if order == 1 else f'{text} (× {order})',
-                (found.frequency, 1.0),
-                xycoords=('data', 'axes fraction'),
-                xytext=(2, -2),
-                textcoords='offset points',
-                ha='left',
-                va='top',
-                rotation=90,
-                fontsize=SMALL - 1.0,
-                color=GREEN,
-            )
+def _mark_line(axes: Axes, frequency: float, amplitude: float, order: int) -> None:
+    axes.axvline(frequency, color=GREEN, linewidth=0.8, linestyle=':', zorder=1)
+    text = f'{frequency:.4g} Hz, {1e9 * amplitude:.2g} nm'
+    axes.annotate(
+        text if order == 1 else f'{text} (× {order})',
+        (frequency, 1.0),
+        xycoords=('data', 'axes fraction'),
+        xytext=(2, -2),
+        textcoords='offset points',
+        ha='left',
+        va='top',
+        rotation=90,
+        fontsize=SMALL - 1.0,
+        color=GREEN,
+    )
 
 
-def residual_errors_figure(
+def residual_dependence_figure(
     before: ResidualAnalysis, after: ResidualAnalysis | None = None
 ) -> Figure:
     """
-    Draw bars of the error by segment and by frequency, before and after.
-
-    Parameters
-    ----------
-    before : ResidualAnalysis
-    after : ResidualAnalysis, optional
+    Draw the mean residual over voltage, speed, and the time since the last turn and step.
 
     Raises
     ------
     NothingToDraw
-        When there is no segment.
+        When no curve has points.
     """
-    several = len({row.record for row in before.segments}) > 1
-    keys = [
-        (row.record, row.segment, row.start_time)
-        for row in before.segments
-        if row.segment.partition(':')[0] != 'ramp'
-    ]
-    keys = keys or [(row.record, row.segment, row.start_time) for row in before.segments]
-    if not keys:
-        raise NothingToDraw('there is no segment')
-    own = {(r.record, r.segment, r.start_time): r.percent for r in before.segments}
-    if len(keys) > BARS:
-        largest = sorted(keys, key=lambda key: -own[key])[:BARS]
-        keys = [key for key in keys if key in largest]
-    other = {
-        (r.record, r.segment, r.start_time): r.percent
-        for r in (after.segments if after is not None else ())
-    }
-    frequencies = {
-        (r.record, r.segment, r.frequency, r.amplitude): r.percent for r in before.frequencies
-    }
-    others = {
-        (r.record, r.segment, r.frequency, r.amplitude): r.percent
-        for r in (after.frequencies if after is not None else ())
-    }
-    height = 0.9 + 0.21 * max(len(keys), 6)
-    fig = figure(height)
-    wide = bool(frequencies)
-    grid = fig.subplots(
-        1, 2 if wide else 1, squeeze=False, gridspec_kw={'width_ratios': [1.25, 1.0][: 1 + wide]}
-    )[0]
-    names = [safe(f'{record}: {segment}' if several else segment) for record, segment, _ in keys]
-    _bars(
-        grid[0],
-        names,
-        [own[key] for key in keys],
-        [other.get(key, np.nan) for key in keys] if after is not None else None,
-        before.floor_percent,
-    )
-    grid[0].set_xlabel('rms error by segment / % of stroke', fontsize=NORMAL)
-    if wide:
-        shown = sorted(frequencies, key=lambda key: (key[2], key[3]))[:BARS]
-        _bars(
-            grid[1],
-            [f'{key[2]:g} Hz, {key[3]:.3g} V' for key in shown],
-            [frequencies[key] for key in shown],
-            [others.get(key, np.nan) for key in shown] if after is not None else None,
-            None,
-        )
-        grid[1].set_xlabel('steady sines: rms error / %', fontsize=NORMAL)
-    legend_above(grid[0])
+    names = [name for name in AXES if _curves(before, name)]
+    if not names:
+        raise NothingToDraw('the residual has no curve with two points or more')
+    rows = -(-len(names) // 2)
+    fig = figure(2.7 * rows)
+    grid = fig.subplots(rows, min(2, len(names)), squeeze=False)
+    sizes = [np.abs(c.mean).max(initial=0.0) for name in names for c in _curves(before, name)]
+    unit, scale = length_unit(float(max(sizes)))
+    for axes, name in zip(grid.ravel(), names, strict=False):
+        shares = []
+        for analysis, colour, label in _both(before, after):
+            curves = _curves(analysis, name)
+            for curve in curves:
+                _draw_curve(axes, curve, scale, colour, label if after is not None else '')
+            if curves:
+                shares.append(f'{100.0 * curves[0].share:.0f} %')
+        axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
+        tidy(axes, AXES[name], f'mean residual / {unit}')
+        if name.startswith('time'):
+            axes.set_xscale('log')
+            plain_log(axes.xaxis, *axes.get_xlim())
+        elif name == 'dv/dt':
+            _signed_log(axes, _curves(before, name))
+        # means over lg t, in which a decade counts as much as any other
+        what = 'the means' if name == 'time since the step' else 'the variance'
+        note(axes, f'explains {" → ".join(shares)} of {what}')
+        legend(axes)
+    for axes in grid.ravel()[len(names) :]:
+        axes.set_axis_off()
+    fig.align_ylabels(list(grid.ravel()))
     return fig
 
 
-def _bars(
-    axes: Axes,
-    names: Sequence[str],
-    before: Sequence[float],
-    after: Sequence[float] | None,
-    floor: float | None,
-) -> None:
-    k = np.arange(len(names))
-    thick = 0.38 if after is not None else 0.7
-    shift = 0.5 * thick if after is not None else 0.0
-    axes.barh(k - shift, before, thick, color=BEFORE, label='before' if after else 'model')
-    values = list(before)
-    if after is not None:
-        axes.barh(k + shift, after, thick, color=AFTER, label='after')
-        values += [x for x in after if np.isfinite(x)]
-    positive = [x for x in values if x > 0.0]
-    tidy(axes, 'rms error / % of stroke')
-    if positive and max(positive) > 20.0 * min(positive):
-        low = 0.5 * min([*positive, *([floor] if floor else [])])
-        axes.set_xscale('log')
-        axes.set_xlim(low, 1.6 * max(positive))
-        plain_log(axes.xaxis, low, 1.6 * max(positive))
-    if floor:
-        axes.axvline(floor, color=GREY, linestyle='--', linewidth=1.1, label='noise floor')
-    axes.set_yticks(k, names, fontsize=SMALL)
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.grid(False, axis='y')
+def _curves(analysis: ResidualAnalysis, against: str) -> list[Curve]:
+    return [c for c in analysis.curves if c.against == against and c.x.size > 1]
+
+
+def _draw_curve(axes: Axes, curve: Curve, scale: float, colour: str, label: str) -> None:
+    branch = {'up': 'rising', 'down': 'falling', 'both': ''}[curve.branch]
+    name = ', '.join(filter(None, (label, branch))) or 'along the drive'
+    style: dict[str, Any] = {'color': colour, 'linewidth': 1.1, 'markersize': 3.0}
+    if curve.branch == 'down':
+        style |= {'linestyle': '--', 'marker': 'v', 'markerfacecolor': 'white'}
+    else:
+        style |= {'marker': '^' if curve.branch == 'up' else 'o'}
+    mean, std = scale * curve.mean, scale * curve.std
+    band: dict[str, Any] = {'color': colour, 'alpha': 0.18, 'linewidth': 0}
+    axes.fill_between(curve.x, mean - 2 * std, mean + 2 * std, **band)
+    axes.plot(curve.x, mean, label=name, **style)
+
+
+def _signed_log(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Make an axis of speeds logarithmic to both sides where they span decades."""
+    sizes = np.abs(np.concatenate([c.x for c in curves]))
+    sizes = sizes[sizes > 0.0]
+    if sizes.size == 0 or sizes.max() < 30.0 * np.quantile(sizes, 0.1):
+        return
+    # at most four decades to a side
+    slowest = max(float(np.quantile(sizes, 0.1)), 1e-4 * float(sizes.max()))
+    threshold = 10.0 ** np.floor(np.log10(slowest))
+    axes.set_xscale('symlog', linthresh=threshold, linscale=0.3)
+    decades = np.arange(np.log10(threshold), np.log10(sizes.max()) + 0.5)
+    # ticks that would touch are left out
+    ticks = 10.0 ** decades[1 :: max(1, -(-decades.size // 3))]
+    ticks = np.concatenate([-ticks[::-1], [0.0], ticks])
+    axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
+    axes.minorticks_off()
+
+
+def residual_correlation_figure(
+    before: ResidualAnalysis, after: ResidualAnalysis | None = None
+) -> Figure:
+    """
+    Draw the coherence of voltage and residual, and their cross-correlations with their bands.
+
+    Raises
+    ------
+    NothingToDraw
+        When there is too little data for either.
+    """
+    if before.coherence is None and not before.correlations:
+        raise NothingToDraw('too few samples for coherence and correlation')
+    both = _both(before, after)
+    rows = int(before.coherence is not None) + int(bool(before.correlations))
+    fig = figure(2.5 * rows)
+    grid = fig.add_gridspec(rows, 2)
+    if before.coherence is not None:
+        _draw_coherence(fig.add_subplot(grid[0, :]), both)
+    for i, first in enumerate(before.correlations):
+        axes = fig.add_subplot(grid[-1, i])
+        for analysis, colour, label in both:
+            for c in analysis.correlations:
+                if c.input == first.input:
+                    lag = 1e3 * c.lag
+                    axes.plot(lag, c.correlation, color=colour, linewidth=1.1, label=label)
+                    for band in (-c.band, c.band):
+                        axes.plot(lag, band, color=colour, linewidth=0.8, linestyle='--', zorder=1)
+        tidy(axes, 'lag / ms', f'correlation with {first.input}')
+        axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
+        axes.margins(x=0.0)
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        note(axes, 'dashed: 99 % band of all lags')
+        if before.coherence is None:
+            legend(axes)
+    return fig
+
+
+def _draw_coherence(axes: Axes, both: Sequence[tuple[ResidualAnalysis, str, str]]) -> None:
+    coherences = [(a.coherence, colour, name) for a, colour, name in both if a.coherence]
+    shares = []
+    for c, colour, label in coherences:
+        value = np.where(c.tested, c.coherence, np.nan)
+        axes.plot(c.frequency, value, color=colour, linewidth=0.8, label=label)
+        shares.append(f'{100.0 * c.share:.1f} %')
+    first = coherences[0][0]
+    axes.axhline(first.bound, color='k', linewidth=1.0, linestyle='--', label='99 % bound')
+    tidy(axes, 'frequency / Hz', 'coherence with v')
+    axes.set_xscale('log')
+    axes.set_ylim(-0.02, 1.05)
+    low = float(first.frequency[1])
+    high = 1.1 * float(first.frequency[first.tested].max(initial=2.0 * low))
+    axes.set_xlim(low, high)
+    plain_log(axes.xaxis, low, high)
+    note(axes, f'coherent share of the residual: {" → ".join(shares)}')
+    legend_above(axes)

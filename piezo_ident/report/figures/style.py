@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How the pictures look: colours, fonts, axes, and long traces without losing their extremes.
+The looks of the pictures: colours, fonts, axes, and long traces without loss of their extremes.
 
 Everything is set on the objects themselves: neither pyplot nor the global settings are touched,
 so pictures can be drawn from any thread and beside a lab's own.
@@ -10,12 +10,13 @@ so pictures can be drawn from any thread and beside a lab's own.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import io
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
@@ -23,26 +24,32 @@ from numpy.typing import NDArray
 
 __all__ = [
     'COLOURS',
+    'Drawn',
     'NothingToDraw',
     'Picture',
+    'Wanted',
+    'axis_limit',
+    'draw_each',
     'envelope',
     'figure',
     'legend',
     'legend_above',
     'length_unit',
-    'lightness',
     'line',
+    'name_above',
     'note',
     'percent_axis',
     'plain_log',
+    'png',
     'safe',
+    'symmetric',
     'tidy',
 ]
 
 # Okabe and Ito's palette: told apart with every common colour vision, and by lightness in grey
 BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
 GREEN, ORANGE, SKY, PURPLE = '#009E73', '#E69F00', '#56B4E9', '#CC79A7'
-GREY = '#7A7A7A'
+GREY, ZERO = '#7A7A7A', '#555555'
 
 #: who is drawn how, in every picture; 'under' is the measured trace below that of the model
 COLOURS = {
@@ -62,6 +69,10 @@ WIDTH = 7.0
 SMALL, NORMAL = 8.0, 9.0
 #: points of one trace; two a pixel column are enough to show every extreme
 POINTS = 3000
+#: dots an inch: sharp in print at the size drawn
+DPI = 160
+#: an axis ends at this many times the usual error, if the largest one is this much further out
+USUAL, ROOM, FAR = 0.995, 2.5, 1.6
 
 
 class NothingToDraw(Exception):
@@ -87,11 +98,50 @@ class Picture:
     figure: Figure
 
 
-def safe(text: str) -> str:
+#: name, title and caption of a picture, and what draws it
+Wanted = tuple[str, str, str, Callable[[], Figure]]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """
+    Pictures of a result.
+
+    Attributes
+    ----------
+    pictures : tuple of Picture
+    left_out : tuple of (str, str)
+        Title of each picture that the data do not allow, and why.
+    """
+
+    pictures: tuple[Picture, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+
+def draw_each(wanted: Sequence[Wanted], tick: Callable[[float], None]) -> Drawn:
+    """Draw what the data allow; `tick` takes the share that is done, and may raise."""
+    pictures, left_out = [], []
+    for i, (name, title, caption, make) in enumerate(wanted):
+        tick(i / len(wanted))
+        try:
+            pictures.append(Picture(name, title, caption, make()))
+        except NothingToDraw as reason:
+            left_out.append((title, str(reason)))
+    return Drawn(tuple(pictures), tuple(left_out))
+
+
+def png(picture: Figure, dpi: int | None = None) -> bytes:
+    """Return a figure as PNG."""
+    buffer = io.BytesIO()
+    picture.savefig(buffer, format='png', dpi=dpi or DPI)
+    return buffer.getvalue()
+
+
+def safe(text: str, longest: int = 60) -> str:
     """Return text that shows as it is: no mathematics, no control characters, not too long."""
     shown = ''.join(c if c.isprintable() else '?' for c in text)
-    if len(shown) > 60:
-        shown = shown[:57] + '...'
+    if len(shown) > longest:
+        shown = shown[: longest - 3] + '...'
     return shown.replace('$', r'\$')
 
 
@@ -129,20 +179,26 @@ def length_unit(largest: float) -> tuple[str, float]:
     return ('nm', 1e9) if largest >= 1e-9 else ('pm', 1e12)
 
 
+def axis_limit(errors: NDArray[np.float64]) -> tuple[float, float]:
+    """Return where to end an axis for some errors, and the largest; rare spikes are cut."""
+    sizes = np.abs(errors)
+    largest = float(sizes.max(initial=0.0))
+    usual = ROOM * float(np.quantile(sizes, USUAL))
+    return (usual if 0.0 < FAR * usual < largest else largest), largest
+
+
+def symmetric(axes: Axes, limit: float) -> None:
+    """Let an axis of errors end at `limit` to both sides, and mark zero."""
+    end = 1.08 * limit if limit > 0.0 else 1.0
+    axes.set_ylim(-end, end)
+    axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
+
+
 def envelope(y: NDArray[np.float64], points: int = POINTS) -> NDArray[np.int64]:
     """
-    Return the samples that have to be drawn for a trace to show every extreme.
+    Return the samples that show every extreme of a trace: about `points`, or all of a short one.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n,)
-    points : int, optional
-        Most samples to return, about.
-
-    Returns
-    -------
-    ndarray of int
-        All samples of a short trace; of a long one the smallest and the largest of each stretch.
+    Of a long trace these are the smallest and the largest of each stretch.
     """
     if y.size <= points:
         return np.arange(y.size)
@@ -216,8 +272,17 @@ def legend_above(axes: Axes) -> None:
     )
 
 
-def lightness() -> ListedColormap:
-    """Return a map of one hue, light where the error is small, so that marks are seen on it."""
-    share = np.linspace(0.0, 1.0, 256)[:, None]
-    light, dark = np.array([[0.97, 0.98, 1.0]]), np.array([[0.03, 0.19, 0.42]])
-    return ListedColormap(np.clip(light + (dark - light) * share**0.8, 0.0, 1.0), 'lightness')
+def name_above(axes: Axes, text: str, x: float, rotation: float = 30.0, **options: Any) -> None:
+    """Write a name above an axes at `x` in its data, at an angle unless that is zero."""
+    options = {'ha': 'left' if rotation else 'center', 'fontsize': SMALL, **options}
+    axes.annotate(
+        safe(text),
+        (x, 1.0),
+        xycoords=('data', 'axes fraction'),
+        xytext=(0, 2),
+        textcoords='offset points',
+        va='bottom',
+        rotation=rotation,
+        rotation_mode='anchor',
+        **options,
+    )

@@ -9,7 +9,6 @@ import itertools
 from diagnosis_examples import base_model, example, measured
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.diagnosis.diagnosis_json import json_text
 from piezo_ident.diagnosis.next_experiment import Experiment
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.nodes.identifier import diagnosis_session as module
@@ -18,6 +17,7 @@ from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome, re
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.capture import Capture
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.to_json import json_text
 import pytest
 
 HOLDS = Experiment('holds', 'this and that cannot be told apart')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of what the three steps found: delay, frequency response, orders, weights."""
+"""Pictures of the three steps: delay, frequency response, orders of G, weights of H."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
@@ -24,7 +24,7 @@ from piezo_ident.report.figures.style import (
     figure,
     GREY,
     legend,
-    lightness,
+    name_above,
     NORMAL,
     NothingToDraw,
     plain_log,
@@ -40,6 +40,12 @@ BEFORE, AFTER = 15, 40
 WORST = 10.0
 #: at most so many modes are named in a frequency response, the least damped ones
 MODES = 4
+#: a map of one hue, light where the error is small, so that marks are seen on it
+LIGHTNESS = ListedColormap(
+    np.array([0.97, 0.98, 1.0])
+    - np.linspace(0.0, 1.0, 256)[:, None] ** 0.8 * np.array([0.94, 0.79, 0.58]),
+    'lightness',
+)
 
 
 def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) -> Figure:
@@ -87,9 +93,9 @@ def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> NDArray[np.float64
             else:
                 pieces.append(predicted)
         if pieces:
-            found = delay_from_steps(pieces, before, after)
-            if found.repeats == step.repeats:
-                return found.response
+            modelled = delay_from_steps(pieces, before, after)
+            if modelled.repeats == step.repeats:
+                return modelled.response
     return None
 
 
@@ -111,13 +117,8 @@ def _draw_step(
         traces = [response] if modelled is None else [response, 1e9 * modelled[which]]
         if size:
             traces = [np.maximum(np.abs(x), floor) for x in traces]
-        axes.axhspan(
-            floor if size else -level,
-            level,
-            color=COLOURS['band'],
-            zorder=1,
-            linewidth=0,
-        )
+        low = floor if size else -level
+        axes.axhspan(low, level, color=COLOURS['band'], zorder=1, linewidth=0)
         axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2)
         if modelled is not None:
             axes.plot(lag, traces[1], color=COLOURS['model'], linewidth=1.2, label='model')
@@ -150,9 +151,8 @@ def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: 
     axes.semilogy(d, loss / loss.min(), 'o-', color=COLOURS['measured'], markersize=3, linewidth=1)
     axes.axvline(chosen, color=COLOURS['mark'], linewidth=1.4, label=f'used: {chosen}')
     if scan is not None and scan != chosen:
-        axes.axvline(
-            scan, color=COLOURS['static'], linestyle='--', linewidth=1.2, label=f'scan: {scan}'
-        )
+        style: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
+        axes.axvline(scan, label=f'scan: {scan}', **style)
     tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the ARX loss')
     plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -197,11 +197,8 @@ def response_figure(identification: Identification) -> Figure:
     phase = np.degrees(np.unwrap(np.angle(G)))
     heights = [2.0, 1.5] if measured is None else [2.0, 1.5, 0.9]
     fig = figure(1.1 * sum(heights))
-    axes: list[Axes] = list(
-        fig.subplots(
-            len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights}, squeeze=False
-        )[:, 0]
-    )
+    ratios = {'height_ratios': heights}
+    axes: list[Axes] = list(fig.subplots(len(heights), 1, sharex=True, gridspec_kw=ratios))
     axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model', zorder=3)
     axes[1].plot(f, phase, color=COLOURS['model'], linewidth=1.4, zorder=3)
     tidy(axes[0], '', f'magnitude {unit}')
@@ -248,19 +245,7 @@ def _mark_modes(axes: Sequence[Axes], modes: list[tuple[float, float]]) -> None:
             continue
         for each in axes:
             each.axvline(frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1)
-        axes[0].annotate(
-            f'{frequency:.0f} Hz',
-            (frequency, 1.0),
-            xycoords=('data', 'axes fraction'),
-            xytext=(0, 2),
-            textcoords='offset points',
-            ha='left',
-            va='bottom',
-            rotation=30,
-            rotation_mode='anchor',
-            fontsize=SMALL,
-            color=COLOURS['mark'],
-        )
+        name_above(axes[0], f'{frequency:.0f} Hz', frequency, color=COLOURS['mark'])
 
 
 def orders_figure(identification: Identification) -> Figure:
@@ -288,7 +273,7 @@ def orders_figure(identification: Identification) -> Figure:
         np.ma.masked_invalid(ratio),
         origin='lower',
         norm=LogNorm(1.0, WORST),
-        cmap=lightness(),
+        cmap=LIGHTNESS,
         extent=(0.5, ratio.shape[1] + 0.5, 0.5, ratio.shape[0] + 0.5),
         interpolation='nearest',
         aspect='auto',

@@ -1,11 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of measurement against model: loops, time traces, errors over frequency."""
+"""Measurement against free run: loops, traces over time, segments, errors over frequency."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,19 +14,22 @@ from numpy.typing import NDArray
 from piezo_ident.model.free_run import PieceRun, sine_frequency, SineError
 from piezo_ident.record.record import Segment
 from piezo_ident.report.figures.style import (
+    axis_limit,
     COLOURS,
     envelope,
     figure,
     GREY,
     legend,
     legend_above,
+    length_unit,
     line,
+    name_above,
     note,
     NothingToDraw,
     percent_axis,
     plain_log,
     safe,
-    SMALL,
+    symmetric,
     tidy,
 )
 
@@ -55,88 +58,63 @@ def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> 
     ----------
     runs : sequence of PieceRun
     edges : sequence of (int or None), optional
-        For each run the first sample that was not fitted, where its end was kept back.
+        For each run the first sample that was not fitted, where its end was held out.
 
     Raises
     ------
     NothingToDraw
         When the voltage does not move.
     """
-    found = _loop(runs)
-    if found is None:
-        raise NothingToDraw('the voltage does not move')
-    run, s = found
-    part = slice(s.start, s.stop)
+    number, s = _widest_loop(runs)
+    run, part = runs[number], slice(s.start, s.stop)
     v, y, y_hat = run.piece.v[part], 1e6 * run.piece.y[part], 1e6 * run.y_hat[part]
     fig = figure(5.2, 5.2)
     loops, errors = fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [2.4, 1]})
-    k = envelope(y, LOOP_POINTS)
-    loops.plot(*_broken(v[k], y[k]), color=COLOURS['under'], linewidth=3.0, label='measured')
-    unit, scale = _error_unit(y - y_hat)
-    error = scale * (y - y_hat)
-    kept = dict(zip(map(id, runs), edges, strict=False)).get(id(run))
+    _loop(loops, v, y, COLOURS['under'], 'measured', 3.0)
+    limit, largest = axis_limit(1e-6 * (y - y_hat))
+    unit, scale = length_unit(largest)
+    error = 1e-6 * scale * (y - y_hat)
+    kept = edges[number] if edges else None
     edge = y.size if kept is None else min(max(kept - s.start, 0), y.size)
-    for cut, name, colour in (
-        (slice(0, edge), 'model', COLOURS['model']),
-        (slice(edge, None), 'model, held out', COLOURS['model held out']),
-    ):
-        if y_hat[cut].size == 0:
-            continue
-        k = envelope(y_hat[cut], LOOP_POINTS)
-        loops.plot(*_broken(v[cut][k], y_hat[cut][k]), color=colour, linewidth=1.0, label=name)
-        k = envelope(error[cut], LOOP_POINTS)
-        errors.plot(*_broken(v[cut][k], error[cut][k]), color=colour, linewidth=0.6)
-    limit, largest = _limit(error)
-    _symmetric(errors, limit)
+    for cut, name in ((slice(0, edge), 'model'), (slice(edge, None), 'model held out')):
+        if y_hat[cut].size:
+            _loop(loops, v[cut], y_hat[cut], COLOURS[name], name.replace('model h', 'model, h'))
+            _loop(errors, v[cut], error[cut], COLOURS[name], width=0.6)
+    symmetric(errors, scale * limit)
     if largest > limit:
-        note(errors, f'axis cut; largest {largest:.3g} {unit}')
+        note(errors, f'axis cut; largest {scale * largest:.3g} {unit}')
     name = ', '.join(filter(None, (safe(run.record), safe(s.label))))
     tidy(loops, '', 'displacement / µm', name)
     tidy(errors, 'voltage / V', f'error / {unit}')
-    percent_axis(errors, scale * 1e6 * float(np.ptp(run.piece.y)))
+    percent_axis(errors, scale * float(np.ptp(run.piece.y)))
     legend(loops, loc='best')
     fig.align_ylabels([loops, errors])
     return fig
 
 
-def _loop(runs: Sequence[PieceRun]) -> tuple[PieceRun, Segment] | None:
-    """Return the triangle, or else the whole piece, that covers the widest range."""
-    candidates = [(run, s) for run in runs for s in run.piece.find('triangle')]
-    candidates = candidates or [(run, Segment('', 0, run.piece.n)) for run in runs]
-
-    def width(candidate: tuple[PieceRun, Segment]) -> float:
-        run, s = candidate
-        return float(np.ptp(run.piece.v[s.start : s.stop]))
-
-    best = max(candidates, key=width, default=None)
-    return best if best is not None and width(best) > 0.0 else None
+def _widest_loop(runs: Sequence[PieceRun]) -> tuple[int, Segment]:
+    loops = [(i, s) for i, run in enumerate(runs) for s in run.piece.find('triangle')]
+    loops = loops or [(i, Segment('', 0, run.piece.n)) for i, run in enumerate(runs)]
+    width = [float(np.ptp(runs[i].piece.v[s.start : s.stop])) for i, s in loops]
+    if not any(width):
+        raise NothingToDraw('the voltage does not move')
+    return loops[int(np.argmax(width))]
 
 
-def _broken(
-    v: NDArray[np.float64], y: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a loop without the chords that jumps of the voltage would draw across it."""
+def _loop(
+    axes: Axes,
+    v: NDArray[np.float64],
+    y: NDArray[np.float64],
+    colour: str,
+    label: str = '',
+    width: float = 1.0,
+) -> None:
+    k = envelope(y, LOOP_POINTS)
+    v, y = v[k], y[k]
+    # no chords across the loop where the voltage jumps
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.1 * np.ptp(v)) + 1
-    return np.insert(v, jumps, np.nan), np.insert(y, jumps, np.nan)
-
-
-def _error_unit(error: NDArray[np.float64]) -> tuple[str, float]:
-    """Return the unit in which an error given in µm is read best, and its factor."""
-    return ('µm', 1.0) if float(np.abs(error).max(initial=0.0)) >= 1.0 else ('nm', 1e3)
-
-
-def _limit(error: NDArray[np.float64]) -> tuple[float, float]:
-    """Return where to end an axis for an error, and the largest error; spikes may be cut."""
-    sizes = np.abs(error)
-    largest = float(sizes.max(initial=0.0))
-    usual = 2.5 * float(np.quantile(sizes, 0.995))
-    return (usual if 0.0 < 1.6 * usual < largest else largest), largest
-
-
-def _symmetric(axes: Axes, limit: float) -> None:
-    end = 1.08 * limit if limit > 0.0 else 1.0
-    axes.set_ylim(-end, end)
-    axes.axhline(0.0, color='#555555', linewidth=0.6, zorder=1)
+    v, y = np.insert(v, jumps, np.nan), np.insert(y, jumps, np.nan)
+    axes.plot(v, y, color=colour, linewidth=width, label=label)
 
 
 def _draw_error(
@@ -146,47 +124,23 @@ def _draw_error(
     e_static: NDArray[np.float64],
     width: float,
 ) -> tuple[str, float]:
-    """
-    Draw the error of the model, and of the hysteresis alone where both can be read.
-
-    Parameters
-    ----------
-    axes : Axes
-    x : ndarray, shape (n,)
-    e, e_static : ndarray, shape (n,)
-        [µm]
-    width : float
-        Of the lines [points].
-
-    Returns
-    -------
-    unit : str
-    scale : float
-        From µm to the unit.
-    """
-    unit, scale = _error_unit(e)
-    limit, largest = _limit(scale * e)
-    said = [f'axis cut; largest {largest:.3g} {unit}'] if largest > limit else []
+    """Draw errors [m], that of the hysteresis alone where both are readable; return the unit."""
+    limit, largest = axis_limit(e)
+    unit, scale = length_unit(largest)
+    remarks = [f'axis cut; largest {scale * largest:.3g} {unit}'] if largest > limit else []
     if not np.array_equal(e, e_static):
-        static_limit, static_largest = _limit(scale * e_static)
+        static_limit, static_largest = axis_limit(e_static)
         if static_limit <= READABLE * limit:
-            line(
-                axes,
-                x,
-                scale * e_static,
-                COLOURS['static'],
-                'hysteresis alone',
-                linewidth=width,
-            )
+            line(axes, x, scale * e_static, COLOURS['static'], 'hysteresis alone', linewidth=width)
             limit = max(limit, static_limit)
         else:
-            other, factor = _error_unit(e_static)
-            static_largest *= factor / scale
-            said.append(f'hysteresis alone (not drawn): up to {static_largest:.3g} {other}')
+            other, factor = length_unit(static_largest)
+            remarks.append(
+                f'hysteresis alone (not drawn): up to {factor * static_largest:.3g} {other}'
+            )
     line(axes, x, scale * e, COLOURS['model'], 'model', linewidth=width)
-    _symmetric(axes, limit)
-    if said:
-        note(axes, '; '.join(said))
+    symmetric(axes, scale * limit)
+    note(axes, '; '.join(remarks))
     return unit, scale
 
 
@@ -198,30 +152,25 @@ def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
     ----------
     run : PieceRun
     held_out_from : int, optional
-        First sample that was not fitted, where the end of a record was kept back.
+        First sample that was not fitted, where the end of a record was held out.
     """
-    piece = run.piece
-    t, y, y_hat, y_static = piece.t, 1e6 * piece.y, 1e6 * run.y_hat, 1e6 * run.y_static
+    piece, t = run.piece, run.piece.t
     fig = figure(5.0)
     axes = fig.subplots(3, 1, sharex=True, gridspec_kw={'height_ratios': [1, 1.7, 1.4]})
     line(axes[0], t, piece.v, COLOURS['measured'])
-    line(axes[1], t, y, COLOURS['under'], 'measured', linewidth=3.0)
-    line(axes[1], t, y_hat, COLOURS['model'], 'model')
-    unit, scale = _draw_error(axes[2], t, y - y_hat, y - y_static, 0.8)
+    line(axes[1], t, 1e6 * piece.y, COLOURS['under'], 'measured', linewidth=3.0)
+    line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
+    unit, scale = _draw_error(axes[2], t, piece.y - run.y_hat, piece.y - run.y_static, 0.8)
     if held_out_from is not None:
         for each in axes:
-            each.axvspan(
-                t[held_out_from],
-                t[-1],
-                color=COLOURS['held out'],
-                zorder=0,
-                label='held out' if each is axes[1] else None,
-            )
+            label = 'held out' if each is axes[1] else None
+            first, colour = t[held_out_from], COLOURS['held out']
+            each.axvspan(first, t[-1], color=colour, zorder=0, label=label)
     tidy(axes[0], '', 'voltage / V')
     tidy(axes[1], '', 'displacement / µm')
     tidy(axes[2], 'time / s', f'error / {unit}')
     _name_segments(axes[0], run)
-    percent_axis(axes[2], scale * float(np.ptp(y)))
+    percent_axis(axes[2], scale * float(np.ptp(piece.y)))
     axes[0].margins(x=0.01)
     legend_above(axes[1])
     if len(axes[2].lines) > 2:
@@ -238,22 +187,11 @@ def _name_segments(axes: Axes, run: PieceRun) -> None:
     for s in named:
         first, last = run.piece.t[s.start], run.piece.t[s.stop - 1]
         axes.axvline(first, color=COLOURS['band'], linewidth=0.8, zorder=1)
-        axes.annotate(
-            safe(s.label),
-            (0.5 * (first + last), 1.0),
-            xycoords=('data', 'axes fraction'),
-            xytext=(0, 2),
-            textcoords='offset points',
-            ha='left' if rotated else 'center',
-            va='bottom',
-            rotation=30 if rotated else 0,
-            rotation_mode='anchor',
-            fontsize=SMALL,
-        )
+        name_above(axes, s.label, 0.5 * (first + last), 30.0 if rotated else 0.0)
 
 
 def segments_figure(
-    runs: Sequence[PieceRun], errors: dict[tuple[str, str], str] | None = None
+    runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], str] | None = None
 ) -> Figure:
     """
     Draw a readable stretch of every segment with its error below.
@@ -261,33 +199,31 @@ def segments_figure(
     Parameters
     ----------
     runs : sequence of PieceRun
-    errors : dict, optional
-        Error in words for each (record, segment label).
+    errors : mapping, optional
+        Text on the error of each (record, segment label).
 
     Raises
     ------
     NothingToDraw
         Without labelled segments.
     """
-    found = [
-        (ORDER.index(s.kind), run, s)
+    cells = [
+        (run, s)
         for run in runs
         for s in run.piece.segments
         if s.kind in ORDER and np.ptp(run.piece.v[s.start : s.stop]) > 0.0
     ]
-    if not found:
+    if not cells:
         raise NothingToDraw('no segment is labelled with a kind of the programmes')
-    found = sorted(found, key=lambda item: item[0])[:CELLS]
-    rows = -(-len(found) // 2)
+    cells = sorted(cells, key=lambda cell: ORDER.index(cell[1].kind))[:CELLS]
+    rows = -(-len(cells) // 2)
     fig = figure(2.05 * rows + 0.3)
-    grid = fig.add_gridspec(
-        2 * rows + 1, min(2, len(found)), height_ratios=[0.12] + [1.6, 1.0] * rows
-    )
-    for i, (_, run, s) in enumerate(found):
+    heights = [0.12] + [1.6, 1.0] * rows
+    grid = fig.add_gridspec(2 * rows + 1, min(2, len(cells)), height_ratios=heights)
+    for i, (run, s) in enumerate(cells):
         trace = fig.add_subplot(grid[2 * (i // 2) + 1, i % 2])
         error = fig.add_subplot(grid[2 * (i // 2) + 2, i % 2], sharex=trace)
-        words = (errors or {}).get((run.record, s.label), '')
-        _draw_segment(trace, error, run, s, words)
+        _draw_segment(trace, error, run, s, (errors or {}).get((run.record, s.label), ''))
     head = fig.add_subplot(grid[0, :])
     head.set_axis_off()
     for name, colour, width in (
@@ -300,29 +236,27 @@ def segments_figure(
     return fig
 
 
-def _stretch(run: PieceRun, s: Segment) -> tuple[slice, str]:
-    """Return what of a segment can be read in a small picture, and how to say so."""
-    rate = run.piece.sample_rate
+def _readable(run: PieceRun, s: Segment) -> tuple[slice, str]:
+    """Return what of a segment is readable in a small picture, and its name."""
     frequency = sine_frequency(s.label)
-    if frequency is not None and s.n > (PERIODS + 1) * rate / frequency:
-        return slice(
-            s.stop - round(PERIODS * rate / frequency), s.stop
-        ), f', last {PERIODS} periods'
+    if frequency is not None:
+        period = run.piece.sample_rate / frequency
+        if s.n > (PERIODS + 1) * period:
+            return slice(s.stop - round(PERIODS * period), s.stop), f', last {PERIODS} periods'
     if s.kind in ('noise', 'multisine') and s.n > 2 * NOISE_SAMPLES:
         return slice(s.stop - 2 * NOISE_SAMPLES, s.stop - NOISE_SAMPLES), ', near its end'
     return slice(s.start, s.stop), ''
 
 
-def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, words: str) -> None:
-    part, what = _stretch(run, s)
-    t = run.piece.t[part]
+def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, remark: str) -> None:
+    part, what = _readable(run, s)
+    t, y, y_hat = run.piece.t[part], run.piece.y[part], run.y_hat[part]
     long = t[-1] - t[0] > 1.0
     x = t if long else 1e3 * (t - t[0])
-    y, y_hat = 1e6 * run.piece.y[part], 1e6 * run.y_hat[part]
-    line(trace, x, y, COLOURS['under'], linewidth=3.0)
-    line(trace, x, y_hat, COLOURS['model'])
-    unit, _ = _draw_error(error, x, y - y_hat, y - 1e6 * run.y_static[part], 0.7)
-    tidy(trace, '', 'y / µm', safe(s.label) + (f': {words}' if words else ''))
+    line(trace, x, 1e6 * y, COLOURS['under'], linewidth=3.0)
+    line(trace, x, 1e6 * y_hat, COLOURS['model'])
+    unit, _ = _draw_error(error, x, y - y_hat, y - run.y_static[part], 0.7)
+    tidy(trace, '', 'y / µm', safe(s.label) + (f': {remark}' if remark else ''))
     tidy(error, f'time / {"s" if long else "ms"}{what}', f'error / {unit}')
     trace.tick_params(labelbottom=False)
     trace.margins(x=0.01)
@@ -356,13 +290,20 @@ def sines_figure(errors: Sequence[SineError], floor: float | None = None) -> Fig
         ([e.percent for e in errors], COLOURS['model'], 'o-', 'model with dynamics'),
     ):
         axes.loglog(f, values, shape, color=colour, markersize=5, linewidth=1.3, label=name)
+    finish_frequencies(axes, f, floor, 'sensor noise')
+    return fig
+
+
+def finish_frequencies(
+    axes: Axes, f: NDArray[np.float64], floor: float | None, noise: str
+) -> None:
+    """Finish an axes of errors [% of stroke] over frequencies [Hz], with the noise floor."""
     tidy(axes, 'frequency of the sine / Hz', 'rms error / % of stroke')
     if floor is not None and floor > 0.0:
-        axes.axhline(floor, color=GREY, linestyle=':', linewidth=1.3, label='sensor noise')
+        axes.axhline(floor, color=GREY, linestyle=':', linewidth=1.3, label=noise)
     axes.margins(0.06)
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.6, high)
     plain_log(axes.yaxis, low, high)
     plain_log(axes.xaxis, f.min(), f.max() * 1.5)
     legend(axes, loc='best')
-    return fig

@@ -1,0 +1,158 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""All pictures of an identification, in the order in which they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.free_run import PieceRun, sine_frequency, sines_of
+from piezo_ident.report.figures.free_run import (
+    loops_figure,
+    overview_figure,
+    segments_figure,
+    sines_figure,
+)
+from piezo_ident.report.figures.style import draw_each, Drawn, Wanted
+from piezo_ident.report.figures.three_steps import (
+    delay_figure,
+    orders_figure,
+    response_figure,
+    weights_figure,
+)
+
+__all__ = ['IDENTIFICATION_NAMES', 'draw_identification']
+
+#: at most so many records get a picture of their own
+OVERVIEWS = 4
+#: strokes of sines that differ by no more than this factor have one level of noise in %
+ALIKE = 1.1
+#: names of all pictures that `draw_identification` can give
+IDENTIFICATION_NAMES = (
+    'sines',
+    'loops',
+    'segments',
+    *(f'overview_{i + 1}' for i in range(OVERVIEWS)),
+    'delay',
+    'response',
+    'orders',
+    'weights',
+)
+
+
+def draw_identification(
+    identification: Identification,
+    runs: Sequence[PieceRun],
+    tick: Callable[[float], None] = lambda share: None,
+) -> Drawn:
+    """
+    Draw everything that the data of an identification allow.
+
+    Parameters
+    ----------
+    identification : Identification
+    runs : sequence of PieceRun
+        From `piezo_ident.model.free_run.piece_runs`.
+    tick : callable, optional
+        Called with the share of the work done; may raise to stop it.
+    """
+    texts: dict[tuple[str, str], list[str]] = {}
+    for row in identification.errors:
+        text = f'{row.data} {row.percent:.2g} %'
+        texts.setdefault((row.record, row.segment), []).append(text)
+    errors = {key: ', '.join(parts) for key, parts in texts.items()}
+    edges = [_held_out_from(identification, run) for run in runs]
+    response = (
+        'G(z) z^-d of the model; without a noise segment none was measured. Dotted: modes.'
+        if identification.dynamics.response is None
+        else 'Welch estimate from the noise segment with its standard deviation, and the slope of '
+        'H at the bias times G(z) z^-d. Dotted: modes of G.'
+    )
+    wanted: list[Wanted] = [
+        (
+            'sines',
+            'Error over frequency',
+            'Steady state of each sine: rms error in % of its stroke, with and without G.',
+            lambda: sines_figure(sines_of(runs), _floor_of_sines(identification, runs)),
+        ),
+        (
+            'loops',
+            'Hysteresis',
+            'Displacement over voltage, free run, and the error below.',
+            lambda: loops_figure(runs, edges),
+        ),
+        (
+            'segments',
+            'Segments',
+            'Free run and its error; that of the hysteresis alone is drawn where both can be read '
+            'on one scale. Percentages are of the stroke of the whole record.',
+            lambda: segments_figure(runs, errors),
+        ),
+    ]
+    by_width = sorted(range(len(runs)), key=lambda i: -float(np.ptp(runs[i].piece.v)))
+    for number, i in enumerate(sorted(by_width[:OVERVIEWS]), 1):
+        wanted.append(
+            (
+                f'overview_{number}',
+                f'Whole record: {runs[i].record}',
+                'Each column of a long trace shows its smallest and largest sample.',
+                partial(overview_figure, runs[i], edges[i]),
+            )
+        )
+    wanted += [
+        (
+            'delay',
+            'Delay',
+            'The delay is the first sample at which the averaged response leaves its noise.',
+            lambda: delay_figure(identification, runs),
+        ),
+        (
+            'response',
+            'Frequency response',
+            response,
+            lambda: response_figure(identification),
+        ),
+        (
+            'orders',
+            'Orders of G',
+            'Free-run error on held-out noise of least squares at every order; grey: unstable.',
+            lambda: orders_figure(identification),
+        ),
+        (
+            'weights',
+            'Weights of the plays',
+            'Bars: standard deviation for white residuals.',
+            lambda: weights_figure(identification),
+        ),
+    ]
+    return draw_each(wanted, tick)
+
+
+def _held_out_from(identification: Identification, run: PieceRun) -> int | None:
+    """Return the first held-out sample of a piece whose end was held out, None otherwise."""
+    if identification.dynamics.table is not None:
+        return None
+    rows = [row for row in identification.errors if row.record == run.record]
+    fitted = sum(row.n for row in rows if row.data in ('fitted', 'selection'))
+    # of several pieces only one is fitted, and the rows do not name it
+    if fitted == 0 or sum(row.n for row in rows) != run.piece.n:
+        return None
+    return fitted if fitted < run.piece.n else None
+
+
+def _floor_of_sines(identification: Identification, runs: Sequence[PieceRun]) -> float | None:
+    """Return the sensor noise in % of the stroke of the sines, None where these differ."""
+    strokes = [
+        float(np.ptp(run.piece.y[s.start : s.stop]))
+        for run in runs
+        for s in run.piece.segments
+        if sine_frequency(s.label)
+    ]
+    floor = identification.noise_floor
+    if floor is None or not strokes or not 0.0 < max(strokes) <= ALIKE * min(strokes):
+        return None
+    return floor * identification.stroke / max(strokes)

@@ -1,0 +1,407 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""An identification for people: its headline, its tables, a page and a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+import math
+
+import numpy as np
+from piezo_ident import __version__
+from piezo_ident.identification.results import ErrorRow, Identification
+from piezo_ident.model.free_run import SineError
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.report.html import Box, Page, Section, Shown
+from piezo_ident.report.modes import modes
+from piezo_ident.report.table import columns, length, number, printable, Table, wrapped
+
+__all__ = [
+    'KINDS',
+    'brief_table',
+    'headline',
+    'identification_page',
+    'identification_text',
+    'table_one',
+]
+
+#: kinds of data, in the order in which they are shown and in which a headline prefers them
+KINDS = ('validation', 'held out', 'selection', 'fitted')
+#: how a headline begins, by the kind of data that it is about
+ABOUT = {
+    'validation': 'On {records}, recorded for validation',
+    'held out': 'On data it did not fit',
+    'selection': 'On the parts of steps, noise and triangle that were held out from the fit (no '
+    'other motion was there to test it)',
+    'fitted': 'Nothing was held out; on the data it was fitted to',
+}
+#: static gain that the paper leaves in G: its printed coefficients give G(1) = 0.6411
+PAPER_GAIN = 0.6411
+FOOTER = (
+    'Method: Gu, Li, Zhu and Su, IEEE/ASME Trans. Mechatronics 21(3), 2016, '
+    'doi:10.1109/TMECH.2015.2465868. Every error is of a free run, never of one-step '
+    'prediction. Beside this page: model.yaml, identification.json and the pictures.'
+)
+
+
+def headline(result: Identification) -> str:
+    """
+    Return in one sentence by how much the model errs, and its hysteresis alone.
+
+    Both errors are over the same samples, see `Identification.headline`.
+    """
+    errors = result.headline
+    text = ABOUT[errors.data].format(records=', '.join(errors.records))
+    text += f', the model errs by {number(errors.percent)} % of stroke'
+    if not result.model.is_static and math.isfinite(errors.static_percent):
+        text += f', its hysteresis alone by {number(errors.static_percent)} %'
+    return f'{text} ({FORMULA}).'
+
+
+def facts(result: Identification) -> list[tuple[str, str]]:
+    """Return the few numbers that stand beside the headline."""
+    model, delay, floor = result.model, result.delay, result.noise_floor
+    na, nb = result.dynamics.order
+    low, high = model.scaling.range
+    lag = 1e6 * model.delay.total / model.sample_rate
+    texts = {
+        'stroke': length(result.stroke),
+        'voltage': f'{low:g} .. {high:g} V',
+        'direction': 'retracts with rising voltage' if model.scaling.Y < 0.0 else '',
+        'sampling rate': f'{model.sample_rate:g} Hz',
+        'delay': f'{delay.samples} ± {number(delay.std, 2)} samples = {lag:.4g} µs',
+        'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
+        'hysteresis': f'{model.hysteresis.thresholds.size} thresholds, p1, p2',
+        'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
+        'effects': ', '.join(effect.name for effect in model.effects),
+    }
+    missing = dict(result.not_identified)
+    return [
+        (what, 'not identified' if what in missing else text)
+        for what, text in texts.items()
+        if text
+    ]
+
+
+def error_table(result: Identification) -> Table:
+    """Return the errors by segment."""
+    order = {kind: i for i, kind in enumerate(KINDS)}
+    rows = sorted(result.errors, key=lambda row: (order.get(row.data, len(order)), not row.driven))
+    source = result.noise_source
+    if result.noise_floor is not None:
+        source = f'from {source}'
+    return Table(
+        'Errors',
+        (
+            'record',
+            'segment',
+            'data',
+            'model / %',
+            'hysteresis alone / %',
+            'NRMSE fit / %',
+            'samples',
+        ),
+        [
+            (
+                row.record,
+                row.segment or 'whole',
+                row.data,
+                number(row.percent),
+                number(row.static_percent),
+                _fit(row),
+                str(row.n),
+            )
+            for row in rows
+        ],
+        f'Errors in % of stroke: {FORMULA}, with the stroke of the whole record. NRMSE fit: '
+        '100 (1 - |y - y_hat| / |y - mean y|) over the samples of the row; it says nothing '
+        'where the stage rests. "validation": of a record that took no part; "held out": neither '
+        'fitted nor looked at before; "selection": not fitted, but chose between models. '
+        f'Sensor noise: {source}.',
+    )
+
+
+def _fit(row: ErrorRow) -> str:
+    # at rest there is nothing but noise to explain, and a good model looks like a bad one
+    if row.segment.partition(':')[0] == 'idle' or not math.isfinite(row.fit):
+        return '–'
+    # adding zero turns a negative zero into a plain one
+    return f'{round(row.fit, 2) + 0.0:.2f}'
+
+
+def sine_table(rows: Sequence[SineError]) -> Table | None:
+    """Return the steady-state errors in the layout of the paper's Table I; None without any."""
+    if not rows:
+        return None
+    return Table(
+        'Errors of sines in steady state',
+        ('frequency / Hz', *(f'{row.frequency:g}' for row in rows)),
+        (
+            ('model with dynamics', *(number(row.percent) for row in rows)),
+            ('hysteresis alone', *(number(row.static_percent) for row in rows)),
+        ),
+        'In % of stroke: 100 rms(y - y_hat) / (max y - min y), free run; the first second '
+        'and at least one period are dropped, and the stroke is that of what is left. '
+        'Layout of Table I of the paper.',
+    )
+
+
+def dynamics_tables(result: Identification) -> list[Table]:
+    """Return delay, coefficients, modes and the methods that were compared."""
+    model, dynamics, delay = result.model, result.dynamics, result.delay
+    G = model.dynamics
+    na, nb = G.a.size, G.b.size
+    rows = [('used', str(delay.samples), number(delay.std, 2), delay.source)]
+    if delay.step is not None:
+        samples = '–' if delay.step.samples is None else str(delay.step.samples)
+        source = f'average of {delay.step.repeats}' if delay.step.repeats else 'no steps'
+        rows.append(('steps', samples, number(delay.step.std, 2), source))
+    if delay.scan is not None:
+        source = 'noise segment' if delay.step is None else 'the same steps'
+        rows.append(('scan of the ARX loss', str(delay.scan), '–', source))
+    tables = [Table('Delay', ('', 'd / samples', '± / samples', 'from'), rows)]
+    if not na:
+        return tables
+    sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
+    if sigma.size != na + nb:
+        sigma = np.full(na + nb, math.nan)
+    a = [(number(x, 6), number(e, 2)) for x, e in zip(G.a, sigma[:na], strict=True)]
+    b = [
+        (number(x, 6), number(e, 2), number(PAPER_GAIN * x, 4))
+        for x, e in zip(G.b, sigma[na:], strict=True)
+    ]
+    a += [('', '')] * (nb - na)
+    b += [('', '', '')] * (na - nb)
+    tables.append(
+        Table(
+            'Coefficients of G',
+            ('i', 'a_i', '±', 'b_i', '±', f'{PAPER_GAIN} b_i'),
+            [(str(i), *left, *right) for i, (left, right) in enumerate(zip(a, b, strict=True), 1)],
+            'y(k) = - sum a_i y(k-i) + sum b_j w(k-d-j+1), normalised so that G(1) = 1. The paper '
+            f'leaves a static gain of {PAPER_GAIN} in G; the last column is b in its split.',
+        )
+    )
+    poles = modes(G, model.sample_rate, dynamics.covariance)
+    if poles:
+        tables.append(
+            Table(
+                'Poles of G as modes',
+                ('', 'frequency / Hz', '± / Hz', 'damping ratio', '±'),
+                [
+                    (
+                        'resonance' if mode.oscillates else 'real pole',
+                        number(mode.frequency, 4),
+                        number(mode.frequency_std, 2),
+                        number(mode.damping if mode.oscillates else None),
+                        number(mode.damping_std if mode.oscillates else None, 2),
+                    )
+                    for mode in poles
+                ],
+                'Real: corner frequency. A mode whose uncertainty is as large as itself only '
+                f'helps the others to fit. The input has power up to {number(dynamics.band, 4)} '
+                'Hz; what lies above is an extrapolation.',
+            )
+        )
+    if dynamics.methods:
+        tables.append(
+            Table(
+                'Methods compared on held-out noise',
+                ('method', 'free-run error / % of rms'),
+                [
+                    (name, number(error) if math.isfinite(error) else 'unstable')
+                    for name, error in dynamics.methods.items()
+                ],
+                f'At the order ({dynamics.order[0]}, {dynamics.order[1]}). Small-signal gain of '
+                f'the noise {number(dynamics.slope_measured)}, of H at its bias '
+                f'{number(dynamics.slope_model)} (normalised).',
+            )
+        )
+    return tables
+
+
+def hysteresis_tables(result: Identification) -> list[Table]:
+    """Return the weights, the scaling and the losses of both solvers."""
+    model, fit = result.model, result.hysteresis
+    h, s, m = model.hysteresis, model.scaling, model.hysteresis.thresholds.size
+    std = fit.std if fit.std.size == m + 2 else np.full(m + 2, math.nan)
+    rows = [
+        (
+            f'q_{i}',
+            number(s.V * r, 4),
+            number(r, 4),
+            number(q, 4),
+            'on its bound' if q == 0.0 else number(e, 2),
+            number(q / PAPER_GAIN, 4),
+        )
+        for i, (r, q, e) in enumerate(zip(h.thresholds, h.weights, std[:m], strict=True), 1)
+    ]
+    for name, value, e in (('p1', h.p1, std[m]), ('p2', h.p2, std[m + 1])):
+        rows.append((name, '', '', number(value, 4), number(e, 2), number(value / PAPER_GAIN, 4)))
+    solvers = [('bounded least squares (optimum)', number(fit.optimum_loss, 5), '', '')]
+    if fit.swarm_loss is not None and fit.swarm is not None:
+        excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0.0 else 0.0
+        effort = f'{fit.swarm.nit} iterations, {fit.swarm.nfev} evaluations'
+        solvers.insert(
+            0,
+            (
+                'particle swarm, then polished' if fit.polished else 'particle swarm',
+                number(fit.swarm_loss, 5),
+                f'{number(100.0 * excess, 2)} %',
+                effort,
+            ),
+        )
+    return [
+        Table(
+            'Weights of H',
+            ('', 'r / V', 'r', 'weight', '±', f'weight / {PAPER_GAIN}'),
+            rows,
+            'Normalised, for white residuals. The play at r = 0 is v itself, so p2 holds its '
+            'weight too. H carries the static gain here; the last column is in the split of the '
+            f'paper, where G(1) = {PAPER_GAIN}.',
+        ),
+        Table(
+            'Scaling',
+            ('', 'zero', 'span'),
+            (
+                ('voltage u = (v - v0) / V', f'{s.v0:.6g} V', f'{s.V:.6g} V'),
+                ('displacement (y - y0) / Y', f'{1e6 * s.y0:.6g} µm', f'{1e6 * s.Y:.6g} µm'),
+            ),
+            'A negative Y belongs to a stage that retracts as the voltage rises.',
+        ),
+        Table(
+            'Solver of the weights',
+            ('', 'sum of squares', 'above optimum', 'effort'),
+            solvers,
+            f'Normalised, over {fit.n} samples; rms {number(100.0 * fit.rms)} % of stroke.',
+        ),
+    ]
+
+
+def origin_tables(result: Identification) -> list[Table]:
+    """Return settings and versions."""
+    origin = result.model.identification
+    versions = {'piezo_ident': __version__, **dict(origin.get('versions', {}))}
+    words = {None: 'chosen from the data', True: 'yes', False: 'no'}
+    settings = [
+        (name, words[value] if value is None or isinstance(value, bool) else str(value))
+        for name, value in asdict(result.settings).items()
+    ]
+    return [
+        Table(
+            'Settings',
+            ('setting', 'value'),
+            [('method', str(origin.get('method', '–'))), *settings],
+        ),
+        Table(
+            'Versions', ('software', 'version'), [(str(x), str(y)) for x, y in versions.items()]
+        ),
+    ]
+
+
+def identification_page(
+    result: Identification,
+    sines: Sequence[SineError],
+    pictures: Sequence[Shown],
+    left_out: Sequence[tuple[str, str]],
+) -> Page:
+    """
+    Return the page of an identification.
+
+    Parameters
+    ----------
+    result : Identification
+    sines : sequence of SineError
+    pictures : sequence of Shown
+    left_out : sequence of (title, reason)
+        Pictures that the data do not allow.
+    """
+    faults = [
+        (record.name, fault.name, str(fault.count), fault.where, fault.action)
+        for record in result.records
+        for fault in record.faults
+    ]
+    # a fault stands in its own table; a second time would hide the other warnings
+    shown = {f'{record.name}: {fault}' for record in result.records for fault in record.faults}
+    warnings = [text for text in result.warnings if text not in shown]
+    if faults:
+        warnings.append(f'the data had {len(faults)} kinds of faults, see below')
+
+    def named(*names: str) -> list[Shown]:
+        return [picture for picture in pictures if picture.name.startswith(names)]
+
+    return Page(
+        title='Identification of a piezo stage',
+        source=', '.join(f'{r.name} ({r.duration:.4g} s)' for r in result.records),
+        headline=headline(result),
+        facts=facts(result),
+        before=(
+            Box('warnings', 'Warnings', warnings),
+            Box('missing', 'Not identified', _pairs(result.not_identified)),
+        ),
+        sections=(
+            Section(
+                'How well the model predicts',
+                [
+                    error_table(result),
+                    sine_table(sines),
+                    *named('sines', 'loops', 'segments', 'overview'),
+                ],
+            ),
+            Section(
+                'Delay and dynamics',
+                [*named('delay', 'response', 'orders'), *dynamics_tables(result)],
+            ),
+            Section('Hysteresis', [*named('weights'), *hysteresis_tables(result)]),
+            Section(
+                'Origin',
+                [
+                    Table(
+                        'Faults in the data',
+                        ('record', 'fault', 'count', 'where', 'action'),
+                        faults,
+                    )
+                    if faults
+                    else None,
+                    *origin_tables(result),
+                ],
+            ),
+        ),
+        after=(Box('missing', 'Pictures that these data do not allow', _pairs(left_out)),),
+        footer=FOOTER,
+    )
+
+
+def _pairs(items: Iterable[tuple[str, str]]) -> list[str]:
+    return [f'{first}: {second}' for first, second in items]
+
+
+def identification_text(result: Identification) -> str:
+    """Return headline, facts, errors and warnings for a terminal."""
+    lines = [*wrapped(headline(result)), '']
+    lines += [printable(f'{what:<14}{text}') for what, text in facts(result)]
+    head = ('error / % of stroke', 'model', 'hysteresis alone', 'NRMSE fit / %', 'samples')
+    rows = [(f'{row[0]} {row[1]}, {row[2]}', *row[3:]) for row in error_table(result).rows]
+    lines += ['', *columns(head, rows)]
+    for item in _pairs(result.not_identified):
+        lines += ['', *wrapped(f'not identified: {item}', '  ')]
+    for item in result.warnings:
+        lines += ['', *wrapped(f'warning: {item}', '  ')]
+    return '\n'.join(lines)
+
+
+def brief_table(result: Identification) -> Table:
+    """Return facts and errors for a notebook."""
+    rows = [(kind, number(result.error(kind))) for kind in KINDS]
+    errors = [(f'error, {kind}', f'{x} % of stroke') for kind, x in rows if x != '–']
+    return Table('Model', ('', ''), [*facts(result), *errors])
+
+
+def table_one(rows: Sequence[SineError]) -> str:
+    """Return the errors of sines as a table for a terminal, one column a frequency."""
+    table = sine_table(rows)
+    if table is None:
+        return 'no sine segment is long enough for its steady state'
+    note = '% of stroke: 100 rms(y - y_hat) / (max y - min y), free run, steady state'
+    return '\n'.join([*columns(table.head, table.rows), note])

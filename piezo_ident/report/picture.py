@@ -1,0 +1,121 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Results as one picture, in a file or with a summary in a notebook."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import temporary_output
+from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.report import diagnosis, identification
+from piezo_ident.report.html import Shown, summary_html
+from piezo_ident.report.table import length, number, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ['plot', 'save_plot', 'to_html']
+
+#: endings that a picture may have
+ENDINGS = ('.png', '.pdf', '.svg')
+#: dots an inch on a screen
+DPI = 110
+
+Result = Identification | Diagnosis | FreeRun
+
+
+def plot(result: Result) -> Figure:
+    """
+    Draw the picture that tells most of a result.
+
+    Of an identification that is the hysteresis loop, measured and modelled, with the error; of a
+    free run the longest piece over time; of a diagnosis the residual before and after.
+
+    Parameters
+    ----------
+    result : Identification, Diagnosis or FreeRun
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    NothingToDraw
+        When the result holds no data.
+    """
+    from piezo_ident.report.figures.diagnosis import worst_pieces
+    from piezo_ident.report.figures.free_run import loops_figure, overview_figure
+    from piezo_ident.report.figures.residual import residual_figure
+
+    if isinstance(result, Identification):
+        return loops_figure(piece_runs(result.model, result.records, result.memories))
+    if isinstance(result, Diagnosis):
+        return residual_figure(worst_pieces(result, 1)[0])
+    return overview_figure(_longest(result))
+
+
+def _longest(result: FreeRun) -> PieceRun:
+    record = result.record
+    i = int(np.argmax([piece.n for piece in record]))
+    return PieceRun(record.name, record.pieces[i], result.pieces[i], result.pieces[i])
+
+
+def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
+    """
+    Write the picture of `plot`.
+
+    Parameters
+    ----------
+    result : Identification, Diagnosis or FreeRun
+    path : path
+        Ending in .png, .pdf or .svg; an old file is replaced.
+
+    Raises
+    ------
+    ConfigError
+        When the ending is another one.
+    DataError
+        When the file cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in ENDINGS:
+        raise ConfigError(f'{path}: a picture ends in {", ".join(ENDINGS)}')
+    from piezo_ident.report.figures import style
+
+    drawn = plot(result)
+    with temporary_output(target, overwrite=True) as file:
+        drawn.savefig(file, dpi=style.DPI)
+
+
+def to_html(result: Result) -> str:
+    """Return headline, table and picture of a result as HTML, for a notebook."""
+    from piezo_ident.report.figures.style import png
+
+    if isinstance(result, Identification):
+        headline, table = identification.headline(result), identification.brief_table(result)
+    elif isinstance(result, Diagnosis):
+        headline, table = diagnosis.headline(result), diagnosis.brief_table(result)
+    else:
+        headline, table = _free_run(result)
+    return summary_html(headline, table, Shown('result', table.title, '', png(plot(result), DPI)))
+
+
+def _free_run(result: FreeRun) -> tuple[str, Table]:
+    errors = result.errors_after_start or result.errors
+    text = f'On {result.record.name} the model errs by {number(errors.percent)} % of stroke'
+    rows = [('error', f'{number(errors.percent)} % of stroke')]
+    rows += [('without its mean', f'{number(errors.percent_without_offset)} % of stroke')]
+    rows += [('mean', length(errors.offset)), ('NRMSE fit', f'{number(errors.fit, 4)} %')]
+    rows += [('samples', str(errors.n))]
+    rows += [('warning', warning) for warning in result.warnings]
+    return f'{text} ({FORMULA}).', Table('Free run', ('', ''), rows)

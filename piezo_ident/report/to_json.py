@@ -1,0 +1,269 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Results as plain data for strict JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib import resources
+import json
+import math
+import sys
+from typing import Any
+
+import numpy as np
+from piezo_ident import __version__
+from piezo_ident.diagnosis.results import Diagnosis, Errors, FORMULA, FoundParameter
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    Identification,
+    Steps,
+)
+from piezo_ident.model import metrics
+from piezo_ident.model.files import plain
+from piezo_ident.model.free_run import PieceRun, sines_of
+from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.record.record import Record
+from piezo_ident.report.identification import headline, KINDS
+from piezo_ident.report.modes import modes
+
+__all__ = ['diagnosis_schema', 'json_text', 'steps_to_json', 'to_json']
+
+VERSION = {'schema_version': 1, 'package_version': __version__}
+
+
+def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> dict[str, Any]:
+    """
+    Return a result as plain data, ready for strict JSON.
+
+    Parameters
+    ----------
+    result : Identification or Diagnosis
+    runs : sequence of PieceRun, optional
+        For the steady-state errors of sines of an identification.
+
+    Returns
+    -------
+    dict
+        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  What is unknown or not
+        finite is None; but a parameter of an effect that is infinite becomes the text ``inf`` or
+        ``-inf``, and the overall error of a model that diverged the largest number there is.
+    """
+    data = _diagnosis(result) if isinstance(result, Diagnosis) else _identified(result, runs)
+    strict: dict[str, Any] = _strict(plain({**VERSION, **data}))
+    return strict
+
+
+def json_text(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> str:
+    """Return `to_json` as text on one line."""
+    return json.dumps(to_json(result, runs), ensure_ascii=False, allow_nan=False)
+
+
+def diagnosis_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a diagnosis, as plain data."""
+    file = resources.files('piezo_ident').joinpath('schemas', 'diagnosis.schema.json')
+    schema: dict[str, Any] = json.loads(file.read_text(encoding='utf-8'))
+    return schema
+
+
+def steps_to_json(
+    steps: Steps, sample_rate: float, records: Sequence[Record] = ()
+) -> dict[str, Any]:
+    """
+    Return the result of single steps, under the keys of `to_json`.
+
+    Parameters
+    ----------
+    steps : Steps
+    sample_rate : float
+        [Hz]
+    records : sequence of Record, optional
+        For the faults in their data.
+    """
+    data = {**VERSION, 'sample_rate': sample_rate, 'data_faults': _faults(records)}
+    if steps.delay is not None:
+        data['delay'] = _delay(steps.delay, steps.delay.samples / sample_rate)
+    if steps.dynamics is not None:
+        data['dynamics'] = _dynamics(*steps.dynamics, sample_rate)
+    strict: dict[str, Any] = _strict(plain(data))
+    return strict
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, Any]:
+    model, fit, dynamics = result.model, result.hysteresis, result.dynamics
+    h, m = model.hysteresis, model.hysteresis.thresholds.size
+    std = fit.std if fit.std.size == m + 2 else np.full(m + 2, np.nan)
+    records = [record.name for record in result.records]
+    return {
+        'verdict': headline(result),
+        'method': model.identification.get('method'),
+        'records': model.identification.get('records', records),
+        'sample_rate': model.sample_rate,
+        'stroke': result.stroke,
+        'voltage_range': list(model.scaling.range),
+        'errors': {
+            'unit': '% of stroke',
+            'formula': metrics.FORMULA,
+            **{kind.replace(' ', '_'): result.error(kind) for kind in KINDS},
+            'rows': [asdict(row) for row in result.errors],
+        },
+        'sines': [asdict(row) for row in sines_of(runs)],
+        'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
+        'delay': _delay(result.delay, model.delay.total / model.sample_rate),
+        'dynamics': {
+            **_dynamics(dynamics, model.dynamics, model.sample_rate),
+            'bias': model.scaling.v0 + model.scaling.V * dynamics.bias,
+        },
+        'hysteresis': {
+            'thresholds': h.thresholds,
+            'thresholds_volt': h.thresholds * model.scaling.V,
+            'weights': h.weights,
+            'weights_std': None if np.isnan(std).all() else std[:m],
+            'p1': h.p1,
+            'p1_std': std[m],
+            'p2': h.p2,
+            'p2_std': std[m + 1],
+            'solver': fit.solver,
+            'polished': fit.polished,
+            'loss': fit.loss,
+            'swarm_loss': fit.swarm_loss,
+            'optimum_loss': fit.optimum_loss,
+            'samples': fit.n,
+            'swarm_iterations': None if fit.swarm is None else fit.swarm.nit,
+            'swarm_evaluations': None if fit.swarm is None else fit.swarm.nfev,
+        },
+        'warnings': list(result.warnings),
+        'not_identified': [{'what': what, 'why': why} for what, why in result.not_identified],
+        'data_faults': _faults(result.records),
+        'settings': asdict(result.settings),
+        'seed': result.settings.seed,
+        'versions': model.identification.get('versions', {}),
+    }
+
+
+def _delay(delay: DelayResult, seconds: float) -> dict[str, Any]:
+    return {
+        'samples': delay.samples,
+        'seconds': seconds,
+        'std': delay.std,
+        'source': delay.source,
+        'from_steps': delay.step.samples if delay.step is not None else None,
+        'from_scan': delay.scan,
+        'agree': delay.agree,
+    }
+
+
+def _dynamics(dynamics: DynamicsResult, G: Dynamics, sample_rate: float) -> dict[str, Any]:
+    na, nb = G.a.size, G.b.size
+    sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
+    known = sigma.size == na + nb
+    return {
+        'order': list(dynamics.order),
+        'a': G.a,
+        'b': G.b,
+        'a_std': sigma[:na] if known else None,
+        'b_std': sigma[na:] if known else None,
+        'modes': [asdict(mode) for mode in modes(G, sample_rate, dynamics.covariance)],
+        'methods': dynamics.methods,
+        'slope_measured': dynamics.slope_measured,
+        'slope_model': dynamics.slope_model,
+        'band': dynamics.band,
+    }
+
+
+def _faults(records: Sequence[Record]) -> list[dict[str, Any]]:
+    return [
+        {'record': record.name, **asdict(fault)} for record in records for fault in record.faults
+    ]
+
+
+def _diagnosis(result: Diagnosis) -> dict[str, Any]:
+    group, left = result.group, result.unexplained
+    return {
+        'verdict': result.verdict,
+        'sentence': result.sentence,
+        'effects': [
+            {
+                'name': effect.name,
+                'slot': effect.slot,
+                'share_of_explainable': _share(effect.share),
+                'rms_percent_of_stroke': _size(effect.rms_percent),
+                'parameters': {name: _parameter(p) for name, p in effect.parameters.items()},
+            }
+            for effect in result.effects
+        ],
+        'class': None if group is None else asdict(group),
+        'unexplained': {
+            'share_of_explainable': _share(left.share),
+            'rms_percent_of_stroke': _size(left.rms_percent),
+            'description': left.description,
+        },
+        'candidates': [
+            {'name': x.name, 'share_of_explainable': _share(x.share), 'why_not': x.why_not}
+            for x in result.candidates
+        ],
+        'error': {
+            'unit': '% of stroke',
+            'formula': FORMULA,
+            'before': _errors(result.before),
+            'refit': _errors(result.refit),
+            'after': _errors(result.after),
+        },
+        'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
+        'smallest_detectable': {'percent_of_stroke': result.smallest_detectable},
+        'untestable': [asdict(x) for x in result.untestable],
+        'data_faults': [asdict(fault) for fault in result.faults],
+        'records': list(result.records),
+        'held_out_blocks': result.blocks,
+        'warnings': list(result.warnings),
+        'settings': asdict(result.settings),
+        'seed': result.settings.seed,
+    }
+
+
+def _share(value: float) -> float:
+    # estimated from noisy sums, a share may come out a little below 0 or above 1
+    return min(1.0, max(0.0, float(value))) if math.isfinite(value) else 0.0
+
+
+def _size(value: float) -> float:
+    return 0.0 if math.isnan(value) else min(max(0.0, float(value)), sys.float_info.max)
+
+
+def _errors(errors: Errors) -> dict[str, Any]:
+    return {
+        'overall': sys.float_info.max if math.isnan(errors.overall) else _size(errors.overall),
+        'by_segment': errors.by_segment,
+        # one way to write a frequency, whoever made the table
+        'by_frequency': {str(float(f)): x for f, x in errors.by_frequency.items()},
+    }
+
+
+def _parameter(parameter: FoundParameter) -> dict[str, Any]:
+    return {
+        'value': _value(plain(parameter.value)),
+        'unit': parameter.unit,
+        'std': parameter.std,
+    }
+
+
+def _value(value: Any) -> Any:
+    # the end of a range that is not there is infinite, which is not the same as unknown
+    if isinstance(value, list):
+        return [_value(x) for x in value]
+    if isinstance(value, float) and math.isinf(value):
+        return 'inf' if value > 0.0 else '-inf'
+    return value

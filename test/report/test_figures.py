@@ -1,0 +1,174 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pictures: they hold the data of the result, and say why they cannot be drawn."""
+
+from dataclasses import replace
+
+from diagnosis_examples import example, HOSTILE
+from matplotlib.image import imread
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.model.free_run import piece_runs, sines_of
+from piezo_ident.record.record import Piece
+from piezo_ident.report import save_plot
+from piezo_ident.report.figures.diagnosis import draw_diagnosis, errors_figure, ranking_figure
+from piezo_ident.report.figures.free_run import loops_figure, overview_figure, sines_figure
+from piezo_ident.report.figures.identification import draw_identification
+from piezo_ident.report.figures.residual import (
+    residual_correlation_figure,
+    residual_dependence_figure,
+    residual_figure,
+    residual_spectrum_figure,
+)
+from piezo_ident.report.figures.style import axis_limit, envelope, NothingToDraw, safe
+from piezo_ident.report.figures.three_steps import weights_figure
+from piezo_ident.report.table import length, number
+from piezo_ident.residual import analyse, ResidualPart
+import pytest
+
+
+@pytest.fixture(scope='module')
+def runs(identified):
+    return piece_runs(identified.model, identified.records, identified.memories)
+
+
+def lines_of(figure):
+    """Return the data of all named lines, by name."""
+    return {
+        line.get_label(): line.get_xydata()
+        for axes in figure.axes
+        for line in axes.lines
+        if not line.get_label().startswith('_')
+    }
+
+
+def test_every_picture_has_finite_data_and_labelled_axes(identified, runs):
+    pictures = [
+        *draw_identification(identified, runs).pictures,
+        *draw_diagnosis(example('class')).pictures,
+    ]
+    assert len(pictures) > 15
+    for picture in pictures:
+        assert picture.title
+        assert picture.caption
+        drawn = [axes for axes in picture.figure.axes if axes.axison and axes.has_data()]
+        assert drawn, picture.name
+        assert any(axes.get_xlabel() for axes in drawn), picture.name
+        for axes in drawn:
+            assert np.all(np.isfinite([*axes.get_xlim(), *axes.get_ylim()])), picture.name
+        data = [line.get_ydata() for axes in drawn for line in axes.lines]
+        data += [bar.get_window_extent().size for axes in drawn for bar in axes.patches]
+        assert any(np.isfinite(np.asarray(y, float)).any() for y in data), picture.name
+
+
+def test_overview_shows_measurement_and_model(runs):
+    run = runs[1]
+    lines = lines_of(overview_figure(run))
+    for name, y in (('measured', run.piece.y), ('model', run.y_hat)):
+        shown = lines[name][:, 1]
+        # the error is the last line that is called model
+        if name == 'measured':
+            assert (shown.min(), shown.max()) == pytest.approx((1e6 * y.min(), 1e6 * y.max()))
+    error = np.abs(run.piece.y - run.y_hat).max()
+    assert np.abs(lines['model'][:, 1]).max() == pytest.approx(1e9 * error)
+
+
+def test_sines_and_weights_are_those_of_the_result(identified, runs):
+    errors = sines_of(runs)
+    lines = lines_of(sines_figure(errors))
+    expected = [(e.frequency, e.percent) for e in errors]
+    assert np.allclose(lines['model with dynamics'], expected)
+    bars = weights_figure(identified).axes[0].patches
+    assert [bar.get_height() for bar in bars] == list(identified.model.hysteresis.weights)
+
+
+def test_bars_are_the_errors_of_the_diagnosis():
+    result = example('named')
+    widths = [bar.get_width() for bar in errors_figure(result).axes[0].patches]
+    n = 1 + len(result.before.by_segment)
+    assert widths[::n] == [e.overall for e in (result.before, result.refit, result.after)]
+
+
+def test_a_held_out_end_is_marked(unlabelled):
+    runs = piece_runs(unlabelled.model, unlabelled.records, unlabelled.memories)
+    drawn = {p.name: p.figure for p in draw_identification(unlabelled, runs).pictures}
+    assert 'model, held out' in lines_of(drawn['loops'])
+    assert len(drawn['overview_1'].axes[1].patches) == 1
+
+
+def test_without_a_refinement_nothing_is_drawn_as_refined():
+    (given,), (refined,) = example('unexplained').residuals, example('named').residuals
+    assert len(residual_figure(given).axes) == 2
+    # on the same scale, and enlarged
+    assert len(residual_figure(refined).axes) == 4
+
+
+def test_pictures_that_cannot_be_drawn_say_why(runs):
+    piece = Piece(np.zeros(50), np.zeros(50), 1000.0)
+    still = replace(runs[0], piece=piece, y_hat=piece.y, y_static=piece.y)
+    with pytest.raises(NothingToDraw, match='voltage'):
+        loops_figure([still])
+    with pytest.raises(NothingToDraw, match='sine'):
+        sines_figure([])
+    empty = analyse([ResidualPart('r', piece, np.zeros(50))])
+    with pytest.raises(NothingToDraw, match='spectrum'):
+        residual_spectrum_figure(empty)
+    with pytest.raises(NothingToDraw, match='curve'):
+        residual_dependence_figure(empty)
+    with pytest.raises(NothingToDraw, match='too few'):
+        residual_correlation_figure(empty)
+    result = example('unexplained')
+    deaf = replace(result.residuals[0], sound=np.zeros(result.residuals[0].piece.n, dtype=bool))
+    with pytest.raises(NothingToDraw, match='no sample'):
+        residual_figure(deaf)
+    with pytest.raises(NothingToDraw, match='candidate'):
+        ranking_figure(replace(result, candidates=()))
+    left_out = dict(draw_diagnosis(replace(result, residuals=(deaf,), candidates=())).left_out)
+    assert {'Spectrum of the residual', 'Ranking of the candidates'} <= set(left_out)
+
+
+def test_decimated_traces_keep_their_extremes():
+    y = np.sin(np.arange(300_007) / 50.0)
+    y[123_456], y[300_006] = 9.0, -7.0
+    k = envelope(y)
+    assert k.size < 3100
+    assert {0, 123_456, 300_006} <= set(k.tolist())
+    assert np.all(np.diff(k) > 0)
+    # every stretch between drawn samples lies within what is drawn around it
+    assert y[k].max() == 9.0
+    assert y[k].min() == -7.0
+    assert np.array_equal(envelope(y[:100]), np.arange(100))
+    assert axis_limit(y) == (pytest.approx(2.5, rel=0.01), 9.0)
+    assert axis_limit(y[:1000]) == pytest.approx((1.0, 1.0), rel=0.01)
+
+
+def test_labels_in_pictures_are_plain_text():
+    assert safe('a$b\x07') == r'a\$b?'
+    assert len(safe('x' * 500)) == 60
+
+
+def test_results_draw_and_show_themselves(identified, runs, tmp_path):
+    run = pi.free_run(identified.model, identified.records[1])
+    numbers = (length(identified.stroke), str(run.errors.n), number(example().after.overall))
+    for result, text in zip((identified, run, example()), numbers, strict=True):
+        figure = result.plot()
+        figure.savefig(tmp_path / 'plot.png', dpi=30)
+        assert np.any(imread(tmp_path / 'plot.png')[..., :3] < 0.5)
+        html = result._repr_html_()
+        assert text in html
+        assert '<img src="data:image/png;base64,' in html
+        assert HOSTILE not in html
+    y = lines_of(run.plot())['measured'][:, 1]
+    assert y.max() == pytest.approx(1e6 * run.measured.max())
+
+
+def test_plot_in_a_file(identified, tmp_path, coarse):
+    run = pi.free_run(identified.model, identified.records[1])
+    save_plot(run, tmp_path / 'p.png')
+    assert np.any(imread(tmp_path / 'p.png')[..., :3] < 0.5)
+    save_plot(run, tmp_path / 'p.svg')
+    with pytest.raises(pi.ConfigError, match=r'\.png'):
+        save_plot(run, tmp_path / 'p.gif')
+    with pytest.raises(pi.DataError, match='nowhere'):
+        save_plot(run, tmp_path / 'nowhere' / 'p.png')

@@ -1,0 +1,187 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""An identification for people: tables hold the numbers of the result."""
+
+from dataclasses import replace
+import json
+import math
+
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.identification.results import Steps
+from piezo_ident.model.free_run import piece_runs, SineError, sines_of
+from piezo_ident.report import headline, identification_text, steps_to_json, table_one, to_json
+from piezo_ident.report.identification import (
+    dynamics_tables,
+    error_table,
+    hysteresis_tables,
+    sine_table,
+)
+from piezo_ident.report.modes import modes
+from piezo_ident.report.table import columns, length, number, Table
+import pytest
+
+
+def test_headline_is_about_the_record_for_validation(identified):
+    rows = [r for r in identified.errors if r.data == 'validation' and r.driven]
+    n = sum(row.n for row in rows)
+    errors = [
+        math.sqrt(sum(row.n * getattr(row, name) ** 2 for row in rows) / n)
+        for name in ('percent', 'static_percent')
+    ]
+    # ramps are easy, and count for neither; the rests have another label here
+    assert n == 50_000
+    for error in errors:
+        assert f' by {number(error)} %' in headline(identified)
+    assert rows[0].record in headline(identified)
+
+
+def test_headline_without_validation(identified):
+    rows = tuple(row for row in identified.errors if row.data != 'validation')
+    assert 'held out from the fit' in headline(replace(identified, errors=rows))
+    rows = tuple(row for row in rows if row.data == 'fitted')
+    assert 'Nothing was held out' in headline(replace(identified, errors=rows))
+    assert '–' in headline(replace(identified, errors=()))
+
+
+def test_error_table_holds_the_errors(identified):
+    table = error_table(identified)
+    cells = {
+        (row.record, row.segment, row.data, number(row.percent), number(row.static_percent))
+        for row in identified.errors
+    }
+    assert {row[:5] for row in table.rows} == cells
+    assert [row[2] for row in table.rows] == sorted(
+        (row[2] for row in table.rows), key=['validation', 'held out', 'selection', 'fitted'].index
+    )
+    # at rest there is nothing but noise to explain
+    assert {row[5] for row in table.rows if row[1] == 'idle'} == {'–'}
+
+
+def test_both_solvers_are_shown(identified):
+    fit = identified.hysteresis
+    weights, _, solvers = hysteresis_tables(identified)
+    assert [float(row[1]) for row in solvers.rows] == [
+        pytest.approx(fit.swarm_loss, rel=1e-4),
+        pytest.approx(fit.optimum_loss, rel=1e-4),
+    ]
+    assert str(fit.swarm.nit) in solvers.rows[0][3]
+    h = identified.model.hysteresis
+    assert [row[3] for row in weights.rows] == [number(x, 4) for x in (*h.weights, h.p1, h.p2)]
+    alone = replace(identified, hysteresis=replace(fit, swarm=None, swarm_loss=None))
+    assert len(hysteresis_tables(alone)[2].rows) == 1
+
+
+def test_dynamics_tables_hold_the_coefficients(identified):
+    G = identified.model.dynamics
+    delay, coefficients, poles, methods = dynamics_tables(identified)
+    assert delay.rows[0][1] == '3'
+    assert [row[1] for row in coefficients.rows if row[1]] == [number(x, 6) for x in G.a]
+    assert [row[3] for row in coefficients.rows if row[3]] == [number(x, 6) for x in G.b]
+    assert len(poles.rows) > 2
+    assert len(methods.rows) == len(identified.dynamics.methods)
+
+
+def test_numbers_are_strict_json(identified):
+    runs = piece_runs(identified.model, identified.records, identified.memories)
+    data = to_json(identified, runs)
+    json.dumps(data, allow_nan=False)
+    assert data['delay']['samples'] == 3
+    assert data['delay']['seconds'] == pytest.approx(150e-6)
+    assert data['dynamics']['order'] == list(identified.dynamics.order)
+    assert len(data['dynamics']['a_std']) == len(data['dynamics']['a'])
+    assert data['errors']['validation'] == pytest.approx(identified.error('validation'))
+    assert len(data['errors']['rows']) == len(identified.errors)
+    assert [row['frequency'] for row in data['sines']] == [20.0, 100.0]
+    assert [row['percent'] for row in data['sines']] == [
+        pytest.approx(float(x), rel=0.01) for x in sine_table(sines_of(runs)).rows[0][1:]
+    ]
+    assert data['data_faults'][0]['count'] == 3
+    assert data['hysteresis']['thresholds_volt'][0] == pytest.approx(1.0)
+    assert data['hysteresis']['swarm_loss'] == identified.hysteresis.swarm_loss
+
+
+def test_unknown_numbers_are_null(identified):
+    rows = (replace(identified.errors[0], fit=float('-inf'), percent=float('nan')),)
+    delay = replace(identified.delay, std=float('inf'))
+    data = to_json(replace(identified, errors=rows, delay=delay, noise_floor=None))
+    json.dumps(data, allow_nan=False)
+    assert data['errors']['rows'][0]['fit'] is None
+    assert data['errors']['selection'] is None
+    assert data['delay']['std'] is None
+    assert data['noise_floor']['percent_of_stroke'] is None
+
+
+def test_single_steps_have_the_keys_of_the_whole(identified):
+    steps = Steps(identified.delay, (identified.dynamics, identified.model.dynamics))
+    data, whole = steps_to_json(steps, 20_000.0, identified.records), to_json(identified)
+    assert {**data['dynamics'], 'bias': None} == {**whole['dynamics'], 'bias': None}
+    assert data['delay'] == whole['delay']
+    assert data['data_faults'] == whole['data_faults']
+
+
+def test_summary_for_a_terminal(identified):
+    text = identification_text(identified)
+    assert length(identified.stroke) in text
+    assert 'warning: ' in text
+    # names in files must not steer a terminal
+    assert '\x1b' not in text
+    assert max(map(len, text.splitlines())) < 140
+
+
+def test_table_of_sines():
+    rows = [SineError(1.0, 1.03, 1.03, 10), SineError(120.0, 3.59, 10.06, 10)]
+    lines = table_one(rows).splitlines()
+    assert lines[0].split() == ['frequency', '/', 'Hz', '1', '120']
+    assert lines[1].split()[-2:] == ['1.03', '3.59']
+    assert lines[2].split()[-2:] == ['1.03', '10.1']
+    assert 'no sine' in table_one([])
+
+
+def test_modes_and_their_uncertainty():
+    model = pi.SimulatedStage.load('paper').model
+    G, n = model.dynamics, model.dynamics.a.size
+    rng = np.random.default_rng(2)
+    root = 1e-7 * rng.standard_normal((n, n))
+    covariance = np.zeros((2 * n, 2 * n))
+    covariance[:n, :n] = root @ root.T
+    given = [m for m in modes(G, model.sample_rate, covariance) if m.oscillates]
+    expected = np.array(G.modes(model.sample_rate))
+    assert np.allclose([(m.frequency, m.damping) for m in given], expected)
+    # against a sample of models drawn from that covariance
+    draws = [
+        [m[0] for m in replace(G, a=G.a + root @ rng.standard_normal(n)).modes(model.sample_rate)]
+        for _ in range(2000)
+    ]
+    assert [m.frequency_std for m in given] == pytest.approx(np.std(draws, axis=0), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [
+        (None, '–'),
+        (float('nan'), '–'),
+        (float('inf'), '∞'),
+        (0.0, '0'),
+        (0.00323456, '0.00323'),
+        (12.3456, '12.3'),
+        (-1234.5, '-1234'),
+        (3.2e-7, '3.20e-07'),
+    ],
+)
+def test_numbers_for_people(value, text):
+    assert number(value) == text
+
+
+def test_lengths_and_columns():
+    assert [length(x) for x in (2e-3, 71e-6, 3e-9, 0.0)] == [
+        '2.000 mm',
+        '71.00 µm',
+        '3.000 nm',
+        '0 nm',
+    ]
+    assert columns(('a', 'b'), [('x', '1'), ('yy\x1b', '12')]) == ['a     b', 'x     1', 'yy?  12']
+    table = Table('t', ('', 'n', 'text'), [('a', '1', 'b'), ('b', '–', '2')])
+    assert table.text_columns == (False, False, True)
+    assert Table('t', ('', 'n'), []).text_columns == (False, False)
