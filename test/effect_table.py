@@ -4,17 +4,13 @@
 """What the tests of the effects share: a setting of each that can be seen, signals, a runner."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from paper_stage import FS, PAPER
 from piezo_ident.effects import find_effect, View
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
 
-FS = 20_000.0
-ROOT = Path(__file__).resolve().parents[1]
-PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 H = PAPER.hysteresis
 
 #: a setting of each effect that can be seen

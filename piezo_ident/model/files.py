@@ -22,10 +22,13 @@ import yaml
 
 __all__ = [
     'SCHEMA_VERSION',
+    'check_keys',
     'load',
     'model_from_dict',
     'model_to_dict',
     'model_to_yaml',
+    'number',
+    'numbers',
     'plain',
 ]
 
@@ -70,16 +73,16 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _mapping(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
+def _part(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
     value = data.get(key)
     if not isinstance(value, Mapping):
         raise ModelError(f'{name}: {key} must be a mapping, see config/stage_paper.yaml')
     return value
 
 
-def _number(data: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
+def number(data: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
+    """Return a number of a mapping, or raise ModelError; ``2e-5``, text to YAML 1.1, is one."""
     value = data.get(key, default)
-    # YAML 1.1 reads 2e-5 as text; people write it all the same
     if isinstance(value, bool) or value is None:
         raise ModelError(f'{name}: {key} is missing or not a number')
     try:
@@ -88,7 +91,8 @@ def _number(data: Mapping[str, Any], key: str, name: str, default: float | None 
         raise ModelError(f'{name}: {key} is not a number: {reprlib.repr(value)}') from None
 
 
-def _numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
+def numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
+    """Return a list of numbers of a mapping, or raise ModelError."""
     value = data.get(key)
     if not isinstance(value, list) or any(isinstance(x, bool) for x in value):
         raise ModelError(f'{name}: {key} must be a list of numbers')
@@ -102,18 +106,25 @@ def _unknown(data: Mapping[str, Any], known: Collection[str]) -> list[str]:
     return sorted(set(map(str, data)) - set(known))
 
 
-def _meant(key: str, known: Iterable[str]) -> str | None:
-    """Return the known key that a misspelt one stands for."""
+def _similar(key: str, known: Iterable[str]) -> str | None:
     names = {name.lower(): name for name in known}
     close = difflib.get_close_matches(key.lower(), names, n=1)
     return names[close[0]] if close else None
 
 
-def _refuse_unknown(unknown: list[str], known: Collection[str], where: str, name: str) -> None:
+def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name: str) -> None:
+    """
+    Refuse unknown keys, and suggest the known ones that they resemble.
+
+    Raises
+    ------
+    ModelError
+    """
+    unknown = _unknown(data, known)
     if not unknown:
         return
-    meant = list(dict.fromkeys(filter(None, (_meant(key, known) for key in unknown))))
-    cure = f'did you mean {", ".join(meant)}?' if meant else f'it knows {", ".join(known)}'
+    similar = list(dict.fromkeys(filter(None, (_similar(key, known) for key in unknown))))
+    cure = f'did you mean {", ".join(similar)}?' if similar else f'known are {", ".join(known)}'
     listed = ', '.join(key[:40] for key in unknown[:8])
     raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
 
@@ -127,7 +138,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     data : mapping
         Contents of a model file.
     name : str, optional
-        What to call it in messages.
+        File, for messages.
 
     Raises
     ------
@@ -145,19 +156,18 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
             f'{SCHEMA_VERSION}; update piezo_ident'
         )
     missing = [key for key in _REQUIRED if key not in data]
-    unknown = _unknown(data, (*_REQUIRED, *_OPTIONAL))
-    # a misspelt part is there; anything else that lacks one is another file
-    if missing and not any(_meant(key, missing) for key in unknown):
+    known = (*_REQUIRED, *_OPTIONAL)
+    # a missing part may be there with its name misspelt; otherwise it is another kind of file
+    if missing and not any(_similar(key, missing) for key in _unknown(data, known)):
         raise ModelError(f'{name}: missing {", ".join(missing)}; is this a model file?')
-    _refuse_unknown(unknown, (*_REQUIRED, *_OPTIONAL), '', name)
-    for part, known in _INSIDE.items():
-        inside = _mapping(data, part, name)
-        _refuse_unknown(_unknown(inside, known), known, f' in {part}', name)
+    check_keys(data, known, '', name)
+    for part, keys in _INSIDE.items():
+        check_keys(_part(data, part, name), keys, f' in {part}', name)
 
-    source, target = _mapping(data, 'input', name), _mapping(data, 'output', name)
-    delay, h = _mapping(data, 'delay', name), _mapping(data, 'hysteresis', name)
-    g = _mapping(data, 'dynamics', name)
-    limits = _numbers(source, 'range', name)
+    source, target = _part(data, 'input', name), _part(data, 'output', name)
+    delay, h = _part(data, 'delay', name), _part(data, 'hysteresis', name)
+    g = _part(data, 'dynamics', name)
+    limits = numbers(source, 'range', name)
     if limits.size != 2:
         raise ModelError(f'{name}: input.range must be [lowest, highest] voltage')
     effects = data.get('effects') or []
@@ -166,38 +176,38 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     if len(effects) > EFFECTS:
         raise ModelError(f'{name}: {len(effects)} effects; give at most {EFFECTS}')
     for effect in effects:
-        _refuse_unknown(_unknown(effect, _EFFECT), _EFFECT, ' in effects', name)
+        check_keys(effect, _EFFECT, ' in effects', name)
     identification = data.get('identification') or {}
     if not isinstance(identification, Mapping):
         raise ModelError(f'{name}: identification must be a mapping')
-    samples = _number(delay, 'samples', name)
+    samples = number(delay, 'samples', name)
     if not samples.is_integer():
         raise ModelError(f'{name}: delay.samples must be a whole number, got {samples}')
-    a, b = _numbers(g, 'a', name), _numbers(g, 'b', name)
+    a, b = numbers(g, 'a', name), numbers(g, 'b', name)
     if max(a.size, b.size) > ORDER:
         raise ModelError(f'{name}: dynamics of order {max(a.size, b.size)}; at most {ORDER}')
     try:
         return StageModel(
-            sample_rate=_number(data, 'sample_rate', name),
+            sample_rate=number(data, 'sample_rate', name),
             scaling=Scaling(
-                v0=_number(source, 'v0', name),
-                V=_number(source, 'V', name),
-                y0=_number(target, 'y0', name),
-                Y=_number(target, 'Y', name),
+                v0=number(source, 'v0', name),
+                V=number(source, 'V', name),
+                y0=number(target, 'y0', name),
+                Y=number(target, 'Y', name),
                 range=(float(limits[0]), float(limits[1])),
             ),
             hysteresis=Hysteresis(
-                thresholds=_numbers(h, 'thresholds', name),
-                weights=_numbers(h, 'weights', name),
-                p1=_number(h, 'p1', name),
-                p2=_number(h, 'p2', name),
+                thresholds=numbers(h, 'thresholds', name),
+                weights=numbers(h, 'weights', name),
+                p1=number(h, 'p1', name),
+                p2=number(h, 'p2', name),
             ),
             dynamics=Dynamics(a=a, b=b),
-            delay=Delay(int(samples), _number(delay, 'fraction', name, 0.0)),
+            delay=Delay(int(samples), number(delay, 'fraction', name, 0.0)),
             effects=tuple(
                 EffectSetting(
                     str(e.get('name')),
-                    {str(k): v for k, v in _mapping(e, 'parameters', name).items()},
+                    {str(k): v for k, v in _part(e, 'parameters', name).items()},
                 )
                 for e in effects
             ),

@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The memory of a stage at the start of a record: unknown, unless it begins from a known rest.
+The memory of the plays at the start of a record.
 
-Before the voltage has swept as far as its threshold, a play is its unknown start, held between
+It is known where the record starts at the lowest voltage.  Elsewhere each play keeps its unknown
+start F_r(0) as long as the voltage allows,
 
-    max(v so far) - r   <=   F_r   <=   min(v so far),
+    max(v so far) - r   <=   F_r(0)   <=   min(v so far),
 
-and after that it has forgotten it.  So the start is a handful of bounded numbers, found by least
-squares on the early part of a record.
+so the starts are a few bounded numbers, which least squares finds from the early part of the
+record.  Once the voltage has swept the width of a play, the play depends on its start no more.
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
 
 __all__ = [
-    'SHARE',
-    'Sweep',
     'connected_pieces',
     'fit_memory',
     'forgotten',
@@ -32,61 +31,38 @@ __all__ = [
     'start_memory',
 ]
 
-#: share of its range that a run must sweep to forget its start
+#: share of its range that the voltage must sweep until the start is forgotten
 SHARE = 0.98
-#: samples that are looked at together for where the start is forgotten
+#: samples that are searched together
 WINDOW = 1 << 18
-#: pull towards the memory of a stage that came down to zero, as a share of the data's weight
+#: weight of the memory of a stage that came down to zero, as a share of the weight of the data
 PULL = 1e-4
 
 
-class Sweep:
+def forgotten(u: NDArray[np.float64], share: float = SHARE) -> int:
     """
-    How far a run has swept the range after which its start is forgotten.
+    Return the first sample at which the voltage has swept a share of its range.
 
-    Parameters
-    ----------
-    goal : float
-        What has to be swept, in the unit of the voltage.
-    """
-
-    def __init__(self, goal: float) -> None:
-        self._goal = goal
-        self._low, self._high = np.inf, -np.inf
-        self.is_done = False
-
-    def before(self, u: NDArray[np.float64]) -> int:
-        """Return how many of the next samples come before the start is forgotten."""
-        if self.is_done:
-            return 0
-        for start in range(0, u.size, WINDOW):
-            part = u[start : start + WINDOW]
-            top = np.maximum(np.maximum.accumulate(part), self._high)
-            bottom = np.minimum(np.minimum.accumulate(part), self._low)
-            swept = top - bottom >= self._goal
-            if swept.any():
-                self.is_done = True
-                return start + int(np.argmax(swept))
-            self._low, self._high = float(bottom[-1]), float(top[-1])
-        return int(u.size)
-
-
-def forgotten(u: NDArray[np.float64], share: float = SHARE, span: float | None = None) -> int:
-    """
-    Return the sample from which the start is forgotten.
+    Plays that are not wider than that share then no longer depend on their start.
 
     Parameters
     ----------
     u : ndarray, shape (n,)
         Voltage in any unit.
     share : float, optional
-        Share of the record's range that must have been swept.
-    span : float, optional
-        That range, where `u` is the beginning of the record alone.
+        Of the range of `u`.
     """
-    sweep = Sweep(share * (float(np.ptp(u)) if span is None else span))
-    start = sweep.before(u)
-    return start if sweep.is_done else 0
+    goal = share * float(np.ptp(u))
+    low, high = np.inf, -np.inf
+    for start in range(0, u.size, WINDOW):
+        part = u[start : start + WINDOW]
+        top = np.maximum(np.maximum.accumulate(part), high)
+        bottom = np.minimum(np.minimum.accumulate(part), low)
+        swept = top - bottom >= goal
+        if swept.any():
+            return start + int(np.argmax(swept))
+        low, high = float(bottom[-1]), float(top[-1])
+    return 0
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
@@ -95,7 +71,7 @@ def is_at_rest(model: StageModel, piece: Piece) -> bool:
 
 
 def connected_pieces(record: Record) -> list[list[Piece]]:
-    """Return the pieces of a record, those together that follow each other over short gaps."""
+    """Return the pieces of a record in groups; within a group, gaps are short."""
     groups: list[list[Piece]] = []
     for piece in record:
         last = groups[-1][-1] if groups else None
@@ -124,7 +100,7 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
     model : StageModel
     piece : Piece
     stop : int, optional
-        Samples to use; up to where the start is forgotten when absent.
+        Number of samples to use; those before the start is forgotten when absent.
 
     Returns
     -------

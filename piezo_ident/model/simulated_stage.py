@@ -24,7 +24,7 @@ from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import load_yaml
 from piezo_ident.excitation.program import Program, Sequence
-from piezo_ident.model.files import model_from_dict
+from piezo_ident.model.files import check_keys, model_from_dict, number, numbers
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.record.record import Fault, Piece, Record
@@ -36,6 +36,8 @@ __all__ = [
     'StageRun',
     'stage_from_dict',
 ]
+
+_SENSOR = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
 
 
 @dataclass(frozen=True)
@@ -288,51 +290,27 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
     sensor = data.get('sensor') or {}
     if not isinstance(sensor, Mapping):
         raise ConfigError(f'{name}: sensor must be a mapping, see config/stage_paper.yaml')
-    known = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
-    strange = [str(key)[:40] for key in sensor if key not in known][:8]
-    if strange:
-        raise ConfigError(
-            f'{name}: unknown {", ".join(strange)} in sensor; it knows {", ".join(known)}'
-        )
+    check_keys(sensor, _SENSOR, ' in sensor', name)
     seed = data.get('seed', 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigError(
-            f'{name}: seed must be a whole number, not negative, got {reprlib.repr(seed)}'
-        )
+        raise ConfigError(f'{name}: seed must be a whole number >= 0, got {reprlib.repr(seed)}')
     model = model_from_dict({k: v for k, v in data.items() if k not in ('sensor', 'seed')}, name)
+    where = f'{name}: sensor'
+    noise_rms = number(sensor, 'noise_rms', where, 0.0)
     try:
-        return SimulatedStage(
-            model,
-            Sensor(
-                noise_rms=_number(sensor.get('noise_rms', 0.0), 'noise_rms'),
-                dac=_converter(sensor, 'dac'),
-                adc=_converter(sensor, 'adc'),
-            ),
-            seed,
-        )
+        dac, adc = (_converter(sensor, which, where) for which in ('dac', 'adc'))
+        return SimulatedStage(model, Sensor(noise_rms, dac, adc), seed)
     except ConfigError as error:
-        raise ConfigError(f'{name}: sensor: {error}') from None
+        raise ConfigError(f'{where}: {error}') from None
 
 
-def _converter(sensor: Mapping[str, Any], which: str) -> Converter | None:
-    bits, ends = sensor.get(f'{which}_bits'), sensor.get(f'{which}_range')
-    if bits is None and ends is None:
+def _converter(sensor: Mapping[str, Any], which: str, where: str) -> Converter | None:
+    bits, ends = f'{which}_bits', f'{which}_range'
+    if sensor.get(bits) is None and sensor.get(ends) is None:
         return None
-    if bits is None or not isinstance(ends, list) or len(ends) != 2:
-        raise ConfigError(f'give both {which}_bits and {which}_range: [lowest, highest]')
-    number = _number(bits, f'{which}_bits')
-    if number != int(number):
-        raise ConfigError(f'{which}_bits must be a whole number, got {number:g}')
-    low, high = (_number(x, f'{which}_range') for x in ends)
-    return Converter(int(number), low, high)
-
-
-def _number(value: Any, key: str) -> float:
-    # YAML 1.1 reads 2e-5 as text; people write it all the same
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise ConfigError(f'{key} must be a number, got {reprlib.repr(value)}')
-    return number
+    if sensor.get(bits) is None or sensor.get(ends) is None:
+        raise ConfigError(f'give both {bits} and {ends}: [lowest, highest]')
+    count, limits = number(sensor, bits, where), numbers(sensor, ends, where)
+    if not count.is_integer() or limits.size != 2:
+        raise ConfigError(f'{bits} must be a whole number and {ends} [lowest, highest]')
+    return Converter(int(count), float(limits[0]), float(limits[1]))

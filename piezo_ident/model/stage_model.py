@@ -32,7 +32,7 @@ from piezo_ident.record.record import Piece, Record
 
 __all__ = ['EffectSetting', 'Scaling', 'StageModel']
 
-#: share of the identified voltages below which another unit is likelier than a small signal
+#: share of the identified range below which a wrong unit is likelier than a small signal
 FAINT = 2e-3
 
 
@@ -106,7 +106,7 @@ class EffectSetting:
 @dataclass(frozen=True, eq=False)
 class StageModel:
     """
-    A stage: H, G, delay and effects, with scaling and the story of its identification.
+    A stage: H, G, delay and effects, with its scaling and how it was identified.
 
     Parameters
     ----------
@@ -340,43 +340,18 @@ class StageModel:
         )
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
-        """Return a warning when the voltage is not of the range in which H was identified."""
-        outside = sum(self.outside(p.v) for p in record)
-        return self.range_warnings(record.name, outside / record.n, record.voltage_range)
-
-    def outside(self, v: NDArray[np.float64]) -> int:
-        """Return how many voltages [V] leave the range in which the model was identified."""
+        """Return a warning when the voltage differs from that of the identification."""
         low, high = self.scaling.range
         slack = 1e-3 * (high - low)
-        return int(np.sum((v < low - slack) | (v > high + slack)))
-
-    def range_warnings(
-        self, name: str, outside: float, seen: tuple[float, float]
-    ) -> tuple[str, ...]:
-        """
-        Return what to say of voltages that the model was not identified with.
-
-        Parameters
-        ----------
-        name : str
-            Of the record.
-        outside : float
-            Share of its samples that leave the identified range.
-        seen : tuple of float
-            Its smallest and largest voltage [V].
-        """
-        low, high = self.scaling.range
-        identified = f'identified range {low:g} .. {high:g} V'
-        reach = f'they reach {seen[0]:g} .. {seen[1]:g} V'
+        outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
+        least, most = record.voltage_range
+        identified = f'the identified range {low:g} .. {high:g} V'
+        reach = f'{record.name}: the voltage spans {least:g} .. {most:g} V'
         if outside:
             return (
-                f'{name}: {outside:.1%} of the samples lie outside the {identified} ({reach}); '
-                'the prediction is an extrapolation there',
+                f'{reach}; {outside / record.n:.1%} of the samples lie outside {identified}, '
+                'where the prediction is an extrapolation',
             )
-        largest = max(map(abs, seen))
-        if 0.0 < largest < FAINT * max(abs(low), abs(high)):
-            return (
-                f'{name}: the voltages are next to nothing beside the {identified} ({reach}): '
-                'are they in volts?',
-            )
+        if 0.0 < max(abs(least), abs(most)) < FAINT * max(abs(low), abs(high)):
+            return (f'{reach}, far less than {identified}; is it in volts?',)
         return ()

@@ -5,12 +5,13 @@
 
 import copy
 from dataclasses import replace
-from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_array_equal
+import paper_stage
+from paper_stage import CONFIG
 from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.model.files import (
     load,
@@ -20,15 +21,13 @@ from piezo_ident.model.files import (
     plain,
     SCHEMA_VERSION,
 )
-from piezo_ident.model.simulated_stage import SimulatedStage, stage_from_dict
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Delay
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[2]
 PAPER = replace(
-    SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model,
+    paper_stage.PAPER,
     delay=Delay(3, 0.25),
     effects=(EffectSetting('creep', {'gain': [0.012, 0.01], 'time_constant': [0.1, 1 / 3]}),),
     identification={
@@ -88,7 +87,7 @@ def test_weight_at_zero_is_folded_on_loading():
 
 
 def test_numbers_as_people_write_them(tmp_path):
-    text = (ROOT / 'config/stage_paper.yaml').read_text(encoding='utf-8').split('sensor:')[0]
+    text = (CONFIG / 'stage_paper.yaml').read_text(encoding='utf-8').split('sensor:')[0]
     # YAML 1.1 takes 75e-6 for text
     path = tmp_path / 'model.yaml'
     path.write_text(text.replace('75.0e-6', '75e-6').replace('20000.0', '2e4'), encoding='utf-8')
@@ -131,44 +130,29 @@ def test_unknown_keys_are_named():
 
 
 @pytest.mark.parametrize(
-    ('part', 'key', 'said'),
+    ('part', 'key', 'message'),
     [
-        ('input', 'v', 'unknown keys v in input; did you mean'),
-        ('output', 'y', 'unknown keys y in output; did you mean'),
-        ('delay', 'sample', 'unknown keys sample in delay; did you mean samples?'),
-        ('hysteresis', 'wieghts', 'unknown keys wieghts in hysteresis; did you mean weights?'),
-        ('hysteresis', 'P1', 'unknown keys P1 in hysteresis; did you mean p1?'),
-        ('hysteresis', 'zzz', 'it knows thresholds, weights, p1, p2'),
-        ('dynamics', 3, 'unknown keys 3 in dynamics; it knows a, b'),
+        ('delay', 'sample', r'sample in delay; did you mean samples\?'),
+        ('hysteresis', 'P1', r'P1 in hysteresis; did you mean p1\?'),
+        ('hysteresis', 'zzz', 'known are thresholds, weights, p1, p2'),
+        ('dynamics', 3, 'unknown keys 3 in dynamics'),
     ],
 )
-def test_unknown_keys_inside_are_named(part, key, said):
+def test_unknown_keys_inside_are_named(part, key, message):
     d = data()
     d[part][key] = 1.0
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(ModelError, match=f'm.yaml: .*{message}'):
         model_from_dict(d, 'm.yaml')
-    assert str(caught.value).startswith('m.yaml: ')
-    assert said in str(caught.value)
 
 
-def test_misspelt_keys_are_named_before_what_they_leave_out():
-    d = data()
-    d['hysteresis']['wieghts'] = d['hysteresis'].pop('weights')
-    with pytest.raises(ModelError, match=r'wieghts in hysteresis; did you mean weights\?'):
-        model_from_dict(d)
-    d = data()
-    d['dynmics'] = d.pop('dynamics')
-    with pytest.raises(ModelError, match=r'unknown keys dynmics; did you mean dynamics\?'):
-        model_from_dict(d)
-    d = data()
-    d['effects'][0]['paramters'] = d['effects'][0].pop('parameters')
-    with pytest.raises(ModelError, match=r'paramters in effects; did you mean parameters\?'):
-        model_from_dict(d)
-
-
-def test_unknown_sensor_keys_are_named():
-    with pytest.raises(ConfigError, match=r'unknown noise_rsm in sensor; it knows noise_rms'):
-        stage_from_dict({**data(), 'sensor': {'noise_rsm': 1e-9}})
+@pytest.mark.parametrize(
+    ('wrong', 'key'),
+    [('wieghts', 'weights'), ('dynmics', 'dynamics'), ('paramters', 'parameters')],
+)
+def test_a_misspelt_key_is_named_rather_than_missing(wrong, key):
+    text = model_to_yaml(PAPER).replace(f'{key}:', f'{wrong}:', 1)
+    with pytest.raises(ModelError, match=f'{wrong}.*did you mean {key}'):
+        model_from_dict(yaml.safe_load(text))
 
 
 HUGE = 10**400
@@ -232,60 +216,13 @@ def test_wrong_values_are_refused_in_one_line(key, value):
     assert '\n' not in str(caught.value)
 
 
-HOSTILE = [
-    '',
-    'just text',
-    '- a\n- list',
-    '{',
-    'a: !!python/object/apply:os.system ["true"]',
-    'a: !!python/name:os.system',
-    'a: !!python/object:builtins.dict {}',
-    '!!int ""',
-    'a: !!int ""',
-    'a: !!float ""',
-    'a: !!bool perhaps',
-    'a: !!timestamp yesterday',
-    'a: 2026-99-99',
-    'a: !!binary "?"',
-    '? [a, b]\n: 1',
-    '? {a: b}\n: 1',
-    'a: *nowhere',
-    'a: &x [*x',
-    'a: ' + '9' * 5000,
-    'a: ' + '1:' * 400 + '1.0',
-    '[' * 5000,
-    'a: \x00',
-    '--- a\n--- b',
-    '<<: 1',
-    '<<: [1]',
-]
-
-
-@pytest.mark.parametrize('text', HOSTILE)
-def test_hostile_yaml_gives_an_error_of_ours(tmp_path, text):
+@pytest.mark.parametrize(
+    'text', ['', '- a\n- list', 'a: !!python/object/apply:os.system ["true"]', '[' * 5000]
+)
+def test_a_file_that_is_no_model_is_refused(tmp_path, text):
     path = tmp_path / 'model.yaml'
     path.write_text(text, encoding='utf-8')
-    with pytest.raises((ConfigError, ModelError)) as caught:
-        load(path)
-    assert '\n' not in str(caught.value)
-    assert len(str(caught.value)) < 1000
-
-
-BOMB = 'a0: &a0 [1, 1]\n' + ''.join(f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n' for i in range(1, 40))
-
-
-def test_bomb_in_a_file_and_a_list_that_holds_itself(tmp_path):
-    path = tmp_path / 'model.yaml'
-    path.write_text(BOMB, encoding='utf-8')
-    with pytest.raises(ConfigError, match='too large'):
-        load(path)
-    path.write_text(
-        model_to_yaml(replace(PAPER, identification={}, effects=())).replace(
-            'identification: {}', 'identification: &me {x: *me}'
-        ),
-        encoding='utf-8',
-    )
-    with pytest.raises(ConfigError, match='not valid YAML'):
+    with pytest.raises((ConfigError, ModelError), match=r'model\.yaml'):
         load(path)
 
 

@@ -4,17 +4,12 @@
 """The model: a stream is the batch, scaling with either sign, rates, ranges."""
 
 from dataclasses import replace
-from itertools import pairwise
-from pathlib import Path
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import FS, PAPER
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.effects import catalogue, View
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -22,70 +17,10 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record
 import pytest
 
-FS = 20_000.0
-ROOT = Path(__file__).resolve().parents[2]
-PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
-
-
-#: what effects may know of the signals of this file
-VIEW = View(
-    sample_rate=FS,
-    low=0.0,
-    high=1.0,
-    speeds=np.linspace(10.0, 60.0, 8),
-    duration=1.0,
-    channels={'other_axis': (0.0, 1.0)},
-    lines=(50.0,),
-    modes=tuple(PAPER.dynamics.modes(FS)),
-    thresholds=PAPER.hysteresis.thresholds,
-)
-
-
-def inside(effect) -> dict:
-    """Return a setting of any effect away from its neutral values, from what it declares."""
-    trial = effect.trials(VIEW)[0]
-    values = dict(trial.values)
-    for (name, index), step in zip(trial.moves, trial.steps, strict=True):
-        if index is None:
-            values[name] = values[name] + 3 * step
-        else:
-            values[name] = np.array(values[name])
-            values[name][index] += 3 * step
-    return values
-
-
-EVERY = {name: inside(effect) for name, effect in catalogue().items()}
-
 
 def long_signal(n=3 * CHUNK + 100):
     t = np.arange(n) / FS
     return 5 - 5 * np.cos(2 * np.pi * 20 * t) * np.minimum(1, 0.5 + t)
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    cuts=st.lists(st.integers(0, 4000), max_size=10),
-    names=st.lists(st.sampled_from(sorted(EVERY)), unique=True),
-    d=st.integers(0, 5),
-    fraction=st.sampled_from([0.0, 0.3]),
-    sign=st.sampled_from([-1.0, 1.0]),
-)
-def test_streamed_is_batch_with_every_effect_of_the_catalogue(cuts, names, d, fraction, sign):
-    model = replace(
-        PAPER,
-        delay=Delay(d, fraction),
-        scaling=replace(PAPER.scaling, Y=sign * 75e-6),
-        effects=tuple(EffectSetting(name, EVERY[name]) for name in names),
-    )
-    v = long_signal(4000)
-    other = np.sin(np.arange(v.size) / 50)
-    batch = model.simulate(v, channels={'other_axis': other})
-    stream, edges = model.stream(), [0, *sorted(cuts), v.size]
-    parts = [
-        stream.process(v[a:b], channels={'other_axis': other[a:b]}) for a, b in pairwise(edges)
-    ]
-    assert_allclose(np.concatenate(parts), batch, rtol=0, atol=1e-12 * 75e-6)
-    assert np.all(np.isfinite(batch))
 
 
 def test_prediction_does_not_show_its_own_chunks():
@@ -174,7 +109,7 @@ def test_leaving_the_identified_range_warns_with_numbers():
     # rounding at the ends is no extrapolation
     assert free_run(PAPER, record([0, -1e-3, 10.004])).warnings == ()
     (warning,) = free_run(PAPER, record([0, 5, 10, 12])).warnings
-    assert warning.startswith('mine: 25.0%')
+    assert 'mine' in warning and '25.0%' in warning
     assert '0 .. 10 V' in warning
     assert '12 V' in warning
 
@@ -182,14 +117,16 @@ def test_leaving_the_identified_range_warns_with_numbers():
 def test_millivolts_are_taken_for_what_they_are():
     (warning,) = free_run(PAPER, record([0, 5e-3, 10e-3])).warnings
     assert 'mine: ' in warning
-    assert 'are they in volts?' in warning
+    assert 'in volts?' in warning
     # a small signal is a signal, and a stage at 0 V is at rest
     assert free_run(PAPER, record([0, 0.05, 0.03])).warnings == ()
     assert free_run(PAPER, record([0, 0, 0])).warnings == ()
 
 
 def test_hysteresis_alone_keeps_the_static_gain():
-    model = replace(PAPER, effects=(EffectSetting('creep', EVERY['creep']),))
+    model = replace(
+        PAPER, effects=(EffectSetting('creep', {'gain': [0.01], 'time_constant': [1.0]}),)
+    )
     alone = model.without_dynamics()
     assert alone.effects == ()
     assert alone.delay.total == 0.0

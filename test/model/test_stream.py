@@ -6,15 +6,14 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 from effect_table import VISIBLE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import FS, PAPER
 from piezo_ident.common.errors import ModelError
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.chain import Block
@@ -23,10 +22,6 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import STRETCH
 from piezo_ident.record.record import Piece
 import pytest
-
-FS = 20_000.0
-ROOT = Path(__file__).resolve().parents[2]
-PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
 
 #: effects of every slot that need no further channel
 NAMES = sorted(set(VISIBLE) - {'cross_coupling'})
