@@ -10,9 +10,9 @@ import time
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
-from piezo_ident.nodes.wire import from_message, STREAM, to_message
+from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
@@ -36,7 +36,7 @@ class Driver(LabNode):
         super().__init__()
         self.guard = Guard(self._settings(self.values))
         Guard(self.guard.settings).process([np.nan])  # compiles what blocks would wait for
-        self.follower = Follower(RATE, self.values['silence'])
+        self.sample_clock = SampleClock(RATE, self.values['silence'])
         self.tick, self.heard = 0, time.monotonic()
         self.y = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
         self.applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
@@ -58,16 +58,16 @@ class Driver(LabNode):
     def apply(self, changed: dict) -> None:
         """Take new limits over at the next sample."""
         self.guard.settings = self._settings(self.values)
-        self.follower.longest_gap = self.values['silence']
+        self.sample_clock.longest_gap = self.values['silence']
 
     def _on_block(self, message: Float64MultiArray, info: dict) -> None:
         number = info.get('publication_sequence_number')
         try:
             samples = from_message(message)
         except DataError as error:
-            self.follower.skip(number)
+            self.sample_clock.skip(number)
             return self.report_status('running', 0.0, f'refused: {error}', WARN)
-        verdict = self.follower.judge(samples, number, self.v.get_publisher_count())
+        verdict = self.sample_clock.judge(samples, number, lambda: publisher_ids(self, self.v))
         if not verdict.is_taken:  # of a second publisher, or one that came before, or too late
             return self.report_status('running', 0.0, f'refused: {verdict.reason}', WARN)
         self.heard = time.monotonic()
@@ -88,8 +88,10 @@ class Driver(LabNode):
 
     def _on_timer(self) -> None:
         if time.monotonic() - self.heard > self.values['silence']:
-            self.follower.lose()  # what comes next is a new stream, and joined by a ramp
-            if not self.guard.is_at_rest:
+            self.sample_clock.pause()  # what comes next is a new stream, and joined by a ramp
+            if self.guard.is_at_rest:
+                self.sample_clock.end()  # and may be another publisher's
+            else:
                 self._move(self.guard.idle(round(PERIOD * RATE)), 'ramp:silence')
                 self.report_status('ramping', 0.0, 'no voltage: ramping to rest', WARN)
 

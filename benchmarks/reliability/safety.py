@@ -11,13 +11,14 @@ Whatever arrives on `voltage`, for the voltage that is applied:
 1. every sample is a number within the limits, or, where these were just moved, on its way back
    into them at the slew; no two samples in a row are further apart than the slew allows;
 2. silence ends at rest exactly, and neither that ramp nor the one into a new stream that stands
-   still is faster than `ramp_slew`; a second publisher moves nothing;
+   still is faster than `ramp_slew`; until then a second publisher moves nothing, at whatever time
+   and number its stream is;
 3. how the command is cut into blocks changes no bit of it.
 
-A sequence is a drive as the stage node builds it, a `Follower` and a `Guard`, and some ten things
-that happen to it: blocks of every kind of number, with every kind of time, gaps, silence,
-restarts, blocks of a second publisher, limits that are moved.  The seed of a sequence that fails
-is named: `--first SEED --count 1` plays it again.
+A sequence is a drive as the stage node builds it, a `SampleClock` and a `Guard`, and some ten
+things that happen to it: blocks of every kind of number, with every kind of time, gaps, silence,
+restarts, the stream of a second publisher, limits that are moved.  The seed of a sequence that
+fails is named: `--first SEED --count 1` plays it again.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.record.blocks import Samples
 
 __all__ = ['Broken', 'Drive', 'check', 'main', 'sequence']
@@ -70,18 +71,18 @@ def check(settings: GuardSettings, before: float, v: Array, what: str) -> None:
 
 
 class Drive:
-    """Follower and guard as the stage node has them, watched sample by sample."""
+    """Sample clock and guard as the stage node has them, watched sample by sample."""
 
     def __init__(self, settings: GuardSettings, silence: float) -> None:
         self.guard = Guard(settings)
-        self.follower = Follower(settings.sample_rate, silence)
+        self.clock = SampleClock(settings.sample_rate, silence)
         self.operations: list[tuple[str, object, bool]] = []
         self.applied: list[Array] = []
         self.met: Counter[str] = Counter()
 
-    def block(self, samples: Samples, number: int | None, publishers: int) -> Kind:
+    def block(self, samples: Samples, number: int | None, ids: tuple[bytes, ...]) -> Kind:
         """Take a block as it comes."""
-        verdict = self.follower.judge(samples, number, publishers)
+        verdict = self.clock.judge(samples, number, lambda: ids)
         self.met[verdict.kind.value] += 1
         if not verdict.is_taken:
             return verdict.kind
@@ -95,9 +96,9 @@ class Drive:
             self._is_soft(v, before, 'a ramp into a stream')
         return verdict.kind
 
-    def silence(self, n: int) -> None:
+    def silence(self, n: int, whole: bool) -> None:
         """Let nothing come for so many samples, or until rest."""
-        self.follower.lose()
+        self.clock.pause()
         self.met['silence'] += 1
         s = self.guard.settings
         inside = self._is_inside()
@@ -107,9 +108,12 @@ class Drive:
         # a ramp may be under way already, and is at its slowest near its end
         length = math.ceil(2 * (s.high - s.low) / s.ramp_step) + 1
         if inside and length < PATIENCE:
-            self.do('idle', length)
-            if self.guard.applied != s.rest:
+            if whole:
+                self.do('idle', length)
+            if whole and self.guard.applied != s.rest:
                 raise Broken(f'silence ends at {self.guard.applied:g} V, not at rest')
+        if self.guard.is_at_rest:
+            self.clock.end()
 
     def settings(self, settings: GuardSettings) -> None:
         """Move limits, slew, rest."""
@@ -227,6 +231,55 @@ def _drawn_times(rng: np.random.Generator, n: int, head: int, rate: float, gap: 
     return odd[int(kind)]() if int(kind) in odd else (head + k) / rate
 
 
+class Publishers:
+    """Two publishers of voltage, and which of them the drive follows."""
+
+    def __init__(self, rng: np.random.Generator, drive: Drive, rate: float) -> None:
+        self.rng, self.drive, self.rate = rng, drive, rate
+        self.is_numbered = bool(rng.integers(0, 2))
+        self.numbers = {b'A': int(rng.integers(1, 1000))}
+        self.followed: bytes | None = None
+        self.heard: set[bytes] = set()
+
+    def play(self, t: Array, values: Array) -> Kind:
+        """Send a block of the publisher that is followed, or of the one that comes first."""
+        return self._send(self.followed or b'A', t, values, tuple(self.numbers))
+
+    def play_other(self, values: Array) -> None:
+        """Send blocks of the other publisher, at any time and number."""
+        rng, clock = self.rng, self.drive.clock
+        other = b'A' if self.followed == b'B' else b'B'
+        if other not in self.numbers:
+            self.numbers[other] = self.numbers[b'A'] + int(rng.choice([-500, -3, 1, 3, 500]))
+        head = clock.head or int(rng.integers(0, 10**6))
+        tick = head + int(rng.choice([-values.size, 0, 1, 20, values.size, 10**5]))
+        for k in range(int(rng.integers(1, 5))):
+            first = tick + k * values.size
+            # the very next block of the stream, by time and number, could be anybody's
+            close = abs(self.numbers[other] - self.numbers[self.followed or other]) < 20
+            first += first == clock.head and (close or not self.is_numbered)
+            ids = (other,) if self.followed and not rng.integers(0, 4) else tuple(self.numbers)
+            self._send(other, (first + np.arange(values.size)) / self.rate, values, ids)
+
+    def _send(self, name: bytes, t: Array, values: Array, ids: tuple[bytes, ...]) -> Kind:
+        drive, before = self.drive, self.drive.guard.applied
+        self.numbers[name] += 1
+        if name not in self.heard and self.followed not in (None, name):
+            # the next number, from a publisher that was never heard, could be anybody's
+            self.numbers[name] += self.numbers[name] == self.numbers[self.followed] + 1
+        self.heard.add(name)
+        number = self.numbers[name] if self.is_numbered else None
+        kind = drive.block(Samples(t, values, 'x'), number, ids)
+        if self.followed is None and kind is Kind.START:
+            self.followed = name
+        elif self.followed not in (None, name):
+            if kind not in (Kind.SECOND, Kind.MALFORMED):
+                raise Broken(f'a block of a second publisher is taken as {kind.value}')
+            if drive.guard.applied != before:
+                raise Broken('a second publisher moves the stage')
+        return kind
+
+
 def sequence(seed: int) -> Counter[str]:
     """
     Play one sequence, and return what was met in it.
@@ -239,37 +292,26 @@ def sequence(seed: int) -> Counter[str]:
     rng = np.random.default_rng(seed)
     rate = float(rng.choice([1000.0, 20_000.0, 51_200.0]))
     start = _drawn_settings(rng, rate)
-    drive, number, gap = Drive(start, silence=0.02), 1, max(2, int(0.02 * rate))
-    numbered, last = bool(rng.integers(0, 2)), start.rest
+    drive, gap, last = Drive(start, silence=0.02), max(2, int(0.02 * rate)), start.rest
+    publishers = Publishers(rng, drive, rate)
     for _ in range(int(rng.integers(4, 16))):
         what = rng.integers(0, 16)
         if what == 0:
-            drive.silence(int(rng.integers(0, 400)))
+            drive.silence(int(rng.integers(0, 400)), whole=bool(rng.integers(0, 2)))
+            if drive.guard.is_at_rest:
+                publishers.followed = None
             continue
         if what == 1:
             drive.settings(_drawn_settings(rng, rate))
             continue
         n = int(rng.choice([1, 2, 7, 40, 100]))
-        head = drive.follower.head or 0
         values = _drawn_values(rng, n, drive.guard.settings, last)
-        if what == 2 and drive.follower.head is not None:
-            # of a publisher with numbers of its own, or at another time where there are none
-            before = drive.guard.applied
-            tick = head + 5 + int(rng.integers(1, 10**6))
-            t = (tick + np.arange(n)) / rate
-            other = Samples(t, values, 'theirs')
-            # its numbers are behind: one ahead may look as if the middleware had lost a few
-            kind = drive.block(other, number - 500 if numbered else None, 2)
-            if kind not in (Kind.SECOND, Kind.MALFORMED):
-                raise Broken(f'a block of a second publisher is taken as {kind.value}')
-            if drive.guard.applied != before:
-                raise Broken('a second publisher moves the stage')
+        if what in (2, 4):
+            publishers.play_other(values)
             continue
         if what == 3:
             n, values = 0, values[:0]
-        t = _drawn_times(rng, n, head, rate, gap)
-        number += 1
-        drive.block(Samples(t, values, 'x'), number if numbered else None, 1)
+        publishers.play(_drawn_times(rng, n, drive.clock.head or 0, rate, gap), values)
         finite = values[np.isfinite(values)]
         last = float(np.clip(finite[-1], -100, 100)) if finite.size else last
     drive.replayed(start, rng)

@@ -3,25 +3,36 @@
 
 
 """
-Follows one stream of blocks by its time stamps, and tells what became of it.
+The sample-clock tracker: follows one stream of blocks by its time stamps and its publisher.
 
-Whoever drives an amplifier from blocks must know whether a block goes on where the last one
-ended, starts over, comes twice or too late, or belongs to somebody else's stream.
+A node that drives an amplifier from blocks must know whether a block goes on where the last one
+ended, starts over, comes twice or too late, or belongs to another publisher.
+
+Some middleware does not tell which publisher sent a message; rclpy tells the message's number in
+the count of its publisher, and which publishers there are.  So:
+
+- while the publisher that was there at the start is the only one, every message is its own;
+- beside another one only a message with the next number is its own, and only while no other
+  publisher is known to be at that number; without numbers, only one with the next time;
+- behind a silence the publisher may come back, and no other one until `SampleClock.end`.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Collection, Hashable
 from dataclasses import dataclass
 import enum
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.restart import has_restarted
 
-__all__ = ['Follower', 'Kind', 'Verdict']
+__all__ = ['Kind', 'SampleClock', 'Verdict']
 
-#: blocks whose repetition is recognised, and gaps into which a late block may belong
+#: blocks whose repetition is recognised, gaps into which a late block may belong, and other
+#: publishers whose count is known
 MEMORY = 8
 #: how far a stamp may lie off its tick, in samples
 SLACK = 1e-3
@@ -34,7 +45,7 @@ class Kind(enum.Enum):
     START = 'start'  # a new stream, or one that starts over
     GAP = 'gap'  # the same stream, after samples that are missing
     REPEAT = 'repeat'  # came before
-    LATE = 'late'  # its time has passed: a gap was made of it
+    LATE = 'late'  # its time has passed
     SECOND = 'second'  # of another publisher, while the followed stream is alive
     MALFORMED = 'malformed'  # its time stamps are not those of a block
 
@@ -66,9 +77,9 @@ class Verdict:
         return self.kind in (Kind.NEXT, Kind.START, Kind.GAP)
 
 
-class Follower:
+class SampleClock:
     """
-    Follows a stream.
+    Tracks the sample clock of one stream.
 
     Parameters
     ----------
@@ -80,59 +91,96 @@ class Follower:
     Attributes
     ----------
     head : int or None
-        The tick expected next; None when no stream is followed.
+        The tick expected next; None while no stream is followed, or the one followed is silent.
+
+    Examples
+    --------
+    >>> clock = SampleClock(1000.0, longest_gap=0.1)
+    >>> t = np.arange(100) / 1000.0
+    >>> clock.judge(Samples(t, t)).kind.value, clock.judge(Samples(t + 0.1, t)).kind.value
+    ('start', 'next')
+    >>> clock.judge(Samples(t + 0.25, t)).missing
+    50
     """
 
     def __init__(self, sample_rate: float, longest_gap: float) -> None:
         self.sample_rate = sample_rate
         self.longest_gap = longest_gap
-        self.head: int | None = None
         self._sequence: int | None = None
+        self._is_silent = False
+        #: the next numbers of the other publishers, the latest last
+        self._others: deque[int] = deque(maxlen=MEMORY)
+        self.end()
+
+    def pause(self) -> None:
+        """Take note of a silence: only the publisher that is followed may come back."""
+        self._is_silent = self._is_silent or self.head is not None
+        self._forget()
+
+    def end(self) -> None:
+        """Follow nobody any more: the next block of any publisher starts a stream."""
+        self._is_silent = False
+        self._owner: Hashable = None
+        self._is_alone = True
+        self._forget()
+
+    def _forget(self) -> None:
+        self.head: int | None = None
+        self._begin = 0
+        self._again: int | None = None
         self._seen: deque[tuple[int, bytes]] = deque(maxlen=MEMORY)
         self._holes: deque[tuple[int, int]] = deque(maxlen=MEMORY)
-        self._again: int | None = None
-
-    def lose(self) -> None:
-        """Forget the stream: it has fallen silent, and whatever comes next is a new one."""
-        self.head = None
-        self._again = None
-        self._seen.clear()
-        self._holes.clear()
 
     def skip(self, sequence: int | None) -> None:
         """Count a message that holds no block."""
-        if self._is_own(sequence):
+        if sequence is None or self._is_next(sequence):
             self._sequence = sequence
+        else:
+            self._note_other(sequence)
 
-    def judge(self, samples: Samples, sequence: int | None = None, publishers: int = 1) -> Verdict:
+    def judge(
+        self,
+        samples: Samples,
+        sequence: int | None = None,
+        publishers: Callable[[], Collection[Hashable]] = tuple,
+    ) -> Verdict:
         """
-        Say what the next block is.
+        Return what the next block is.
 
         Parameters
         ----------
         samples : Samples
         sequence : int, optional
             Number that its publisher gave the message, where the middleware tells.
-        publishers : int, optional
-            How many publishers the topic has.
+        publishers : callable, optional
+            Returns the ids (gids) of all publishers of the topic; called only where a block does
+            not simply go on.  No id at all means one publisher.
         """
         ticks, reason = self._ticks(samples.t)
         if reason:
             self.skip(sequence)
             return Verdict(Kind.MALFORMED, reason=reason)
-        verdict = self._judge(int(ticks[0]), samples, sequence, publishers)
-        if verdict.kind is not Kind.SECOND:
-            self._sequence = sequence
+        tick, n = int(ticks[0]), samples.t.size
+        if self._is_foreign(tick, sequence, publishers):
+            self._note_other(sequence)
+            return Verdict(
+                Kind.SECOND,
+                tick,
+                reason=f'second publisher: its block {self._at(tick)} is not of the stream that '
+                'is followed',
+            )
+        verdict = self._judge(tick, samples)
+        if verdict.kind is Kind.START:
+            self._start(tick, sequence, publishers)
+        self._sequence = sequence
         if verdict.is_taken:
-            if verdict.kind is Kind.START:
-                self.lose()
-            elif verdict.kind is Kind.GAP:
-                self._holes.append((verdict.tick - verdict.missing, verdict.tick))
-            self.head = verdict.tick + samples.t.size
-            self._seen.append((verdict.tick, samples.values.tobytes()))
+            if verdict.kind is Kind.GAP:
+                self._holes.append((tick - verdict.missing, tick))
+            self.head = tick + n
+            self._seen.append((tick, samples.values.tobytes()))
             self._again = None
         elif verdict.kind is Kind.REPEAT:
-            self._again = verdict.tick + samples.t.size
+            self._again = tick + n
         return verdict
 
     def _ticks(self, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
@@ -152,33 +200,76 @@ class Follower:
             )
         return t, f'its time stamps are not ticks of {self.sample_rate:g} Hz in a row'
 
-    def _is_own(self, sequence: int | None) -> bool:
-        """Return whether a message may be the next of the followed publisher."""
-        return sequence is None or self._sequence is None or sequence == self._sequence + 1
+    # whose it is
 
-    def _is_foreign(self, tick: int, size: int, sequence: int | None, publishers: int) -> bool:
-        """Return whether a block is another publisher's, as far as one can tell."""
-        if publishers < 2 or self.head is None:
+    def _is_next(self, sequence: int) -> bool:
+        """Return whether a number is the next one of the followed publisher, and of no other."""
+        return self._sequence is None or (
+            sequence == self._sequence + 1 and sequence not in self._others
+        )
+
+    def _note_other(self, sequence: int | None) -> None:
+        if sequence is not None:
+            # a number that may be of either stays known as the other's
+            if sequence in self._others and sequence - 1 != self._sequence:
+                self._others.remove(sequence)
+            self._others.append(sequence + 1)
+
+    def _is_foreign(
+        self,
+        tick: int,
+        sequence: int | None,
+        publishers: Callable[[], Collection[Hashable]],
+    ) -> bool:
+        """Return whether a block is another publisher's, or may be."""
+        if self.head is None and not self._is_silent:
+            return False  # whoever comes is followed
+        numbered = sequence is not None and self._sequence is not None
+        goes_on = tick == self.head and (not numbered or sequence == (self._sequence or 0) + 1)
+        if goes_on and self._is_alone:
             return False
-        if sequence is None or self._sequence is None:
-            return tick != self.head
-        # blocks that the middleware lost are missing from the count and from the time alike
-        lost = sequence - self._sequence - 1
-        return lost != 0 and not (lost > 0 and 0 < tick - self.head <= (lost + 1) * 2 * size)
+        ids = publishers()
+        if goes_on:
+            if len(ids) == 1:
+                # the others have gone
+                (self._owner,) = ids
+                self._is_alone = True
+            return False
+        if self._is_alone and (not ids or set(ids) == {self._owner}):
+            return False
+        if self._owner is not None and ids and self._owner not in ids:
+            return True
+        return not numbered or sequence is None or not self._is_next(sequence)
 
-    def _judge(
-        self, tick: int, samples: Samples, sequence: int | None, publishers: int
-    ) -> Verdict:
-        n = samples.t.size
-        at = f'at t = {tick / self.sample_rate:.6g} s'
+    def _start(
+        self,
+        tick: int,
+        sequence: int | None,
+        publishers: Callable[[], Collection[Hashable]],
+    ) -> None:
+        """Begin a stream; the publisher of one that has ended counts as another."""
+        if self.head is None and not self._is_silent:
+            before = self._sequence
+            if before is not None and sequence is not None and sequence != before + 1:
+                self._note_other(before)
+            if sequence is not None and sequence in self._others:
+                self._others.remove(sequence)
+            ids = publishers()
+            self._is_alone = len(ids) < 2
+            self._owner = next(iter(ids)) if len(ids) == 1 else None
+        self._is_silent = False
+        self._forget()
+        self._begin = tick
+
+    # what it is to the stream
+
+    def _at(self, tick: int) -> str:
+        return f'at t = {tick / self.sample_rate:.6g} s'
+
+    def _judge(self, tick: int, samples: Samples) -> Verdict:
+        n, at = samples.t.size, self._at(tick)
         if self.head is None:
             return Verdict(Kind.START, tick, reason=f'a stream begins {at}')
-        if self._is_foreign(tick, n, sequence, publishers):
-            return Verdict(
-                Kind.SECOND,
-                tick,
-                reason=f'second publisher: its block {at} is not of the stream that is followed',
-            )
         missing = tick - self.head
         if missing == 0:
             return Verdict(Kind.NEXT, tick)
@@ -189,6 +280,7 @@ class Follower:
         if tick != self._again:
             if (tick, samples.values.tobytes()) in self._seen:
                 return Verdict(Kind.REPEAT, tick, reason=f'the block {at} came twice')
-            if any(start <= tick and tick + n <= stop for start, stop in self._holes):
+            in_a_gap = any(start <= tick and tick + n <= stop for start, stop in self._holes)
+            if in_a_gap or not has_restarted(tick, self.head - 1, self._begin, 1.0):
                 return Verdict(Kind.LATE, tick, reason=f'the block {at} came too late')
         return Verdict(Kind.START, tick, reason=f'the stream starts over {at}')

@@ -25,15 +25,18 @@ followed at the slew | WARN |
 | a longer gap | a new stream | WARN |
 | swapped blocks | the early one makes a gap, the late one is refused: its time has passed | WARN |
 | another block size | nothing: blocks are cut as they come | |
-| t jumps back | a new stream, joined by a ramp | |
+| t jumps back to where the stream began, or by more than 1000 samples | a new stream, joined by \
+a ramp | |
+| t jumps back otherwise | the block is refused: its time has passed | WARN |
 | limits or rest that are moved in silence | ramp to rest, back into the limits at the slew | |
 | no block for `silence` | ramp to rest in real time, on `applied_voltage` as `ramp:silence`, t \
-going on; what comes next is a new stream | WARN, unless it was at rest |
-| a second publisher | the stream that was there first is followed, the other's blocks are \
-refused until the first falls silent | WARN |
+going on; until rest only the same publisher may come back, with a new stream | WARN, unless it \
+was at rest |
+| a second publisher | its blocks are refused until the stream of the first has ended: silent, \
+and at rest | WARN |
 
-Publishers are told apart by the numbers that they give their messages, where the middleware hands
-them on, and by the continuity of t.
+`piezo_ident.live.sample_clock` says how publishers are told apart.  Beside a second publisher a
+loss of blocks ends the stream, since the block behind the loss could be anybody's.
 
 SIGINT and SIGTERM ramp to rest within a second, steeper than `ramp_slew` where that would take
 longer.
@@ -52,10 +55,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
-from piezo_ident.nodes.wire import from_message, STREAM, to_message
+from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
@@ -95,7 +98,7 @@ class StageNode(LabNode):
         self._guard = Guard(self._settings())
         self._warm_up()
         self._run = self._stage.run(np.random.default_rng(seed))
-        self._follower = Follower(self.sample_rate, self._longest_gap())
+        self._sample_clock = SampleClock(self.sample_rate, self._longest_gap())
         # tick of the next sample applied, whatever it comes from
         self._tick = 0
         self._segment = ''
@@ -103,8 +106,7 @@ class StageNode(LabNode):
         # the latest of each fault, and how long it stays in the status
         self._faults: dict[str, tuple[str, float]] = {}
         self._state = 'idle'
-        self._sources = 0
-        self._last = self._recount = self._ramp_begin = time.monotonic()
+        self._last = self._ramp_begin = time.monotonic()
         self._ramped = 0
         self._rate = (self._last, 0, 0.0)
         self._busy = 0.0
@@ -149,9 +151,9 @@ class StageNode(LabNode):
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take new limits and times over at the next sample."""
         self._guard.settings = self._settings()
-        self._follower.longest_gap = self._longest_gap()
+        self._sample_clock.longest_gap = self._longest_gap()
         self._watch.timer_period_ns = int(self._watch_period() * 1e9)
-        if self._follower.head is None and not self._guard.is_at_rest:
+        if self._sample_clock.head is None and not self._guard.is_at_rest:
             self._begin_ramp()
 
     def _longest_gap(self) -> float:
@@ -170,7 +172,7 @@ class StageNode(LabNode):
             if samples.quantity != 'voltage':
                 raise DataError(f'a block of {samples.quantity!r}, expected is voltage')
         except DataError as error:
-            self._follower.skip(sequence)
+            self._sample_clock.skip(sequence)
             self._blame('malformed', f'a block is refused: {error}')
         else:
             self._take(samples, sequence)
@@ -178,7 +180,9 @@ class StageNode(LabNode):
         self._say()
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
-        verdict = self._follower.judge(samples, sequence, self._count_publishers(samples))
+        verdict = self._sample_clock.judge(
+            samples, sequence, lambda: publisher_ids(self, self._input)
+        )
         kind = verdict.kind
         if not verdict.is_taken:
             self._blame(kind.value, f'a block is refused: {verdict.reason}')
@@ -205,17 +209,6 @@ class StageNode(LabNode):
         self._counts['samples'] += samples.t.size
         self._state, self._segment = 'running', samples.segment
 
-    def _count_publishers(self, samples: Samples) -> int:
-        # asking costs more than a block: of one that goes on where the last one ended, once every
-        # tenth of a second will do
-        now, head = time.monotonic(), self._follower.head
-        first = samples.t[0] * self.sample_rate if samples.t.size else float('nan')
-        goes_on = head is not None and abs(first - head) < 0.5
-        if now > self._recount or not goes_on or not self._sources:
-            self._sources = self._input.get_publisher_count()
-            self._recount = now + 0.1
-        return self._sources
-
     def _move(self, v: NDArray[np.float64], segment: str) -> None:
         """Apply what nobody commanded, and report it as applied."""
         self._run.process(v)
@@ -229,9 +222,10 @@ class StageNode(LabNode):
 
     def _on_watch(self) -> None:
         silent = time.monotonic() - self._last
-        if self._follower.head is not None and silent > self.values['silence']:
-            self._follower.lose()
+        if self._sample_clock.head is not None and silent > self.values['silence']:
+            self._sample_clock.pause()
             if self._guard.is_at_rest:
+                self._sample_clock.end()
                 self._state = 'idle'
             else:
                 self._blame('silence', f'no voltage for {silent:.2f} s: ramping to rest')
@@ -252,6 +246,7 @@ class StageNode(LabNode):
             self._move(self._guard.idle(due), 'ramp:silence')
         if self._guard.is_at_rest:
             self._ramp_timer.cancel()
+            self._sample_clock.end()
             self._state = 'idle'
             self._blame('silence', 'no voltage: ramped to rest', 0)
         self._say()

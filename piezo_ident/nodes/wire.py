@@ -9,7 +9,9 @@ from array import array
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import decode, encode, Samples
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 __all__ = [
@@ -20,6 +22,7 @@ __all__ = [
     'SERVICE',
     'STREAM',
     'from_message',
+    'publisher_ids',
     'to_message',
 ]
 
@@ -84,3 +87,11 @@ def from_message(message: Float64MultiArray) -> Samples:
     if any(len(d.label) > LONGEST for d in dims):
         raise DataError(f'a label of more than {LONGEST} characters')
     return decode(message.data, message.layout.dim, message.layout.data_offset)
+
+
+def publisher_ids(node: Node, subscription: Subscription) -> list[bytes]:
+    """Return the gids of all publishers of the topic of a subscription."""
+    infos = node.get_publishers_info_by_topic(subscription.topic_name)
+    gids = [bytes(info.endpoint_gid) for info in infos]
+    # one that is matched may not be listed yet
+    return gids + [b'unlisted'] * max(0, subscription.get_publisher_count() - len(gids))

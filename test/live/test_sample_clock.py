@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 from piezo_ident.live.pacing import BlockClock, LogClock, SLIP
-from piezo_ident.live.sample_clock import Follower, Kind
+from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.record.blocks import Samples
 import pytest
 
@@ -21,68 +21,78 @@ def block(tick, n=100, value=None):
     return Samples(np.arange(tick, tick + n) / FS, values, 'x')
 
 
-def kinds(follower, blocks, **more):
-    return [follower.judge(b, **more).kind.value for b in blocks]
+def kinds(clock, blocks):
+    return [clock.judge(b).kind.value for b in blocks]
 
 
 def test_a_stream_in_order():
-    follower = Follower(FS, 0.5)
-    assert kinds(follower, [block(0), block(100, 7), block(107), block(207, 1)]) == [
+    clock = SampleClock(FS, 0.5)
+    assert kinds(clock, [block(0), block(100, 7), block(107), block(207, 1)]) == [
         'start',
         'next',
         'next',
         'next',
     ]
-    assert follower.head == 208
+    assert clock.head == 208
 
 
 def test_ticks_are_told_after_days():
-    follower = Follower(FS, 0.5)
+    clock = SampleClock(FS, 0.5)
     k = 20000 * 86400 * 5
-    assert kinds(follower, [block(k), block(k + 100)]) == ['start', 'next']
+    assert kinds(clock, [block(k), block(k + 100)]) == ['start', 'next']
 
 
 def test_gap_repeat_swap_restart():
-    follower = Follower(FS, 0.5)
+    clock = SampleClock(FS, 0.5)
     a, b, c, d, e = (block(100 * k) for k in range(5))
-    assert kinds(follower, [a, b, b, c]) == ['start', 'next', 'repeat', 'next']
-    assert kinds(follower, [e]) == ['gap']
+    assert kinds(clock, [a, b, b, c]) == ['start', 'next', 'repeat', 'next']
+    assert kinds(clock, [e]) == ['gap']
     # it fits into the gap, but its time is over
-    assert kinds(follower, [d]) == ['late']
-    assert kinds(follower, [block(500), block(0)]) == ['next', 'start']
-    verdict = follower.judge(block(300))
+    assert kinds(clock, [d]) == ['late']
+    assert kinds(clock, [block(500), block(0)]) == ['next', 'start']
+    verdict = clock.judge(block(300))
     assert (verdict.kind, verdict.missing) == (Kind.GAP, 200)
     assert 't = 0.015 s' in verdict.reason
 
 
 def test_two_late_blocks_in_a_row():
-    follower = Follower(FS, 0.5)
+    clock = SampleClock(FS, 0.5)
     order = [block(0), block(300), block(100), block(200), block(400)]
-    assert kinds(follower, order) == ['start', 'gap', 'late', 'late', 'next']
+    assert kinds(clock, order) == ['start', 'gap', 'late', 'late', 'next']
 
 
 def test_the_same_stream_once_more_is_no_repetition():
-    follower = Follower(FS, 0.5)
+    clock = SampleClock(FS, 0.5)
     stream = [block(100 * k, value=0.0) for k in range(6)]
-    assert kinds(follower, stream) == ['start'] + ['next'] * 5
+    assert kinds(clock, stream) == ['start'] + ['next'] * 5
     # the first block might be a repetition; the second one shows that it was not
-    assert kinds(follower, stream) == ['repeat', 'start'] + ['next'] * 4
+    assert kinds(clock, stream) == ['repeat', 'start'] + ['next'] * 4
 
 
 def test_a_long_gap_is_a_new_stream():
-    follower = Follower(FS, 0.5)
-    verdicts = [follower.judge(b) for b in (block(0), block(10100))]
+    clock = SampleClock(FS, 0.5)
+    verdicts = [clock.judge(b) for b in (block(0), block(10100))]
     assert (verdicts[1].kind, verdicts[1].missing) == (Kind.GAP, 10000)
-    verdict = follower.judge(block(20201))
+    verdict = clock.judge(block(20201))
     assert (verdict.kind, verdict.missing) == (Kind.START, 10001)
 
 
-def test_after_silence_anything_is_new():
-    follower = Follower(FS, 0.5)
-    follower.judge(block(0))
-    follower.lose()
-    assert follower.head is None
-    assert kinds(follower, [block(100)]) == ['start']
+def test_a_small_jump_back_is_no_restart():
+    clock = SampleClock(FS, 0.5)
+    blocks = [block(100 * k) for k in range(30)]
+    assert kinds(clock, blocks)[-1] == 'next'
+    assert kinds(clock, [block(2500), block(2100)]) == ['late', 'late']
+    assert kinds(clock, [block(1000), block(1100)]) == ['start', 'next']
+
+
+def test_a_silence_and_an_end():
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(0))
+    clock.pause()
+    assert clock.head is None
+    assert kinds(clock, [block(100)]) == ['start']
+    clock.end()
+    assert kinds(clock, [block(500)]) == ['start']
 
 
 @pytest.mark.parametrize(
@@ -98,38 +108,84 @@ def test_after_silence_anything_is_new():
     ],
 )
 def test_stamps_off_the_clock(t, reason):
-    follower = Follower(FS, 0.5)
-    follower.judge(block(0))
-    verdict = follower.judge(Samples(t, np.zeros(t.size), 'x'))
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(0))
+    verdict = clock.judge(Samples(t, np.zeros(t.size), 'x'))
     assert verdict.kind is Kind.MALFORMED
     assert reason in verdict.reason
     # nothing of it stays
-    assert kinds(follower, [block(100)]) == ['next']
+    assert kinds(clock, [block(100)]) == ['next']
+
+
+def two():
+    return [b'A', b'B']
 
 
 @pytest.mark.parametrize('numbered', [True, False])
-@pytest.mark.parametrize('offset', [0, 100, 5000, 400000])
-def test_the_first_of_two_publishers_is_followed(numbered, offset):
-    follower = Follower(FS, 0.5)
-    follower.judge(block(4000), 41 if numbered else None, 2)
+@pytest.mark.parametrize('offset', [0, 20, 100, 5000, 400000])
+@pytest.mark.parametrize('ahead', [-34, 3, 4000])
+def test_a_live_stream_is_not_taken_by_a_second_publisher(numbered, offset, ahead):
+    clock = SampleClock(FS, 0.5)
+    # alone at first; the other one is there when it sends its first block
+    clock.judge(block(4000), 41 if numbered else None, lambda: [b'A'])
     for k in range(1, 30):
-        mine, other = (k + 41, k + 7) if numbered else (None, None)
-        assert follower.judge(block(4000 + 100 * k), mine, 2).kind is Kind.NEXT
-        if not (offset == 100 and not numbered):
-            verdict = follower.judge(block(4000 + 100 * k + offset), other, 2)
-            assert verdict.kind is Kind.SECOND
-    follower.lose()
-    assert follower.judge(block(0), 99, 2).kind is Kind.START
+        mine, other = (k + 41, k + 42 + ahead) if numbered else (None, None)
+        assert clock.judge(block(4000 + 100 * k), mine, two).kind is Kind.NEXT
+        if offset == 100 and not numbered:
+            continue  # the very next block of the stream: nothing could tell
+        foreign = block(4000 + 100 * k + offset)
+        assert clock.judge(foreign, other, two).kind is Kind.SECOND
+    clock.pause()
+    clock.end()
+    assert clock.judge(block(0), 9999, two).kind is Kind.START
 
 
-def test_the_followed_publisher_may_start_over_and_lose_blocks_beside_another():
-    follower = Follower(FS, 0.5)
-    follower.judge(block(500), 5, 2)
-    assert follower.judge(block(0), 6, 2).kind is Kind.START
-    assert follower.judge(block(300), 9, 2).kind is Kind.GAP
+def test_a_second_publisher_at_the_number_of_the_first_is_known_by_its_own_count():
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(0), 500, lambda: [b'A'])
+    for k in range(1, 60):
+        # it sends twice as many blocks, and overtakes
+        for j in (2 * k, 2 * k + 1):
+            verdict = clock.judge(block(30 + 100 * j), 450 + j, two)
+            assert verdict.kind is Kind.SECOND, k
+        assert clock.judge(block(100 * k), 500 + k, two).kind is Kind.NEXT
+
+
+def test_behind_a_silence_only_the_followed_publisher_comes_back():
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(0), 5, lambda: [b'A'])
+    clock.pause()
+    for numbers, ids in (((1, 2, 9), two), ((6, 7), lambda: [b'B'])):
+        for number in numbers:
+            assert clock.judge(block(100), number, ids).kind is Kind.SECOND
+    assert clock.judge(block(100), 6, two).kind is Kind.START
+    clock.pause()
+    assert clock.judge(block(300), 9, lambda: [b'A']).kind is Kind.START
+    clock.pause()
+    clock.end()
+    assert clock.judge(block(0), 3, lambda: [b'B']).kind is Kind.START
+    assert clock.judge(block(400), 10, two).kind is Kind.SECOND
+
+
+def test_where_the_followed_publisher_has_gone_nobody_goes_on_in_its_stead():
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(0), 5, lambda: [b'A'])
+    assert clock.judge(block(200), 7, lambda: [b'B']).kind is Kind.SECOND
+    # its own last block may still come
+    assert clock.judge(block(100), 6, lambda: [b'B']).kind is Kind.NEXT
+
+
+def test_a_loss_beside_a_second_publisher_ends_the_stream():
+    clock = SampleClock(FS, 0.5)
+    clock.judge(block(500), 5, two)
+    assert clock.judge(block(0), 6, two).kind is Kind.START
     # a message that held no block has a number all the same
-    follower.skip(10)
-    assert follower.judge(block(400), 11, 2).kind is Kind.NEXT
+    clock.skip(7)
+    assert clock.judge(block(100), 8, two).kind is Kind.NEXT
+    assert clock.judge(block(400), 11, two).kind is Kind.SECOND
+    # once it is alone again a loss is a gap
+    assert clock.judge(block(200), 9, lambda: [b'A']).kind is Kind.NEXT
+    assert clock.judge(block(500), 12, lambda: [b'A']).kind is Kind.GAP
 
 
 def test_a_clock_does_not_drift_but_slips_after_a_long_delay():
