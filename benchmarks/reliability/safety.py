@@ -12,7 +12,7 @@ Whatever arrives on `voltage`, for the voltage that is applied:
    into them at the slew; no two samples in a row are further apart than the slew allows;
 2. silence ends at rest exactly, and neither that ramp nor the one into a new stream that stands
    still is faster than `ramp_slew`; until then a second publisher moves nothing, at whatever time
-   and number its stream is;
+   and number its stream is, unless the first one is silent and has gone;
 3. how the command is cut into blocks changes no bit of it.
 
 A sequence is a drive as the stage node builds it, a `SampleClock` and a `Guard`, and some ten
@@ -262,7 +262,7 @@ class Publishers:
             self._send(other, (first + np.arange(values.size)) / self.rate, values, ids)
 
     def _send(self, name: bytes, t: Array, values: Array, ids: tuple[bytes, ...]) -> Kind:
-        drive, before = self.drive, self.drive.guard.applied
+        drive, before, silent = self.drive, self.drive.guard.applied, self.drive.clock.head is None
         self.numbers[name] += 1
         if name not in self.heard and self.followed not in (None, name):
             # the next number, from a publisher that was never heard, could be anybody's
@@ -272,6 +272,9 @@ class Publishers:
         kind = drive.block(Samples(t, values, 'x'), number, ids)
         if self.followed is None and kind is Kind.START:
             self.followed = name
+        elif self.followed not in (None, name) and self.followed not in ids and silent:
+            # the one that was followed is silent and has gone
+            self.followed = name if kind is Kind.START else self.followed
         elif self.followed not in (None, name):
             if kind not in (Kind.SECOND, Kind.MALFORMED):
                 raise Broken(f'a block of a second publisher is taken as {kind.value}')

@@ -1,19 +1,14 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
-"""
-When each block is due, and when it came, whoever sets the clock of the machine.
-
-The schedule is counted from its start, so that it cannot drift.
-"""
+"""When each block is due, and when it arrived, whatever happens to the clock of the machine."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import time
 
-__all__ = ['BlockClock', 'LogClock']
+__all__ = ['ArrivalClock', 'Schedule']
 
 #: a block this much behind its time is not caught up with: readers keep only so many blocks [s]
 SLIP = 0.25
@@ -21,16 +16,18 @@ SLIP = 0.25
 STEP = 500_000
 
 
-class BlockClock:
+class Schedule:
     """
-    The schedule of a stream.
+    The schedule of a stream, counted from its start so that it cannot drift.
 
     Parameters
     ----------
     speed : float
-        Samples a second; 0: everything is due at once.
+        Progress in a second: samples, or seconds of a recording.
     start : float
-        Time of the first sample, on any monotonic clock [s].
+        When position 0 is due, on a monotonic clock [s].
+    slip : float, optional
+        Delay from which on the rest of the schedule moves instead of being caught up with [s].
 
     Attributes
     ----------
@@ -43,38 +40,38 @@ class BlockClock:
 
     Examples
     --------
-    >>> clock = BlockClock(20000.0, start=10.0)
-    >>> clock.due(100)
+    >>> schedule = Schedule(20000.0, start=10.0)
+    >>> schedule.due(100)
     10.005
     """
 
-    def __init__(self, speed: float, start: float) -> None:
+    def __init__(self, speed: float, start: float, slip: float = SLIP) -> None:
         self.speed = speed
         self.start = start
-        self.sent = 0
-        self.late = 0
-        self.worst = 0.0
-        self.slipped = 0.0
+        self.slip = slip
+        self.sent = self.late = 0
+        self.worst = self.slipped = 0.0
 
-    def due(self, tick: int) -> float:
-        """Return when a sample is due."""
-        return self.start + tick / self.speed if self.speed else self.start
+    def due(self, position: float) -> float:
+        """Return when a position is due."""
+        return self.start + position / self.speed
 
-    def note(self, tick: int, size: int, now: float) -> None:
-        """Take note that a block was sent."""
+    def note(self, position: float, size: float, now: float) -> None:
+        """Take note that a block of this position and size is sent now."""
         self.sent += 1
-        if not self.speed:
-            return
-        delay = now - self.due(tick)
+        delay = now - self.due(position)
         self.worst = max(self.worst, delay)
-        if delay > size / self.speed:
-            self.late += 1
-        if delay > SLIP:
+        self.late += delay > size / self.speed
+        if delay > self.slip:
             self.start += delay
             self.slipped += delay
 
+    def change_speed(self, speed: float, position: float, now: float) -> None:
+        """Go on at another speed, with this position due now."""
+        self.speed, self.start = speed, now - position / speed
 
-class LogClock:
+
+class ArrivalClock:
     """
     Times of arrival that go on evenly when somebody sets the clock of the machine.
 
@@ -84,7 +81,7 @@ class LogClock:
     Parameters
     ----------
     wall, steady : callable, optional
-        The clock that may be set, in which arrivals are told, and one that cannot be [ns].
+        The clock that may be set, by which arrivals are stamped, and one that cannot be [ns].
 
     Attributes
     ----------
@@ -103,7 +100,7 @@ class LogClock:
         self._now = 0
 
     def look(self) -> None:
-        """Look whether the clock was set; to be called before what has come is stamped."""
+        """Look whether the clock was set; to be called before arrivals are stamped."""
         moved = self._measured() - self._offset
         self._before = self.set_by
         if abs(moved - self.set_by) > STEP:
@@ -111,16 +108,16 @@ class LogClock:
         self._now = self._steady() + self._offset
 
     def _measured(self) -> int:
-        found = []
+        readings = []
         # a pause between the readings would look like a step
         for _ in range(5):
             before, wall, after = self._steady(), self._wall(), self._steady()
-            found.append((after - before, wall - (before + after) // 2))
-        return min(found)[1]
+            readings.append((after - before, wall - (before + after) // 2))
+        return min(readings)[1]
 
     def stamp(self, arrival: int) -> int:
         """Return the log time of an arrival since the last look but one [ns]."""
-        # what came before the step was told by the clock as it was; nothing comes from the future
+        # before the step the old clock was in force; nothing comes from the future
         ways = (arrival - self.set_by, arrival - self._before)
         now = self._now
         return min(ways, key=lambda stamp: (stamp - now > 4 * STEP, abs(stamp - now)))

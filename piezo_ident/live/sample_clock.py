@@ -14,7 +14,8 @@ the count of its publisher, and which publishers there are.  So:
 - while the publisher that was there at the start is the only one, every message is its own;
 - beside another one only a message with the next number is its own, and only while no other
   publisher is known to be at that number; without numbers, only one with the next time;
-- behind a silence the publisher may come back, and no other one until `SampleClock.end`.
+- behind a silence the publisher may come back, and another one once the first has gone, or behind
+  `SampleClock.end`.
 """
 
 from __future__ import annotations
@@ -238,7 +239,8 @@ class SampleClock:
         if self._is_alone and (not ids or set(ids) == {self._owner}):
             return False
         if self._owner is not None and ids and self._owner not in ids:
-            return True
+            # it has gone; its last blocks may still be on their way
+            return not self._is_silent
         return not numbered or sequence is None or not self._is_next(sequence)
 
     def _start(
@@ -247,16 +249,18 @@ class SampleClock:
         sequence: int | None,
         publishers: Callable[[], Collection[Hashable]],
     ) -> None:
-        """Begin a stream; the publisher of one that has ended counts as another."""
-        if self.head is None and not self._is_silent:
-            before = self._sequence
-            if before is not None and sequence is not None and sequence != before + 1:
-                self._note_other(before)
-            if sequence is not None and sequence in self._others:
-                self._others.remove(sequence)
+        """Begin a stream, of the same publisher or of a new one."""
+        if self.head is None:
             ids = publishers()
-            self._is_alone = len(ids) < 2
-            self._owner = next(iter(ids)) if len(ids) == 1 else None
+            is_same = self._is_silent and (not ids or self._owner is None or self._owner in ids)
+            if not is_same:
+                before = self._sequence
+                if before is not None and sequence != before + 1:
+                    self._note_other(before)
+                if sequence in self._others:
+                    self._others.remove(sequence or 0)
+                self._is_alone = len(ids) < 2
+                self._owner = next(iter(ids)) if len(ids) == 1 else None
         self._is_silent = False
         self._forget()
         self._begin = tick

@@ -3,7 +3,7 @@
 
 
 """
-The excitation node: plays programmes on `voltage`.
+The excitation node: plays programs on `voltage`.
 
 Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every program; a
 block is sent when its first sample is due, counted from the first one.  `rate_factor` makes that
@@ -13,7 +13,7 @@ schedule faster or slower; nobody is waited for, and each listener reports what 
 and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
 A ramp runs in real time.
 
-Two programmes at once would tear the stage to and fro, so a second publisher on `voltage` is
+Two programs at once would tear the stage to and fro, so a second publisher on `voltage` is
 refused at the start, and reported when it comes later.  An excitation that was killed is seen by
 the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
 for that.  Before the first block this node therefore listens for half a second.
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.pacing import BlockClock
+from piezo_ident.live.pacing import Schedule, SLIP
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
@@ -46,6 +46,8 @@ __all__ = ['ExcitationNode', 'main']
 
 #: how long the ramp of a node that is ending may take [s]
 LAST_RAMP = 0.7
+#: most blocks that are sent at once after a delay
+CATCH_UP = 50
 #: how long to listen whether somebody else is playing [s]
 LISTEN = 0.5
 #: how long it may take to meet everybody who could be [s]
@@ -58,7 +60,7 @@ SETTLE = 0.1
 
 def read_program(text: str) -> Program:
     """
-    Return the programme that a parameter names or contains.
+    Return the program that a parameter names or contains.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def read_program(text: str) -> Program:
 
 @dataclass(eq=False)
 class Playing:
-    """One programme on its way, as the threads see it."""
+    """One program on its way, as the threads see it."""
 
     sequence: Sequence
     block_size: int
@@ -82,7 +84,7 @@ class Playing:
     tick: int = 0
     voltage: float | None = None
     heard_other: bool = False
-    clock: BlockClock | None = None
+    clock: Schedule | None = None
     work: float = 0.0
     segment: str = ''
 
@@ -92,7 +94,7 @@ class _Stopped(Exception):
 
 
 class ExcitationNode(LabNode):
-    """Plays the programme of its parameter `program`."""
+    """Plays the program of its parameter `program`."""
 
     executable = 'excitation'
 
@@ -107,21 +109,21 @@ class ExcitationNode(LabNode):
         self._guard_settings()
         self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
         self._born = time.monotonic()
-        self._ears: Any = None
+        self._listener: Any = None
         self.offer('start', self._start)
         self.offer('stop', self._stop)
 
     # parameters
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse programmes that cannot be played, and limits that are crossed."""
+        """Refuse programs that cannot be played, and limits that are crossed."""
         if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
             return None
         # while parameters are declared, those that come later are not there yet
         if not {'program', 'voltage_low', 'voltage_high', 'rest'} <= self.values.keys():
             return None
         if name != 'program' and self._is_playing():
-            return f'{name} cannot be changed while a programme is played; call ~/stop first'
+            return f'{name} cannot be changed while a program is played; call ~/stop first'
         try:
             self._guard_settings(self.wanted)
             self._build(self.wanted['program'], self.wanted)
@@ -160,12 +162,14 @@ class ExcitationNode(LabNode):
 
     def _start(self) -> str:
         if self._is_playing():
-            raise ConfigError('a programme is being played already; call ~/stop first')
+            raise ConfigError('a program is being played already; call ~/stop first')
         self._refuse_others()
         sequence = self._build(self.values['program'])
         playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
-        self._close_ears()
-        self._ears = self.create_subscription(Float64MultiArray, 'voltage', self._on_other, STREAM)
+        self._close_listener()
+        self._listener = self.create_subscription(
+            Float64MultiArray, 'voltage', self._on_other, STREAM
+        )
         self._playing = playing
         self._rate = (time.monotonic(), 0)
         self.report_status('waiting', 0.0, 'waiting for subscribers')
@@ -196,14 +200,14 @@ class ExcitationNode(LabNode):
         for name in self._other_publishers():
             raise ConfigError(
                 f'{name} publishes on {self._voltage.topic_name} too; end it first: '
-                'two programmes at once would tear the stage to and fro'
+                'two programs at once would tear the stage to and fro'
             )
 
-    def _close_ears(self) -> None:
-        # they would hear every block that we send ourselves
-        if self._ears is not None:
-            self.destroy_subscription(self._ears)
-            self._ears = None
+    def _close_listener(self) -> None:
+        # it would get every block that this node sends
+        if self._listener is not None:
+            self.destroy_subscription(self._listener)
+            self._listener = None
 
     def _on_other(self, _: Float64MultiArray) -> None:
         playing = self._playing
@@ -227,7 +231,7 @@ class ExcitationNode(LabNode):
 
     def _await_graph(self, playing: Playing) -> None:
         limit, needed = self.values['wait_limit'], self.values['subscribers']
-        self._await_ears(playing)
+        self._await_publishers(playing)
         begin = time.monotonic()
         self._sleep(playing, begin + LISTEN)
         self._refuse_others()
@@ -237,7 +241,7 @@ class ExcitationNode(LabNode):
                     f'another {self.get_fully_qualified_name()} is playing on '
                     f'{self._voltage.topic_name}; end it first'
                 )
-            # without our own ears
+            # without our own listener
             found = self._voltage.get_subscription_count() - 1
             if found >= needed:
                 break
@@ -247,18 +251,18 @@ class ExcitationNode(LabNode):
                     f'{limit:g} s; start the stage, or set subscribers or wait_limit'
                 )
             self._sleep(playing, time.monotonic() + 0.02)
-        between_turns(self, self._close_ears)
+        between_turns(self, self._close_listener)
         self._sleep(playing, time.monotonic() + SETTLE)
 
-    def _await_ears(self, playing: Playing) -> None:
-        """Wait until every publisher has been met: silence before says nothing."""
+    def _await_publishers(self, playing: Playing) -> None:
+        """Wait until every publisher is matched: silence before says nothing."""
         # a node that has just come up does not even know of them
         self._sleep(playing, self._born + YOUTH)
         give_up = time.monotonic() + MEET
         while time.monotonic() < give_up:
-            ears = self._ears
+            listener = self._listener
             known = self.count_publishers(self._voltage.topic_name)
-            if ears is None or ears.get_publisher_count() >= known:
+            if listener is None or listener.get_publisher_count() >= known:
                 return
             self._sleep(playing, time.monotonic() + 0.02)
 
@@ -268,7 +272,10 @@ class ExcitationNode(LabNode):
 
     def _play(self, playing: Playing) -> None:
         sequence = playing.sequence
-        clock = BlockClock(playing.factor * sequence.sample_rate, time.monotonic())
+        speed = playing.factor * sequence.sample_rate
+        # what is caught up with at once must fit into the queues of the readers
+        slip = min(SLIP, CATCH_UP * playing.block_size / speed)
+        clock = Schedule(speed, time.monotonic(), slip)
         playing.clock = clock
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
             self._sleep(playing, clock.due(start))
@@ -304,8 +311,8 @@ class ExcitationNode(LabNode):
     def _send_ramp(self, playing: Playing, guard: Guard) -> None:
         settings = guard.settings
         hurried, origin = False, playing.tick
-        clock = playing.clock = BlockClock(settings.sample_rate, time.monotonic())
-        # short blocks even where those of the programme are long: the end must not wait
+        clock = playing.clock = Schedule(settings.sample_rate, time.monotonic())
+        # short blocks even where those of the program are long: the end must not wait
         size = min(playing.block_size, max(1, round(0.005 * settings.sample_rate)))
         while not guard.is_at_rest:
             if playing.hurry and not hurried:
@@ -322,7 +329,7 @@ class ExcitationNode(LabNode):
         """Return rate, blocks, delays and head-room; watch for a second publisher."""
         playing = self._playing
         if not self._is_playing():
-            self._close_ears()
+            self._close_listener()
         foreign = self._other_publishers()
         self._second = f'second publisher {foreign[0]} on voltage' if foreign else ''
         values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
@@ -337,7 +344,7 @@ class ExcitationNode(LabNode):
             'segment': playing.segment,
         }
         if clock is not None:
-            period = playing.block_size / clock.speed if clock.speed else math.inf
+            period = playing.block_size / clock.speed
             values |= {
                 'blocks': clock.sent,
                 'late': clock.late,

@@ -221,8 +221,8 @@ class LabNode(Node):
 
         self.create_service(Trigger, f'~/{name}', answer, qos_profile=SERVICE)
 
-    def _said(self, error: Exception) -> str:
-        """Return the reason why a thread ended; what nobody expected goes to the log too."""
+    def reason(self, error: Exception) -> str:
+        """Return the reason why a thread ended; an unexpected one goes to the log too."""
         if isinstance(error, PiezoIdentError):
             return str(error)
         _report(self, error, 'its work ends')

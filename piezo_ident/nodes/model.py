@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import functools
+from pathlib import Path
+import queue
 import threading
 import time
 from typing import Any
@@ -28,6 +30,8 @@ from std_msgs.msg import Float64MultiArray, String
 __all__ = ['ModelNode', 'main']
 
 QUANTITIES = ('displacement', 'prediction', 'residual')
+#: where a model comes from, and what reads it
+Wish = tuple[str, Callable[[], StageModel]]
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4
 
@@ -38,7 +42,6 @@ class ModelNode(LabNode):
     executable = 'model'
 
     def __init__(self, **kwargs: Any) -> None:
-        self._files: dict[str, StageModel] = {}
         super().__init__(**kwargs)
         warm_up()
         self._predictor, self._matcher = Predictor(), Matcher()
@@ -49,15 +52,17 @@ class ModelNode(LabNode):
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
         self._models = 0
-        self._texts: list[str] = []
-        self._parsed: list[tuple[StageModel | None, str]] = []
-        self._parsing: threading.Thread | None = None
-        self._wake = self.create_guard_condition(self._take_parsed)
+        # models are read and compiled by a thread, the newest wish last
+        self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
+        self._loaded: queue.SimpleQueue[tuple[StageModel | None, str]] = queue.SimpleQueue()
+        self._loader: threading.Thread | None = None
+        self._wake = self.create_guard_condition(self._take_loaded)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
-        if self.values['model']:
-            self._use(self._files.pop(self.values['model']), self.values['model'])
+        if path := self.values['model']:
+            # at the start nothing waits, and a bad file ends the node
+            self._use(_tried(load(path)), path)
         self.create_subscription(String, 'model', self._on_model, LATCHED)
         for topic, take in (('voltage', self._voltage), ('displacement', self._displacement)):
             on_message = functools.partial(self._on_block, topic, take)
@@ -67,58 +72,51 @@ class ModelNode(LabNode):
     # models
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse a model file that cannot be used."""
-        if name == 'model' and value:
-            try:
-                self._files = {value: _tried(load(value))}
-            except PiezoIdentError as error:
-                return str(error)
+        """Refuse a model file that is not there; what is wrong inside is in ``~/status``."""
+        if name == 'model' and value and not Path(value).is_file():
+            return f'{value}: no such model file'
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, or another window."""
-        if changed.get('model'):
-            self._use(self._files.pop(changed['model']), changed['model'])
-            self._tell()
+        if path := changed.get('model'):
+            self._load(path, lambda: load(path))
         if 'window' in changed:
             self._error.window = changed['window']
 
     def _on_model(self, message: String) -> None:
-        # reading YAML takes longer than a block: it is done in a thread, the swap here
-        self._texts = [message.data]
-        if self._parsing is None:
-            self._parse()
+        text, name = message.data, 'topic model'
+        self._load(name, lambda: model_from_dict(parse_yaml(text, name), name))
 
-    def _parse(self) -> None:
-        text = self._texts.pop()
+    def _load(self, source: str, read: Callable[[], StageModel]) -> None:
+        # reading YAML and compiling take longer than a block: only the swap is done here
+        self._wishes.put((source, read))
+        if self._loader is None:
+            self._loader = threading.Thread(target=self._load_all, name='load', daemon=True)
+            self._loader.start()
 
-        def work() -> None:
+    def _load_all(self) -> None:
+        while True:
+            source, read = self._wishes.get()
+            while not self._wishes.empty():
+                source, read = self._wishes.get()
             try:
-                model = _tried(model_from_dict(parse_yaml(text, 'topic model'), 'topic model'))
-                self._parsed.append((model, ''))
+                self._loaded.put((_tried(read()), source))
             except PiezoIdentError as error:
-                self._parsed.append((None, ' '.join(str(error).split())))
-            # a text from outside must not end the node, whatever it trips over
+                self._loaded.put((None, ' '.join(str(error).split())))
+            # a file or text from outside must not end the node, whatever is in it
             except Exception as error:  # noqa: BLE001
-                self._parsed.append((None, f'topic model: {type(error).__name__}: {error}'))
+                self._loaded.put((None, f'{source}: {type(error).__name__}: {error}'))
             self._wake.trigger()
 
-        self._parsing = threading.Thread(target=work, name='parse', daemon=True)
-        self._parsing.start()
-
-    def _take_parsed(self) -> None:
-        if self._parsing is None or not self._parsed:
-            return
-        self._parsing.join()
-        self._parsing = None
-        model, reason = self._parsed.pop()
-        if model is None:
-            self._refuse_model(reason)
-        else:
-            self._use(model, 'topic model')
+    def _take_loaded(self) -> None:
+        while not self._loaded.empty():
+            model, source = self._loaded.get()
+            if model is None:
+                self._refuse_model(source)
+            else:
+                self._use(model, source)
         self._tell()
-        if self._texts:
-            self._parse()
 
     def _use(self, model: StageModel, source: str) -> None:
         try:

@@ -14,30 +14,32 @@ nobody is waited for; each listener reports what it lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 import threading
 import time
 from typing import Any
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.replay import chosen_topics, ReplayClock
+from piezo_ident.live.pacing import Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.read import opened_bag
 from piezo_ident.record.bags.recover import Bag, Stored
+from piezo_ident.record.bags.samples import carried_quantities, is_computed
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
-__all__ = ['PlayerNode', 'main']
+__all__ = ['PlayerNode', 'chosen_topics', 'main']
 
-#: how long a start may take before it is answered [s]
+#: how long the end of the node waits for the replay to end [s]
 PATIENCE = 1.5
 #: between the match of the subscribers and the first message, for them to know of it too [s]
 SETTLE = 0.2
-#: how often progress is told [s]
-TELL = 0.25
+#: how often progress is reported [s]
+REPORT_EVERY = 0.25
 
 
 class _Stopped(Exception):
@@ -50,9 +52,7 @@ class Replay:
 
     bag: str
     topics: tuple[str, ...]
-    ready: threading.Event = field(default_factory=threading.Event)
     stop: threading.Event = field(default_factory=threading.Event)
-    refusal: str = ''
     failure: str = ''
     messages: int = 0
     total: int = 0
@@ -85,29 +85,28 @@ class PlayerNode(LabNode):
 
     def start(self) -> str:
         """
-        Replay the bag from its beginning, also when it is being replayed.
+        Replay the bag from its beginning, also when it is being replayed; see ``~/status``.
 
         Raises
         ------
         PiezoIdentError
-            When there is no such bag, or it cannot be replayed.
+            When no bag is named, or there is none.
         """
-        if not self.values['bag']:
+        bag = self.values['bag']
+        if not bag:
             raise PiezoIdentError('no bag is named; set the parameter bag')
-        self._halt()
-        replay = Replay(self.values['bag'], tuple(self.values['topics']))
+        if not Path(bag).exists():
+            raise PiezoIdentError(f'{bag} does not exist; set the parameter bag')
+        before, replay = self._replay, Replay(bag, tuple(self.values['topics']))
+        if before is not None:
+            before.stop.set()
         # a daemon: while a large bag is looked through nothing is lost by an end
         replay.thread = threading.Thread(
-            target=self._work, args=(replay,), name='replay', daemon=True
+            target=self._work, args=(replay, before), name='replay', daemon=True
         )
         self._replay = replay
         replay.thread.start()
-        replay.ready.wait(PATIENCE)
-        if replay.refusal:
-            raise PiezoIdentError(replay.refusal)
-        if not replay.ready.is_set():
-            return f'looking through {replay.bag}, which was not finished'
-        return f'replaying {replay.names} of {replay.bag}: {replay.total} messages'
+        return f'replaying {bag}; see ~/status'
 
     def stop(self) -> str:
         """
@@ -126,9 +125,6 @@ class PlayerNode(LabNode):
 
     def close(self) -> None:
         """End the replay before the node ends."""
-        self._halt()
-
-    def _halt(self) -> None:
         replay = self._replay
         if replay is not None and replay.thread is not None:
             replay.stop.set()
@@ -142,42 +138,39 @@ class PlayerNode(LabNode):
         self._last_count = (now, messages)
         rate = max(0, messages - before) / max(now - then, 1e-3)
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
-        if replay is not None and (replay.failure or replay.refusal):
-            return ERROR, replay.failure or replay.refusal, values
+        if replay is not None and replay.failure:
+            return ERROR, replay.failure, values
         if replay is not None and replay.slipped > 0.1:
             return WARN, f'slower than asked by {replay.slipped:.1f} s; lower the rate', values
         return OK, 'ready', values
 
     # the replay, in a thread of its own
 
-    def _work(self, replay: Replay) -> None:
+    def _work(self, replay: Replay, before: Replay | None) -> None:
+        if before is not None and before.thread is not None:
+            before.thread.join()
+        prepared = False
         try:
             with opened_bag(replay.bag) as bag:
                 chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
                 senders = self._prepared(bag, chosen)
                 replay.names = ', '.join(chosen.values())
                 replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
-                replay.ready.set()
+                prepared = True
                 self._await_subscribers(replay, senders)
-                clock = self._send(replay, bag, senders)
-                self._report_end(replay, bag, clock)
+                schedule = self._send(replay, bag, senders)
+                self._report_end(replay, bag, schedule)
         except _Stopped:
             self._report(
                 'stopped',
                 f'stopped after {replay.messages} of {replay.total} messages',
                 progress=replay.progress,
             )
-        # nobody would hear of a thread that ends by itself
+        # nobody else hears of a thread that ends by itself
         except Exception as error:  # noqa: BLE001
-            reason = self._said(error)
-            if not replay.ready.is_set():
-                replay.refusal = reason
-                self._report('refused', reason, ERROR)
-            else:
-                replay.failure = reason
-                self._report('failed', reason, ERROR, replay.progress)
-        finally:
-            replay.ready.set()
+            replay.failure = self.reason(error)
+            state = 'failed' if prepared else 'refused'
+            self._report(state, replay.failure, ERROR, replay.progress)
 
     def _prepared(self, bag: Bag, chosen: Mapping[str, str]) -> dict[str, Any]:
         """Return the publisher of each chosen topic of the bag."""
@@ -229,36 +222,35 @@ class PlayerNode(LabNode):
         if need:
             self._pause(replay, SETTLE)
 
-    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> ReplayClock:
+    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> Schedule:
         """Send every message when it is due."""
-        rate = self.values['rate']
-        clock: ReplayClock | None = None
-        first, told = 0, float('-inf')
+        schedule, first, reported = None, 0, float('-inf')
         for connection, stamp, raw in self._chosen(bag, senders):
-            now = time.monotonic()
-            if clock is None:
-                clock, first = ReplayClock(rate, stamp, now), stamp
-            elif self.values['rate'] != clock.rate:
-                clock.change_rate(self.values['rate'], stamp, now)
-            clock.note(stamp, now)
-            # in short waits, so that a pause in the recording neither hides a stop nor the status
+            now, rate = time.monotonic(), self.values['rate']
+            if schedule is None:
+                # what is caught up with at once must fit into the queues of the readers
+                schedule, first = Schedule(rate, now, SLIP / max(1.0, rate)), stamp
+            position = (stamp - first) * 1e-9
+            if rate != schedule.speed:
+                schedule.change_speed(rate, position, now)
+            # in short waits: a pause in the recording delays neither a stop nor the status
             while True:
-                if now - told > TELL:
-                    told = now
+                if now - reported > REPORT_EVERY:
+                    reported = now
                     self._report('playing', f'replaying {replay.names}', OK, replay.progress)
-                ahead = clock.due(stamp) - now
-                if replay.stop.is_set() or ahead > 0:
-                    self._pause(replay, min(max(ahead, 0.0), TELL))
-                if ahead <= TELL:
-                    break
+                ahead = schedule.due(position) - now
+                self._pause(replay, min(max(ahead, 0.0), REPORT_EVERY))
                 now = time.monotonic()
+                if ahead <= REPORT_EVERY:
+                    break
             senders[connection.topic].publish(raw)
+            schedule.note(position, 0.0, now)
             replay.messages += 1
-            replay.slipped = clock.slipped
+            replay.slipped = schedule.slipped
             replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)
-        if clock is None:
+        if schedule is None:
             raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
-        return clock
+        return schedule
 
     def _chosen(self, bag: Bag, senders: Mapping[str, Any]) -> Iterator[Stored]:
         return bag.messages([c for c in bag.connections if c.topic in senders])
@@ -267,16 +259,16 @@ class PlayerNode(LabNode):
         if replay.stop.wait(seconds):
             raise _Stopped
 
-    def _report_end(self, replay: Replay, bag: Bag, clock: ReplayClock) -> None:
+    def _report_end(self, replay: Replay, bag: Bag, schedule: Schedule) -> None:
         about = f'replayed {replay.messages} messages of {replay.bag}'
-        if clock.slipped > 0.1:
-            about += f', {clock.slipped:.1f} s slower than asked'
+        if schedule.slipped > 0.1:
+            about += f', {schedule.slipped:.1f} s slower than asked'
         faults = '; '.join(str(f) for f in bag.faults)
         early = f'the bag ends early: {faults}' if faults else ''
         level = WARN if early else OK
         self._report('done', '; '.join(filter(None, [about, early])), level, 100.0)
 
-    # what is told
+    # reports
 
     def _numbers(self) -> Mapping[str, object]:
         replay = self._replay or Replay('', ())
@@ -289,6 +281,66 @@ class PlayerNode(LabNode):
 
     def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
         self.report_status(state, progress, message, level, **self._numbers())
+
+
+def chosen_topics(
+    bag: Bag, wanted: Sequence[str], resolve: Callable[[str], str]
+) -> dict[str, str]:
+    """
+    Return under which name each chosen topic of a bag is replayed.
+
+    A topic is found by its full name here, else by the end of its name, so that what was recorded
+    in one namespace can be replayed in another, else by the quantity that its blocks carry.
+
+    Parameters
+    ----------
+    bag : Bag
+        An open bag.
+    wanted : sequence of str
+        Names of topics, relative or absolute.
+    resolve : callable
+        Gives the full name of a topic, by namespace and remaps.
+
+    Returns
+    -------
+    dict of str to str
+        Full name here by the name in the bag.
+
+    Raises
+    ------
+    DataError
+        When a topic is not in the bag, or more than one could be meant.
+    """
+    topics = sorted({c.topic for c in bag.connections})
+    chosen: dict[str, str] = {}
+    for name in wanted:
+        target = resolve(name)
+        matches = [t for t in topics if t == target]
+        if not matches and not name.startswith(('/', '~')):
+            matches = [t for t in topics if t.endswith(f'/{name}')]
+            if not matches and '/' not in name:
+                carried = _carried(bag).items()
+                matches = [t for t, q in carried if q == name and not is_computed(t)]
+        if not matches:
+            raise DataError(
+                f'{bag.path}: no topic {name} in it; set topics to some of: '
+                + (', '.join(topics) or 'none')
+            )
+        if len(matches) > 1:
+            raise DataError(
+                f'{bag.path}: several topics could be {name}: {", ".join(matches)}; start the '
+                'player in the namespace of one of them'
+            )
+        if chosen.setdefault(matches[0], target) != target:
+            raise DataError(f'{bag.path}: {matches[0]} would be replayed twice; name it once')
+    return chosen
+
+
+def _carried(bag: Bag) -> dict[str, str]:
+    try:
+        return carried_quantities(bag)
+    except DataError:
+        return {}  # no samples in it: then by name alone
 
 
 def _profile(connection: Connection) -> QoSProfile:

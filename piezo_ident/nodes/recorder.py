@@ -35,8 +35,6 @@ __all__ = ['RecorderNode', 'main']
 POLL = 0.02
 #: how often publishers are looked for [s]
 LOOK = 0.1
-#: how long a start may take before it is answered [s]
-PATIENCE = 1.5
 #: how long a bag may take to be closed before the node ends anyway, as ros2 launch has it [s]
 END = 4.0
 #: how long the subscriptions may take to meet the publishers that are there [s]
@@ -49,7 +47,6 @@ class Recording:
 
     output: str
     started: float = field(default_factory=time.monotonic)
-    opened: threading.Event = field(default_factory=threading.Event)
     ready: threading.Event = field(default_factory=threading.Event)
     end: threading.Event = field(default_factory=threading.Event)
     over: threading.Event = field(default_factory=threading.Event)
@@ -89,28 +86,24 @@ class RecorderNode(LabNode):
 
     def start(self) -> str:
         """
-        Open a bag and record.
+        Open a bag and record; ``~/status`` says when all publishers are matched.
 
         Raises
         ------
         PiezoIdentError
-            When a recording is on its way, or the bag cannot be made.
+            When a recording is on its way.
         """
         if self._is_recording():
-            raise PiezoIdentError('recording already; call stop first')
+            raise PiezoIdentError('recording already; call stop, and wait until it is done')
         recording = Recording(self.values['output'])
         topics = dict.fromkeys(self.resolve_topic_name(t) for t in self.values['topics'])
-        subscriptions = self._inputs = RawSubscriptions(self, topics)
+        self._inputs = RawSubscriptions(self, topics)
+        self._recording = recording
         self._thread = threading.Thread(
-            target=self._work, args=(recording, subscriptions), name='recording'
+            target=self._work, args=(recording, self._inputs), name='recording'
         )
         self._thread.start()
-        recording.opened.wait(PATIENCE)
-        if recording.failure:
-            raise PiezoIdentError(recording.failure)
-        self._recording = recording
-        self._look()
-        return f'recording to {recording.path}' if recording.path else 'opening the bag'
+        return f'recording to {recording.output}; see ~/status'
 
     def stop(self) -> str:
         """
@@ -125,7 +118,7 @@ class RecorderNode(LabNode):
         if recording is None or not self._is_recording():
             raise PiezoIdentError('not recording; call start first')
         recording.end.set()
-        return f'closing {recording.path}'
+        return f'closing {recording.path or recording.output}; see ~/status'
 
     def close(self) -> None:
         """Close the bag before the node ends."""
@@ -176,43 +169,36 @@ class RecorderNode(LabNode):
             )
         # nobody would hear of a thread that ends by itself
         except Exception as error:  # noqa: BLE001
-            self._give_up(recording, subscriptions, self._said(error))
+            self._end(recording, subscriptions, self.reason(error))
             return
         recording.path = str(writer.path)
-        recording.opened.set()
         failure = ''
         try:
             self._record(recording, subscriptions, writer)
             writer.close()
         except Exception as error:  # noqa: BLE001
-            failure = self._said(error)
-        recording.failure, recording.size = failure, writer.size
-        recording.end.set()
-        recording.over.set()
-        if failure:
+            failure = self.reason(error)
             writer.abort()
-            self._report('failed', failure, ERROR)
-        else:
+        recording.size = writer.size
+        self._end(recording, subscriptions, failure)
+        if not failure:
             parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
             about = f'{writer.messages} messages in {writer.path}{parts}'
             self._report('done', about, progress=100.0)
-        subscriptions.close()
 
-    def _give_up(self, recording: Recording, subscriptions: RawSubscriptions, reason: str) -> None:
-        recording.failure = reason
+    def _end(self, recording: Recording, subscriptions: RawSubscriptions, failure: str) -> None:
+        recording.failure = failure
         recording.end.set()
         recording.over.set()
-        recording.opened.set()
+        if failure:
+            self._report('failed', failure, ERROR)
         subscriptions.close()
-        # the call that asked for it has been answered by then
-        if time.monotonic() - recording.started > PATIENCE:
-            self._report('failed', reason, ERROR)
 
     def _record(
         self, recording: Recording, subscriptions: RawSubscriptions, writer: BagWriter
     ) -> None:
         flushed = time.monotonic()
-        last = told = False
+        last = reported = False
         while not last:
             # once more after the end was asked for: what has arrived by then is kept
             last = recording.end.wait(POLL)
@@ -228,13 +214,13 @@ class RecorderNode(LabNode):
                 writer.flush()
                 flushed = now
                 recording.size, recording.path = writer.size, str(writer.path)
-            if recording.ready.is_set() and (due or not told) and not last:
-                told = True
+            if recording.ready.is_set() and (due or not reported) and not last:
+                reported = True
                 problems = subscriptions.problems
                 about = problems or f'recording to {writer.path}'
                 self._report('recording', about, WARN if problems else OK)
 
-    # what is told
+    # reports
 
     def _is_recording(self) -> bool:
         return self._recording is not None and not self._recording.over.is_set()

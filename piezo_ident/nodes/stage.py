@@ -30,10 +30,9 @@ a ramp | |
 | t jumps back otherwise | the block is refused: its time has passed | WARN |
 | limits or rest that are moved in silence | ramp to rest, back into the limits at the slew | |
 | no block for `silence` | ramp to rest in real time, on `applied_voltage` as `ramp:silence`, t \
-going on; until rest only the same publisher may come back, with a new stream | WARN, unless it \
-was at rest |
+going on; what comes next is a new stream | WARN, unless it was at rest |
 | a second publisher | its blocks are refused until the stream of the first has ended: silent, \
-and at rest | WARN |
+and its publisher gone or the stage at rest | WARN |
 
 `piezo_ident.live.sample_clock` says how publishers are told apart.  Beside a second publisher a
 loss of blocks ends the stream, since the block behind the loss could be anybody's.

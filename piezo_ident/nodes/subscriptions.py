@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.live.pacing import LogClock
+from piezo_ident.live.pacing import ArrivalClock
 from piezo_ident.nodes.wire import LATCHED, LATCHED_TOPICS, SAMPLE_TOPICS, STREAM
 from piezo_ident.record.bags.write import knows_type
 from piezo_ident.record.stream import LossCount
@@ -214,7 +214,7 @@ class RawSubscriptions:
         self._group = _NotSpun()
         self._lock = threading.Lock()
         self._closed = False
-        self._clock = LogClock()
+        self._clock = ArrivalClock()
 
     @property
     def lost(self) -> int:

@@ -149,6 +149,6 @@ def test_it_ends_at_rest(lab, number):
 
 def test_the_page_shows_this_file():
     page = (ROOT / 'docs/driver.md').read_text(encoding='utf-8')
-    code = EXAMPLE.read_text(encoding='utf-8').partition('limitations under the License.\n')[2]
+    code = EXAMPLE.read_text(encoding='utf-8').partition('Apache-2.0\n')[2]
     shown = page.partition('```python\n')[2].partition('```')[0]
     assert shown.strip() == code.strip()

@@ -113,8 +113,7 @@ def test_replay(lab, tmp_path):
         """Replay it, and return when each block of voltage came, and what the clock slipped."""
         first = len(voltage)
         status = replay(lab, 'b/player')
-        assert '/b/voltage, /b/displacement' in status['answer']
-        assert f'{messages} messages' in status['answer']
+        assert status['answer'].startswith('replaying ')
         assert (status['messages'], status['progress']) == (messages, '100')
         for blocks in (voltage, displacement):
             lab.wait(lambda b=blocks: len(b) >= first + 200, 'all blocks')
@@ -173,21 +172,18 @@ def test_refusals_and_waiting(lab, tmp_path):
     bag(tmp_path / 'bag', 20)
     (tmp_path / 'garbage.mcap').write_bytes(b'no bag at all' * 100)
     assert lab.call('c/player/start') == (False, 'no bag is named; set the parameter bag')
+    assert lab.set('c/player', 'bag', str(tmp_path / 'nowhere'))[0]
+    ok, message = lab.call('c/player/start')
+    assert not ok and 'does not exist' in message
+    assert lab.set('c/player', 'topics', ['voltage', 'temperature'])[0]
     for name, reason in (
-        ('nowhere', 'does not exist'),
         ('garbage.mcap', 'damaged or unfinished bag'),
+        ('bag', 'no topic temperature in it; set topics to some of: /displacement'),
     ):
         assert lab.set('c/player', 'bag', str(tmp_path / name))[0]
-        ok, message = lab.call('c/player/start')
-        assert not ok
-        assert reason in message
+        assert lab.call('c/player/start')[0]
         lab.wait(lambda r=reason: r in lab.status('c/player')['message'], reason)
         assert lab.status('c/player')['state'] == 'refused'
-    assert lab.set('c/player', 'bag', str(tmp_path / 'bag'))[0]
-    assert lab.set('c/player', 'topics', ['voltage', 'temperature'])[0]
-    ok, message = lab.call('c/player/start')
-    assert not ok
-    assert 'no topic temperature in it; set topics to some of: /displacement' in message
     ok, reason = lab.set('c/player', 'topics', ['a b'])
     assert not ok
     assert 'no name of a topic' in reason

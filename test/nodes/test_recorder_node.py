@@ -110,7 +110,8 @@ def test_record_stop_and_refusals(tmp_path):
         assert g.call('a/recorder/stop') == (False, 'not recording; call start first')
         path = start(g, tmp_path, 'a/recorder')
         assert path == str(tmp_path / 'bag')
-        assert g.call('a/recorder/start') == (False, 'recording already; call stop first')
+        ok, message = g.call('a/recorder/start')
+        assert not ok and 'recording already' in message
         assert 'read-only' in g.set('a/recorder', 'storage', 'sqlite3')[1]
         assert not g.set('a/recorder', 'output', '')[0]
         assert not g.set('a/recorder', 'flush', 5.0)[0]
@@ -124,7 +125,7 @@ def test_record_stop_and_refusals(tmp_path):
         source.has_arrived()
         seen = int(g.status('a/recorder')['messages'])
         ok, message = g.call('a/recorder/stop')
-        assert (ok, message) == (True, f'closing {path}')
+        assert ok and f'closing {path}' in message
         g.wait(lambda: g.status('a/recorder')['state'] == 'done', 'closed bag')
         status = g.status('a/recorder')
         assert status['lost'] == '0'

