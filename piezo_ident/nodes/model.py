@@ -56,6 +56,7 @@ class ModelNode(LabNode):
         self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
         self._loaded: queue.SimpleQueue[tuple[StageModel | None, str]] = queue.SimpleQueue()
         self._loader: threading.Thread | None = None
+        self._is_ending = False
         self._wake = self.create_guard_condition(self._take_loaded)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
@@ -107,6 +108,8 @@ class ModelNode(LabNode):
             # a file or text from outside must not end the node, whatever is in it
             except Exception as error:  # noqa: BLE001
                 self._loaded.put((None, f'{source}: {type(error).__name__}: {error}'))
+            if self._is_ending:
+                return
             self._wake.trigger()
 
     def _take_loaded(self) -> None:
@@ -268,6 +271,10 @@ class ModelNode(LabNode):
                 said.append(f'the voltage leaves the identified range by {-room:.3g} V')
         message = '; '.join(filter(None, said))
         return (WARN, message, values) if message else (OK, 'predicting', values)
+
+    def close(self) -> None:
+        """Wake nobody any more."""
+        self._is_ending = True
 
 
 def _tried(model: StageModel) -> StageModel:

@@ -26,9 +26,8 @@ from piezo_ident.live.pacing import Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.record.bags.read import opened_bag
+from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
 from piezo_ident.record.bags.recover import Bag, Stored
-from piezo_ident.record.bags.samples import carried_quantities, is_computed
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 

@@ -7,11 +7,12 @@ import time
 
 import pytest
 
-rclpy = pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
+pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.nodes import model, player, recorder
 from processes import take_domain
+import rclpy
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
