@@ -3,6 +3,7 @@
 
 """Services and parameters answer at once, however long the work behind them takes."""
 
+import threading
 import time
 
 import pytest
@@ -21,14 +22,18 @@ from rclpy.signals import SignalHandlerOptions
 WORK, AT_ONCE = 3.0, 1.0
 
 
+RELEASE = threading.Event()
+
+
 def slow(*_: object) -> None:
-    time.sleep(WORK)
+    RELEASE.wait(WORK)
     raise DataError('it took long')
 
 
 @pytest.fixture
 def made(tmp_path):
     """Return a function that makes a node in this process."""
+    RELEASE.clear()
     domain, lock = take_domain()
     context, nodes = Context(), []
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
@@ -39,6 +44,10 @@ def made(tmp_path):
         return nodes[-1]
 
     yield make
+    RELEASE.set()
+    for thread in threading.enumerate():
+        if thread.name in ('replay', 'recording'):
+            thread.join()
     for node in nodes:
         node.close()
         node.destroy_node()
