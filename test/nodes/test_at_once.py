@@ -71,7 +71,7 @@ def test_a_bag_that_is_slow_to_open_is_replayed_later(made, monkeypatch, tmp_pat
 
 
 def test_a_bag_that_is_slow_to_make_and_to_close(made, monkeypatch, tmp_path):
-    monkeypatch.setattr(recorder, 'PartWriter', slow)
+    monkeypatch.setattr(recorder, 'BagWriter', slow)
     node = made(recorder.RecorderNode, output=str(tmp_path / 'bag'))
     assert seconds(node.start) < AT_ONCE
     assert seconds(node.stop) < AT_ONCE
