@@ -11,7 +11,7 @@ Excitation, stage, identifier, model and recorder run as processes of their own;
 observes.  First the stage is identified, so that there is a model.  Then a sine is played at
 20 kHz in blocks of 5 ms; after two fifths of the time the identifier is asked to identify again
 and again.  The delay of a prediction is that from the receipt of a block of voltage to the receipt
-of the prediction with the same t, both by the middleware of this process.  Last, programmes are
+of the prediction with the same t, both by the middleware of this process.  Last, programs are
 played faster than real time.
 """
 
@@ -49,7 +49,7 @@ FACTORS = (1.5, 2.0, 3.0, 4.0)
 
 @dataclass
 class Seen:
-    """What the observer has seen of one programme."""
+    """What the observer has seen of one program."""
 
     arrivals: dict[str, dict[float, int]] = field(
         default_factory=lambda: {topic: {} for topic in STREAMS}
@@ -182,7 +182,7 @@ def delays(seen: Seen) -> dict[str, np.ndarray]:
 
 
 def sine(seconds: float) -> str:
-    """Return a programme."""
+    """Return a program."""
     return (
         f'limits: [0, 10]\nsample_rate: {RATE}\nsegments:\n'
         f'  - {{signal: sine, bias: 5, amplitude: 4.5, frequency: 7, duration: {seconds:g}}}\n'
@@ -191,7 +191,7 @@ def sine(seconds: float) -> str:
 
 @dataclass
 class Played:
-    """What came of a programme: samples sent, time taken [s], CPU of each process [%], its bag."""
+    """What came of a program: samples sent, time taken [s], CPU of each process [%], its bag."""
 
     seen: Seen
     samples: int
@@ -270,7 +270,7 @@ class Session:
         self.set('recorder', 'output', str(bag))
         self.ask('recorder/start')
         self.wait('recorder', 'recording', 10.0)
-        # all of this programme, and nothing of the one before
+        # all of this program, and nothing of the one before
         captured = self.client.count('identifier')
         seen = self.observer.seen = Seen()
         samples = int(self.ask('excitation/start').split()[-2])

@@ -7,7 +7,7 @@ The graph over two hosts, with a network between them that loses packets, or goe
     sudo .venv/bin/python benchmarks/reliability/netns.py
 
 Stage and excitation run in one network namespace, identifier and model in another, with a pair of
-virtual Ethernet devices between them.  A short programme is run by ``~/run`` while none, 1 % or
+virtual Ethernet devices between them.  A short program is run by ``~/run`` while none, 1 % or
 5 % of the packets are dropped in both directions, and while the link is down for 10 s.  Every
 sample arrives or its loss is reported; the model is the one of a perfect network, or refused.
 Last, with discovery kept to the local machine, each host must see nothing of the other.
@@ -182,7 +182,7 @@ class Outcome:
     state, message : str
         The identifier's last status.
     sent, captured : int
-        Samples of the programme, and those of both streams that the identifier got.
+        Samples of the program, and those of both streams that the identifier got.
     lost : int
         Samples that the identifier says are missing, over all topics.
     faults : tuple of str
@@ -215,7 +215,7 @@ class Outcome:
 
 def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
     """
-    Run a programme over two hosts.
+    Run a program over two hosts.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def drive(program: str) -> int:
         def state() -> str:
             return client.status('identifier').get('state', '')
 
-        client.wait(lambda: captured[-1] > 20_000 or state() in ends, LIMIT, 'the programme')
+        client.wait(lambda: captured[-1] > 20_000 or state() in ends, LIMIT, 'the program')
         print('running', flush=True)
         client.wait(lambda: state() in ends, LIMIT, 'the end')
         seconds = time.monotonic() - begin

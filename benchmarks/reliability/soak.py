@@ -45,7 +45,7 @@ STREAMS = ('voltage', 'displacement', 'applied_voltage', 'prediction', 'residual
 NODES = ('stage', 'identifier', 'model', 'recorder', 'excitation')
 #: how often arrivals are fetched, and memory is looked at [s]
 POLL, LOOK = 0.05, 2.0
-#: longest programme: samples of one are bounded [s]
+#: longest program: samples of one are bounded [s]
 LONGEST = 600.0
 #: stage of the paper as a model: what matters here is that it predicts
 MODEL = HERE.parents[2] / 'config/stage_paper.yaml'
@@ -82,7 +82,7 @@ class Observer:
         self._read = deserialize_message
         self._taps = Taps(client.node, [f'/{t}' for t in STREAMS])
         self.streams = {topic: Stream() for topic in STREAMS}
-        #: of each programme: (time of the machine [s], time of the samples [s]) of its blocks
+        #: of each program: (time of the machine [s], time of the samples [s]) of its blocks
         self.clocks: list[list[tuple[float, float]]] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -153,9 +153,9 @@ class Soak:
     Attributes
     ----------
     seconds : float
-        Of programme.
+        Of program.
     samples : int
-        Of the programmes.
+        Of the programs.
     lost : dict of str to int
         Samples that are missing, by stream at the observer, and by where the graph counts.
     memory : dict of str to (first, last, slope, error)
@@ -196,7 +196,7 @@ class Soak:
 
 
 def sine(seconds: float) -> str:
-    """Return a programme."""
+    """Return a program."""
     return (
         f'limits: [0, 10]\nsample_rate: {RATE}\nsegments:\n'
         f'  - {{signal: sine, bias: 5, amplitude: 4.5, frequency: 7, duration: {seconds:g}}}\n'
@@ -210,7 +210,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
     Parameters
     ----------
     seconds : float
-        Length of all programmes together.
+        Length of all programs together.
     factor : float
         `rate_factor` of the excitation; 1 is real time.
     part : int
@@ -264,7 +264,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
                     if client.status('excitation').get('state') == 'failed':
                         raise PiezoIdentError(str(client.status('excitation')))
                     if now - begin > 20 * length + 120:
-                        raise PiezoIdentError('the programme does not end')
+                        raise PiezoIdentError('the program does not end')
                     if now - looked > LOOK:
                         looked = now
                         times.append(now)

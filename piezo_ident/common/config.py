@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stages and programmes that come with the package, wherever it was installed."""
+"""The stages and programs that come with the package, wherever it was installed."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class DataError(PiezoIdentError):
 
 
 class ConfigError(PiezoIdentError):
-    """A configuration, programme or option that cannot be followed."""
+    """A configuration, program or option that cannot be followed."""
 
 
 class ModelError(PiezoIdentError):

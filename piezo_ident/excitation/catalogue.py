@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The catalogue of signals: their names in a programme, their options, and how they are made."""
+"""The catalogue of signals: their names in a program, their options, and how they are made."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Setting:
 @dataclass(frozen=True, eq=False)
 class Part:
     """
-    A piece of a programme that is played without a ramp inside.
+    A piece of a program that is played without a ramp inside.
 
     Attributes
     ----------
@@ -256,7 +256,7 @@ def _count(default: Any = REQUIRED) -> Option:
     return Option('1', default=default, whole=True)
 
 
-#: every signal that a programme may use
+#: every signal that a program may use
 SIGNALS: dict[str, Signal] = {
     'idle': Signal('idle', {'duration': _TIME}, _idle),
     'hold': Signal('hold', {'level': _LEVEL, 'duration': _TIME}, _hold),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Programmes: named input signals in a row, with soft ramps between them, written as YAML.
+Programs: named input signals in a row, with soft ramps between them, written as YAML.
 
     limits: [0, 10]          # V; no sample may leave them
     sample_rate: 20000       # Hz; the caller's when absent
@@ -49,7 +49,7 @@ _NAME = re.compile(r'[\w.+-]+')
 @dataclass(frozen=True, eq=False)
 class Sequence:
     """
-    The command voltage of a whole programme.
+    The command voltage of a whole program.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Entry:
-    """One item of a programme: a signal with its options, perhaps under a name of its own."""
+    """One item of a program: a signal with its options, perhaps under a name of its own."""
 
     signal: str
     options: Mapping[str, Any]
@@ -106,7 +106,7 @@ class Entry:
 @dataclass(frozen=True)
 class Program:
     """
-    A checked programme.
+    A checked program.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Program:
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> Program:
         """
-        Read a programme: ``identification`` or another that is shipped, or a file of one's own.
+        Read a program: ``identification`` or another that is shipped, or a file of one's own.
 
         Raises
         ------
@@ -159,14 +159,14 @@ class Program:
         limits: tuple[float, float] | None = None,
     ) -> Sequence:
         """
-        Return the voltage of the programme, from rest to rest.
+        Return the voltage of the program, from rest to rest.
 
         Parameters
         ----------
         sample_rate : float, optional
-            [Hz]; needed when the programme names none, and wins over it.
+            [Hz]; needed when the program names none, and wins over it.
         rng : numpy.random.Generator, optional
-            For the random signals; one from the programme's seed when absent.
+            For the random signals; one from the program's seed when absent.
         limits : tuple of float, optional
             Further limits, say of the amplifier [V]; the narrower hold.
 
@@ -236,7 +236,7 @@ class Program:
             if n + v.size > excitation.MAX_SAMPLES:
                 raise ConfigError(
                     f'{self.name}: more than {excitation.MAX_SAMPLES} samples in all; '
-                    'split the programme'
+                    'split the program'
                 )
             pieces.append(v)
             segments.append(Segment(label, n, n + v.size))
@@ -265,7 +265,7 @@ def _where(name: str, number: int, signal: object) -> str:
 
 def parse_program(text: str, name: str = 'program') -> Program:
     """
-    Read a programme from text.
+    Read a program from text.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def _rate() -> Declaration:
 
 EXCITATION = (
     _rate(),
-    Declaration('program', 'identification', 'programme to play: a name, a path, or YAML text'),
+    Declaration('program', 'identification', 'program to play: a name, a path, or YAML text'),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
         'rate_factor',
@@ -112,7 +112,7 @@ STAGE = (
 )
 
 IDENTIFIER = (
-    Declaration('program', 'identification', 'programme that ~/run asks the excitation for'),
+    Declaration('program', 'identification', 'program that ~/run asks the excitation for'),
     Declaration('thresholds', 'auto', 'number of plays of H, or auto: by held-out error'),
     Declaration(
         'solver',
@@ -137,10 +137,10 @@ IDENTIFIER = (
     ),
     Declaration('model', '', 'file of a model for ~/diagnose; empty: that identified here'),
     Declaration(
-        'sweeps_program', 'diagnosis', 'programme that ~/diagnose asks for to have many motions'
+        'sweeps_program', 'diagnosis', 'program that ~/diagnose asks for to have many motions'
     ),
     Declaration(
-        'holds_program', 'holds', 'programme that ~/diagnose asks for to have holds after steps'
+        'holds_program', 'holds', 'program that ~/diagnose asks for to have holds after steps'
     ),
     Declaration(
         'requests', 2, 'how often one ~/diagnose may ask the excitation for more', '1', 0, 10

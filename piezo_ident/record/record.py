@@ -22,7 +22,7 @@ from piezo_ident.common.errors import DataError
 
 __all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment']
 
-#: the segment kinds that the programmes use; other labels are kept and treated as unlabelled
+#: the segment kinds that the programs use; other labels are kept and treated as unlabelled
 KINDS = (
     'step',
     'settle',

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of the programmes knows every key of the head and of every signal."""
+"""The page of the programs knows every key of the head and of every signal."""
 
 from pathlib import Path
 
@@ -53,7 +53,7 @@ def test_every_key_of_the_head_stands_on_the_page(key):
     assert meaning
 
 
-def test_what_the_page_says_of_the_shipped_programmes():
+def test_what_the_page_says_of_the_shipped_programs():
     text = '\n'.join(LINES)
     for name in ('identification', 'diagnosis', 'holds', 'validation', 'survey'):
         program = Program.load(ROOT / f'config/program_{name}.yaml')

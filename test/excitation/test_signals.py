@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals and programmes: what they promise, and what would prove it wrong."""
+"""Signals and programs: what they promise, and what would prove it wrong."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -178,7 +178,7 @@ def test_decaying_triangle_shrinks_to_its_bias():
     assert_allclose(turns, [10, 0, 9, 1, 8, 2, 7, 3, 6, 4], atol=1e-9)
 
 
-# -- programmes --------------------------------------------------------------------------------
+# -- programs --------------------------------------------------------------------------------
 
 volt = st.floats(-0.5, 10.5)
 ONE_SIGNAL = st.one_of(
@@ -252,7 +252,7 @@ ONE_SIGNAL = st.one_of(
 
 @settings(deadline=None, max_examples=150)
 @given(items=st.lists(ONE_SIGNAL, min_size=1, max_size=5), rest=st.floats(0, 10))
-def test_every_programme_keeps_its_promises_or_is_refused(items, rest):
+def test_every_program_keeps_its_promises_or_is_refused(items, rest):
     try:
         s = program(*items, rest=rest, slew=50, seed=4).build(2000)
     except ConfigError as error:
@@ -276,7 +276,7 @@ def test_every_programme_keeps_its_promises_or_is_refused(items, rest):
 
 
 @pytest.mark.parametrize('name', CONFIG)
-def test_programmes_that_come_along(name):
+def test_programs_that_come_along(name):
     s = config(name).build()
     assert s.sample_rate == FS
     assert np.all((s.v >= 0.0) & (s.v <= 10.0))
@@ -289,7 +289,7 @@ def test_programmes_that_come_along(name):
     )
 
 
-def test_identification_programme_has_what_the_three_steps_need():
+def test_identification_program_has_what_the_three_steps_need():
     s = config('identification').build()
     assert 14 < s.duration < 18
     kinds = [x.kind for x in s.segments if x.kind not in ('ramp', 'idle')]
@@ -300,7 +300,7 @@ def test_identification_programme_has_what_the_three_steps_need():
     assert (part['triangle'].min(), part['triangle'].max()) == (0.0, 10.0)
 
 
-def test_validation_programme_is_the_papers_six_sines():
+def test_validation_program_is_the_papers_six_sines():
     s = config('validation').build()
     sines = [x for x in s.segments if x.kind == 'sine']
     assert [x.label for x in sines] == [f'sine:{f}Hz' for f in (1, 10, 50, 80, 100, 120)]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What tests play and compare: a short programme, its blocks, the stage's answer, models as numbers.
+What tests play and compare: a short program, its blocks, the stage's answer, models as numbers.
 
 Blocks are large, so that a whole record fits into the queues of its readers, whatever else the
 machine does.
@@ -115,7 +115,7 @@ def cut(samples: Samples, *at: int) -> list[Samples]:
 
 
 def voltage_of(program: str, size: int = SIZE) -> list[Samples]:
-    """Return the blocks of a programme."""
+    """Return the blocks of a program."""
     sequence = parse_program(program).build(FS)
     return [
         block(a, sequence.v[a:b], label)

@@ -9,7 +9,7 @@ A graph of real node processes for tests, and a node in this process that looks 
         g.start_all(('stage', {'seed': 3}), ('excitation', {}))
         seen = g.collect('displacement')
         assert g.call('excitation/start')[0]
-        g.wait(lambda: g.status('excitation')['state'] == 'done', 'the end of the programme')
+        g.wait(lambda: g.status('excitation')['state'] == 'done', 'the end of the program')
 
 Every graph has a ROS domain of its own, so several may run at once; at the end nothing is left,
 whatever happened.

@@ -127,14 +127,14 @@ def rms(blocks):
 
 
 def play(g, truth, program):
-    """Have a programme played while nobody asks for it, and return its residual."""
+    """Have a program played while nobody asks for it, and return its residual."""
     residual = g.collect(f'{truth}/residual')
     samples = len(residual)
     assert g.set(f'{truth}/excitation', 'program', program) == (True, '')
     seen = len(g.statuses(f'{truth}/excitation'))
     assert g.call(f'{truth}/excitation/start')[0]
     said = g.statuses(f'{truth}/excitation')
-    g.wait(lambda: any(s['state'] == 'done' for s in said[seen:]), 'the programme')
+    g.wait(lambda: any(s['state'] == 'done' for s in said[seen:]), 'the program')
     end = parse_program(program).build(FS).duration
     g.wait(lambda: abs(residual[-1].t[-1] - end) < 2 / FS, 'its last residual')
     return residual[samples:]

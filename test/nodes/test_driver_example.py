@@ -69,17 +69,17 @@ def at_rest(g: Graph) -> bool:
     return bool(applied) and applied[-1].values[-1] == 0.0
 
 
-def test_a_programme_is_followed_bit_by_bit(lab):
+def test_a_program_is_followed_bit_by_bit(lab):
     voltage = lab.collect('voltage')
     lab.start('identifier')
     # the third is the one who looks
     lab.start('excitation', {'program': PROGRAM, 'subscribers': 3})
     n = parse_program(PROGRAM).build(FS).n
     assert lab.call('excitation/start')[0]
-    lab.wait(lambda: lab.status('excitation')['state'] == 'done', 'the programme')
+    lab.wait(lambda: lab.status('excitation')['state'] == 'done', 'the program')
     applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
     for stream in (voltage, applied, y):
-        lab.wait(lambda s=stream: column(s).size >= n, 'the whole programme')
+        lab.wait(lambda s=stream: column(s).size >= n, 'the whole program')
     assert [b.segment for b in y] == [b.segment for b in voltage]
     assert column(applied).tobytes() == column(voltage).tobytes()
     for back in (applied, y):

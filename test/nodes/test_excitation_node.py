@@ -21,7 +21,7 @@ def state(g, name='excitation'):
 
 
 def play(g, name='excitation'):
-    """Start, wait for the end of this programme, and return the status then."""
+    """Start, wait for the end of this program, and return the status then."""
     seen = len(g.statuses(name))
     ok, message = g.call(f'{name}/start')
     assert ok, message
@@ -45,7 +45,7 @@ def lab():
         yield g
 
 
-def test_a_programme_in_real_time(lab):
+def test_a_program_in_real_time(lab):
     sequence = parse_program(SHORT).build(FS)
     voltage = lab.collect('voltage')
     assert not voltage, 'silent until it is started'
@@ -164,7 +164,7 @@ def stopped(g, rest):
     refused, reason = g.call('excitation/start')
     assert not refused and 'already' in reason
     taken, reason = g.set('excitation', 'voltage_high', 9.5)
-    assert not taken and 'cannot be changed while a programme is played' in reason
+    assert not taken and 'cannot be changed while a program is played' in reason
     assert g.call('excitation/stop') == (True, f'ramping to {rest:g} V')
     g.wait(lambda: state(g) == 'stopped', 'stopped')
     g.wait(lambda: voltage[-1].values[-1] == rest, 'rest')
@@ -267,7 +267,7 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         g.wait(is_refused, 'the refusal')
         g.wait(lambda: state(g) not in ('waiting', 'running', 'stopping'), 'rest')
         g.forget(second)
-        # one that comes while a programme is played is reported
+        # one that comes while a program is played is reported
         g.wait(lambda: g.call('excitation/start')[0], 'the start')
         g.wait(lambda: state(g) == 'running', 'running')
         second = g.node.create_publisher(Float64MultiArray, 'voltage', 10)

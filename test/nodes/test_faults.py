@@ -326,7 +326,7 @@ def test_blocks_of_a_second_publisher_change_nothing(rig):
         g.wait(lambda: second.get_subscription_count() == 3, 'the second publisher to be heard')
         g.wait(lambda: g.diagnostics('stage').get('publishers') == '2', 'two publishers')
         before = int(g.diagnostics('stage')['refused_second'])
-        # of another programme: earlier, at the same time, and far ahead
+        # of another program: earlier, at the same time, and far ahead
         strange = [block(0, np.full(1000, 3.0)), replace(BLOCKS[K], values=np.full(1000, 3.0))]
         strange.append(block(10**7, np.full(1000, 3.0), 'triangle'))
         rig.send(BLOCKS[:K])

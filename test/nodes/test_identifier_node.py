@@ -464,7 +464,7 @@ def test_run_drives_the_excitation_and_identifies(course):
 
 
 def settling(g):
-    """Run a programme that sweeps the bias for long enough to be met at it."""
+    """Run a program that sweeps the bias for long enough to be met at it."""
     assert g.set('identifier', 'program', PROGRAM.replace('cycles: 8', 'cycles: 1600'))[0]
     seen = len(g.statuses('excitation'))
     assert g.call('identifier/run')[0]

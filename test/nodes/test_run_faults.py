@@ -184,10 +184,10 @@ def test_an_identifier_that_is_killed_in_a_run(lab):
     new = lab.restart(lab.handle('identifier'))
     lab.wait(lambda: float(lab.diagnostics('identifier').get('captured', 0)) > 0.5, 'a capture')
     kept = float(lab.diagnostics('identifier')['captured'])
-    # nobody stops the programme, and it is not started again over itself
+    # nobody stops the program, and it is not started again over itself
     seen = run(lab, PROGRAM)
     reason = ended(lab, seen, 'failed')
-    assert 'a programme is being played already; call ~/stop first' in reason
+    assert 'a program is being played already; call ~/stop first' in reason
     # and a run that did not begin has cost nothing
     told = len(lab.diagnoses('identifier'))
     lab.wait(lambda: len(lab.diagnoses('identifier')) > told + 1, 'the capture of then')

@@ -69,7 +69,7 @@ def test_three_graphs_side_by_side(tmp_path):
             )
             assert g.status(f'{where}identifier')['state'] == 'done'
 
-        # each has the whole programme and nothing but it
+        # each has the whole program and nothing but it
         sent = column(voltage_of(PROGRAM))
         for where in WHERE:
             for stream in (voltage[where], applied[where]):
