@@ -63,7 +63,10 @@ class ModelNode(LabNode):
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
         if path := self.values['model']:
             # at the start nothing waits, and a bad file ends the node
-            self._use(_tried(load(path)), path)
+            try:
+                self._use(_tried(load(path)), path)
+            except PiezoIdentError as error:
+                raise PiezoIdentError(f'model: {error}') from None
         self.create_subscription(String, 'model', self._on_model, LATCHED)
         for topic, take in (('voltage', self._voltage), ('displacement', self._displacement)):
             on_message = functools.partial(self._on_block, topic, take)
@@ -75,7 +78,7 @@ class ModelNode(LabNode):
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a model file that is not there; what is wrong inside is in ``~/status``."""
         if name == 'model' and value and not Path(value).is_file():
-            return f'{value}: no such model file'
+            return f'model: {value}: no such file'
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:

@@ -303,7 +303,7 @@ def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
         ('warn_ratio', 0.5, 'warn_ratio'),
         ('window', float('nan'), 'window'),
         ('preview_rate', 10.0, 'read'),
-        ('model', '/nowhere.yaml', 'no such model file'),
+        ('model', '/nowhere.yaml', 'no such file'),
     ],
 )
 def test_bad_parameters_are_refused(fast, name, value, reason):

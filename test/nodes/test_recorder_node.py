@@ -139,9 +139,14 @@ def test_record_stop_and_refusals(tmp_path):
         (tmp_path / 'file').write_text('')
         for place in (tmp_path / 'file' / 'bag', tmp_path / ('x' * 300)):
             assert g.set('a/recorder', 'output', str(place))[0]
-            ok, message = g.call('a/recorder/start')
-            assert not ok
-            assert 'cannot be written' in message
+            assert g.call('a/recorder/start')[0]
+            g.wait(
+                lambda p=place: (
+                    (s := g.status('a/recorder'))['state'] == 'failed' and p.name in s['message']
+                ),
+                'the refusal',
+            )
+            assert 'cannot be written' in g.status('a/recorder')['message']
         g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), 'diagnostics')
     got = contents(tmp_path / 'bag')
     assert arrays(got['/a/voltage']) == [v for v, _ in source.messages]
