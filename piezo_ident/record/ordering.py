@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Fault
+from piezo_ident.record.restart import has_restarted
 
 __all__ = ['Rows', 'at_times', 'in_order']
 
-#: time may jump back in a record only between stretches of at least this many samples ...
+#: time may jump back in a record only between stretches of at least this many samples
 MIN_STRETCH = 10
-#: ... and to where the stretch began, or by more than this many samples
-MIN_JUMP_BACK = 1000
 #: rows that start over and equal the old ones for longer than this are another run
 MAX_REPEAT = 200
 
@@ -134,7 +133,8 @@ def _stretches(
                 repeated.append(t[start:overlap])
                 start = overlap
             elif min(epoch.size, stop - start) >= MIN_STRETCH and (
-                from_start or epoch.size - place[0] > MIN_JUMP_BACK
+                # told in samples, so that gaps do not count
+                has_restarted(float(place[0]), epoch.size, 0.0, 1.0)
             ):
                 epochs.append(size)
                 begin = size

@@ -13,9 +13,9 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
+from piezo_ident.live.capture import Capture
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome
-from piezo_ident.record.capture import Capture
 
 __all__ = ['DiagnosisSession', 'Host']
 

@@ -25,11 +25,11 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.identification.single_steps import find_delay, find_dynamics, find_hysteresis
+from piezo_ident.live.capture import refuse_incomplete, Snapshot
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.capture import refuse_incomplete, Snapshot
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import headline, json_text, steps_to_json, write_report
 

@@ -17,6 +17,7 @@ from piezo_ident.cli.outputs import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Steps
+from piezo_ident.live.capture import Capture
 from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
@@ -34,7 +35,7 @@ from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message, LATCHED
-from piezo_ident.record.capture import APPLIED, Capture
+from piezo_ident.record.from_streams import APPLIED
 from std_msgs.msg import Float64MultiArray, String
 
 __all__ = ['IdentifierNode', 'main']

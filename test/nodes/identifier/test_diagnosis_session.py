@@ -10,12 +10,12 @@ from diagnosis_examples import base_model, example, measured
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis.next_experiment import Experiment
+from piezo_ident.live.capture import Capture
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.nodes.identifier import diagnosis_session as module
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome, records_of_runs
 from piezo_ident.record.blocks import cut_blocks, Samples
-from piezo_ident.record.capture import Capture
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.to_json import json_text
 import pytest

@@ -7,10 +7,10 @@ import threading
 
 import numpy as np
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
+from piezo_ident.live.capture import Capture
 from piezo_ident.nodes.identifier.jobs import warm_up
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.capture import Capture
 from process_jobs import fail, MakeRecord, numbers, priority, tick_for_ever
 import pytest
 

@@ -1,166 +1,35 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
-Blocks as they come to a record: bounded, checked, and by the same path as a bag of these blocks.
+Blocks as they come, kept for a record: bounded, checked, and by the same path as a bag of them.
 
-What is wrong is met where it is met for a bag, in `piezo_ident.record.join` and
-`piezo_ident.record.assemble`.
-Beside them a capture knows what no bag tells: which blocks could not be read, and what was
-forgotten to make room.
+What is wrong with the samples is met as for a bag, in `piezo_ident.record.join` and
+`piezo_ident.record.assemble`.  Beside them a capture knows which blocks could not be read, and
+what was forgotten to make room.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.assemble import assemble, ReadOptions
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.join import join
-from piezo_ident.record.ordering import at_times
+from piezo_ident.record.from_streams import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
+from piezo_ident.record.restart import has_restarted
 from piezo_ident.record.stream import Stream
 
-__all__ = [
-    'APPLIED',
-    'SPARSE',
-    'Capture',
-    'Snapshot',
-    'record_of_streams',
-    'refuse_incomplete',
-    'tolerance_of',
-]
+__all__ = ['Capture', 'Snapshot', 'refuse_incomplete']
 
-#: key of what the amplifier got, which carries the quantity voltage
-APPLIED = 'applied_voltage'
-#: commanded and applied voltage may differ by this share of the range
-TOLERANCE = 1e-3
-#: fault of a further channel of a lower rate, or that ended early
-SPARSE = 'sparse_channel'
-#: most of a segment by time, or of a further channel, that may be missing before it is not used
-MAX_MISSING = 0.05
 #: segments that the three steps stand on
 NEEDED = ('step', 'noise', 'triangle')
-#: time that jumps back by more samples than this is a restart, not a late block
-JUMP_BACK = 1000
-#: samples and blocks of a topic that are kept, and labels that are counted, whatever the times say
+#: samples and blocks of a topic that are kept, and labels that are counted, whatever the times are
 MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
-
-
-def record_of_streams(
-    streams: Mapping[str, Stream],
-    *,
-    name: str,
-    tolerance: float | None = None,
-    options: ReadOptions | None = None,
-    sample_rate: float | None = None,
-    faults: Iterable[Fault] = (),
-) -> Record:
-    """
-    Make a record of streams of blocks.
-
-    Parameters
-    ----------
-    streams : mapping of str to Stream
-        Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
-        command and applied voltage differ, the amplifier's guard was at work: the stage did not
-        get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
-        `MAX_MISSING` of the samples is left out.
-    name : str
-        What errors call the data, and the record's name.
-    tolerance : float, optional
-        Difference of command and applied voltage that counts as none [V]; a thousandth of the
-        range when absent.
-    options, sample_rate, faults
-        As for `piezo_ident.record.assemble.assemble`.
-
-    Raises
-    ------
-    DataError
-        For data that cannot be used without a guess.
-    """
-    sparse = _sparse(streams)
-    needed = {key: s for key, s in streams.items() if key != APPLIED and key not in sparse}
-    try:
-        joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
-    except DataError as error:
-        raise DataError(f'{name}: {error}') from None
-    met, t, columns, segments = (
-        [*faults, *sparse.values(), *joined.faults],
-        joined.t,
-        joined.columns,
-        joined.segments,
-    )
-    if APPLIED in columns and np.array_equal(columns['voltage'], columns[APPLIED]):
-        del columns[APPLIED]
-    if APPLIED in columns:
-        v, applied = columns['voltage'], columns.pop(APPLIED)
-        wrong = _guarded(v, applied, tolerance)
-        unknown = int(np.count_nonzero(np.isnan(applied)))
-        if unknown:
-            where = at_times(t[np.isnan(applied)][:1])
-            met.append(Fault('applied_unknown', where, unknown, 'taken as commanded'))
-        if wrong.any():
-            if wrong.all():
-                raise DataError(
-                    f'{name}: the applied voltage is nowhere the commanded one; look at the '
-                    "guards of the amplifier's driver"
-                )
-            worst = float(np.abs(v - applied)[wrong].max())
-            where = f'{at_times(t[_begins(wrong)])}, by up to {worst:.3g} V'
-            count = int(np.count_nonzero(wrong))
-            met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
-            keep = np.flatnonzero(~wrong)
-            names, starts = segments
-            t, columns = t[keep], {key: x[keep] for key, x in columns.items()}
-            segments = (names, np.searchsorted(keep, starts).tolist())
-    return assemble(
-        t,
-        columns.pop('voltage'),
-        columns.pop('displacement'),
-        segments,
-        {key[2:]: x for key, x in columns.items()},
-        name=name,
-        options=options,
-        sample_rate=sample_rate,
-        faults=met,
-    )
-
-
-def _sparse(streams: Mapping[str, Stream]) -> dict[str, Fault]:
-    """Return the further channels for whose sake too many other samples would be cut out."""
-    n = min(streams['voltage'].n, streams['displacement'].n)
-    return {
-        key: Fault(SPARSE, f'{key}, {stream.n} samples beside {n}', n - stream.n, 'left out')
-        for key, stream in streams.items()
-        if key.startswith('x_') and stream.n < (1.0 - MAX_MISSING) * n
-    }
-
-
-def tolerance_of(v: NDArray[np.float64]) -> float:
-    """Return the difference of command and applied voltage that counts as none [V]."""
-    finite = v[np.isfinite(v)]
-    span = float(np.ptp(finite)) if finite.size else 0.0
-    return TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
-
-
-def _guarded(
-    v: NDArray[np.float64], applied: NDArray[np.float64], tolerance: float | None
-) -> NDArray[np.bool_]:
-    """Tell where another voltage was applied than commanded."""
-    if tolerance is None:
-        tolerance = tolerance_of(v)
-    return np.asarray(np.abs(v - applied) > tolerance)  # False where either is NaN
-
-
-def _begins(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    return np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))
 
 
 def refuse_incomplete(
@@ -199,12 +68,12 @@ def refuse_incomplete(
         if missing[kind] > most * whole:
             raise DataError(
                 f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
-                'are missing or not usable; find what loses samples, and run the programme again'
+                'are missing or not usable; find what loses samples, and run the program again'
             )
 
 
 @dataclass
-class _Watch:
+class _Clock:
     """Where the sample clock of one topic stands, and what happened to it."""
 
     last: float = float('nan')
@@ -235,7 +104,7 @@ class _Watch:
         elif step > 1.5 * self.period:
             self.lost += round(step / self.period) - 1
         elif step <= 0.0:
-            if first <= self.begin or -step > JUMP_BACK * self.period:
+            if has_restarted(first, self.last, self.begin, self.period):
                 self.restarts += 1
                 self.runs.append(len(self.seconds))
                 self.begin = first
@@ -318,7 +187,7 @@ class Capture:
     def clear(self) -> None:
         """Forget everything."""
         self._streams: dict[str, Stream] = {}
-        self._watches: dict[str, _Watch] = {}
+        self._clocks: dict[str, _Clock] = {}
         self._segments: dict[str, int] = {}
         self._unreadable: dict[str, tuple[int, str]] = {}
         self._forgotten = 0.0
@@ -337,8 +206,8 @@ class Capture:
             When it came [ns], by a clock that all topics share.
         """
         self._streams.setdefault(key, Stream()).append(samples, arrival)
-        watch = self._watches.setdefault(key, _Watch())
-        watch.add(samples.t)
+        clock = self._clocks.setdefault(key, _Clock())
+        clock.add(samples.t)
         if key == 'voltage':
             self.segment = samples.segment
             label = samples.segment or 'unlabelled'
@@ -346,9 +215,9 @@ class Capture:
                 label = 'others'
             self._segments[label] = self._segments.get(label, 0) + samples.t.size
         if (
-            watch.total > self.limit
-            or watch.samples > MOST_SAMPLES
-            or len(watch.seconds) > MOST_BLOCKS
+            clock.total > self.limit
+            or clock.samples > MOST_SAMPLES
+            or len(clock.seconds) > MOST_BLOCKS
         ):
             self._make_room(key)
 
@@ -357,32 +226,32 @@ class Capture:
         self._unreadable[key] = (self._unreadable.get(key, (0, ''))[0] + 1, reason)
 
     def _make_room(self, key: str) -> None:
-        watch = self._watches[key]
-        blocks = next(iter(watch.runs), 0)
-        if not blocks and watch.total <= self.limit:
-            blocks = max(1, len(watch.seconds) // 10)
+        clock = self._clocks[key]
+        blocks = next(iter(clock.runs), 0)
+        if not blocks and clock.total <= self.limit:
+            blocks = max(1, len(clock.seconds) // 10)
         elif not blocks:
             room = 0.0
-            while room < 0.1 * self.limit and blocks < len(watch.seconds) - 1:
-                room += watch.seconds[blocks]
+            while room < 0.1 * self.limit and blocks < len(clock.seconds) - 1:
+                room += clock.seconds[blocks]
                 blocks += 1
-        before = watch.total
-        watch.drop(blocks)
+        before = clock.total
+        clock.drop(blocks)
         self._streams[key].drop(blocks)
-        watch.samples = self._streams[key].n
+        clock.samples = self._streams[key].n
         if key == 'voltage':
-            self._forgotten += before - watch.total
+            self._forgotten += before - clock.total
 
     def mark(self) -> dict[str, int]:
         """Return what tells later what was captured after now; not across `clear`."""
-        return {key: watch.dropped + len(watch.seconds) for key, watch in self._watches.items()}
+        return {key: clock.dropped + len(clock.seconds) for key, clock in self._clocks.items()}
 
     def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
         """Return the measured time of a topic after a mark that is kept [s]."""
-        if key not in self._watches:
+        if key not in self._clocks:
             return 0.0
-        watch = self._watches[key]
-        return sum(watch.seconds[max(0, mark.get(key, 0) - watch.dropped) :])
+        clock = self._clocks[key]
+        return sum(clock.seconds[max(0, mark.get(key, 0) - clock.dropped) :])
 
     def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
         """
@@ -403,7 +272,7 @@ class Capture:
             faults.append(Fault('capture_limit', where, 1, action))
         streams = {key: stream.copy() for key, stream in self._streams.items()}
         for key, stream in streams.items():
-            stream.drop(max(0, (since or {}).get(key, 0) - self._watches[key].dropped))
+            stream.drop(max(0, (since or {}).get(key, 0) - self._clocks[key].dropped))
         return Snapshot(streams, tuple(faults), self.tolerance)
 
     def record(self, name: str = 'capture') -> Record:
@@ -426,11 +295,11 @@ class Capture:
 
     def last_time(self, key: str) -> float:
         """Return the time of the newest sample of a topic [s]; NaN before the first."""
-        return self._watches[key].last if key in self._watches else float('nan')
+        return self._clocks[key].last if key in self._clocks else float('nan')
 
     def seconds_of(self, key: str) -> float:
         """Return the measured time of a topic that is kept [s]."""
-        return self._watches[key].total if key in self._watches else 0.0
+        return self._clocks[key].total if key in self._clocks else 0.0
 
     @property
     def seconds(self) -> float:
@@ -445,22 +314,22 @@ class Capture:
     @property
     def lost(self) -> Mapping[str, int]:
         """Samples that never came, by topic, as its sample clock tells."""
-        return {key: watch.lost for key, watch in self._watches.items()}
+        return {key: clock.lost for key, clock in self._clocks.items()}
 
     @property
     def late(self) -> Mapping[str, int]:
         """Samples that came again or out of turn, by topic."""
-        return {key: watch.late for key, watch in self._watches.items()}
+        return {key: clock.late for key, clock in self._clocks.items()}
 
     @property
     def problems(self) -> tuple[str, ...]:
         """What is wrong with the capture so far, one sentence a topic."""
         said = []
-        for key, watch in self._watches.items():
-            if watch.lost:
-                said.append(f'{watch.lost} samples of {key} are missing')
-            if watch.late:
-                said.append(f'{watch.late} samples of {key} came twice or out of turn')
+        for key, clock in self._clocks.items():
+            if clock.lost:
+                said.append(f'{clock.lost} samples of {key} are missing')
+            if clock.late:
+                said.append(f'{clock.late} samples of {key} came twice or out of turn')
         for key, (count, reason) in self._unreadable.items():
             said.append(f'{count} messages on {key} are no blocks ({reason})')
         return tuple(said)

@@ -6,10 +6,11 @@
 
 import numpy as np
 from piezo_ident.common.errors import DataError
+from piezo_ident.live.capture import Capture, refuse_incomplete
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.blocks import cut_blocks, Samples
-from piezo_ident.record.capture import APPLIED, Capture, refuse_incomplete
+from piezo_ident.record.from_streams import APPLIED
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
@@ -273,9 +274,9 @@ def test_runs_that_follow_each_other_miss_nothing(record):
 
 
 def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
-    monkeypatch.setattr('piezo_ident.record.capture.MOST_BLOCKS', 100)
-    monkeypatch.setattr('piezo_ident.record.capture.MOST_SAMPLES', 1000)
-    monkeypatch.setattr('piezo_ident.record.capture.MOST_LABELS', 20)
+    monkeypatch.setattr('piezo_ident.live.capture.MOST_BLOCKS', 100)
+    monkeypatch.setattr('piezo_ident.live.capture.MOST_SAMPLES', 1000)
+    monkeypatch.setattr('piezo_ident.live.capture.MOST_LABELS', 20)
     lone, dense = Capture(), Capture()
     for k in range(500):
         # single samples have no period, so that no time adds up
@@ -292,7 +293,7 @@ def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
 
 @pytest.mark.parametrize('time', [np.inf, -np.inf, np.nan])
 def test_times_that_are_none_break_nothing(monkeypatch, time):
-    monkeypatch.setattr('piezo_ident.record.capture.MOST_BLOCKS', 100)
+    monkeypatch.setattr('piezo_ident.live.capture.MOST_BLOCKS', 100)
     capture = Capture()
     for k in range(300):
         t = np.full(100, time) if k % 2 else np.arange(100 * k, 100 * (k + 1)) / RATE
