@@ -31,8 +31,9 @@ from growth_of_fits import base_model, EFFECT, FIT_MEASURES, labelled, to_diagno
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders
-from piezo_ident.identification.step3_hysteresis import Excerpt, factorise, fit_hysteresis
+from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
 from side_by_side import last_line, markdown, peak_memory, seconds, take_turns, versions

@@ -29,7 +29,8 @@ import warnings
 
 import numpy as np
 from piezo_ident.excitation.program import Program
-from piezo_ident.identification.solvers.output_error import output_error, Stretch
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.solvers.output_error import output_error
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     excited_band,
@@ -112,7 +113,7 @@ def ours(data: Data, most: int, refine: bool = False) -> Coefficients:
     if refine:
         u = np.concatenate([np.zeros(DELAY), data.u[:-DELAY]])
         use = np.arange(u.size) >= u.size // 50
-        found = output_error([Stretch(u, data.y, use)], found, maxiter=10).dynamics
+        found = output_error([Excerpt(u, data.y, use)], found, maxiter=10).dynamics
     return delayed(found.b), found.a
 
 

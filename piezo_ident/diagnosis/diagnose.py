@@ -246,7 +246,7 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
     """Return the residual of each run [m]; `whole` with what the unknown start still touches."""
     Y = simulator.model.scaling.Y
     return [
-        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.sound if whole else run.known)
+        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.use if whole else run.known)
         for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
     ]
 

@@ -258,7 +258,7 @@ def _has_clock(model: StageModel) -> bool:
 def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None) -> float:
     """Return the largest stroke of a record, its faults left out."""
     used = (
-        (run.record, run.x[run.sound if out is None else run.sound & ~out])
+        (run.record, run.x[run.use if out is None else run.use & ~out])
         for run, out in zip(runs, bad or [None] * len(runs), strict=True)
     )
     return max(strokes(used).values())

@@ -5,21 +5,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.solvers.lag_products import stretches_of as true_runs
 from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.stage_model import Scaling
+from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.record import Piece, Record
 from scipy import signal
 
 __all__ = [
+    'Excerpt',
     'Prepared',
     'Run',
     'common_rate',
@@ -31,6 +33,7 @@ __all__ = [
     'runs_of',
     'same_rate',
     'scaling_of',
+    'true_runs',
 ]
 
 #: share of a triangle that is one block of held-out data, and how many blocks share one
@@ -39,6 +42,8 @@ BLOCKS, EVERY = 60, 5
 END_HELD = 0.2
 #: a record starts from a known memory when its voltage starts within this share of the lowest
 REST = 0.01
+#: how far the voltage may move within one averaged row, as a share of its range
+ROW_SPAN = 2e-3
 #: chance below which the displacement answers the voltage, and samples that it takes to tell
 CHANCE, MIN_COHERENCE = 1e-7, 256
 #: means into which a ramp is divided
@@ -48,30 +53,86 @@ RAMP = 64
 STRAIGHT, BENT = 5e-4, 15.0
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
+def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """
-    One piece, normalised.
+    Return (start, stop) of every stretch of true values.
+
+    Examples
+    --------
+    >>> true_runs(np.array([True, True, False, True]))
+    [(0, 2), (3, 4)]
+    """
+    padded = np.concatenate([[False], mask, [False]])
+    edges = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """
+    Input and output of a fit, and which samples count.
+
+    Attributes
+    ----------
+    u, x : ndarray, shape (n,)
+        Normalised input and displacement; plays and dynamics need all of the input.
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    memory : callable, optional
+        Play outputs before the first sample, as a function of the thresholds; that of a stage
+        which last came down to zero when absent.
+    """
+
+    u: NDArray[np.float64]
+    x: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def start(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the play outputs before the first sample."""
+        if self.memory is None:
+            return initial_memory(float(self.u[0]), thresholds)
+        return self.memory(thresholds)
+
+    @functools.cached_property
+    def stretches(self) -> list[tuple[int, int]]:
+        """The unbroken stretches of samples that count, as (start, stop)."""
+        return true_runs(self.use)
+
+    @functools.cached_property
+    def row(self) -> int:
+        """Samples that one row of a fit of H may average."""
+        if not self.use.any():
+            return 1
+        speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
+        span = ROW_SPAN * float(np.ptp(self.u[self.use]))
+        return max(
+            1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
+        )
+
+    @property
+    def rows(self) -> int:
+        """Rows that these samples become; white noise is independent from row to row."""
+        return sum((stop - start) // self.row for start, stop in self.stretches)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Run(Excerpt):
+    """
+    One piece, normalised; the samples that count were measured, away from a bridged gap.
 
     Attributes
     ----------
     record : str
         Name of the record it belongs to.
     piece : Piece
-    u, x : ndarray, shape (n,)
-        Normalised voltage and displacement.
     known : ndarray of bool, shape (n,)
-        Sound samples at which the memory of the start no longer matters, or was known.
-    sound : ndarray of bool, shape (n,)
-        Samples that were measured, away from a gap that was bridged.
+        Samples that count and at which the memory of the start no longer matters, or was known.
     """
 
     record: str
     piece: Piece
-    u: NDArray[np.float64]
-    x: NDArray[np.float64]
     known: NDArray[np.bool_]
-    sound: NDArray[np.bool_]
 
     def mask(self, *kinds: str) -> NDArray[np.bool_]:
         """Return which samples belong to segments of these kinds."""
@@ -88,14 +149,11 @@ class Run:
         A sample or two that were bridged do no harm where a regression runs through them; a
         straight line of many does.
         """
-        unsound = np.concatenate([[0], (~self.sound[start:stop]).astype(np.int8), [0]])
-        edges = np.flatnonzero(np.diff(unsound))
-        long = 0.0125 * self.piece.sample_rate
-        breaks = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > long]
-        ends = [0, *(int(x) for pair in breaks for x in pair), stop - start]
-        return [
-            (start + a, start + b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b > a
-        ]
+        whole = np.ones(stop - start, dtype=bool)
+        for a, b in true_runs(~self.use[start:stop]):
+            if b - a > 0.0125 * self.piece.sample_rate:
+                whole[a:b] = False
+        return [(start + a, start + b) for a, b in true_runs(whole)]
 
     def held_out(self) -> NDArray[np.bool_]:
         """
@@ -247,7 +305,10 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
             known = part.sound.copy()
             if abs(u[0]) > REST:
                 known[: forgotten(u)] = False
-            runs.append(Run(record.name, piece, u, scaling.x(piece.y), known, part.sound))
+            x = scaling.x(piece.y)
+            runs.append(
+                Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)
+            )
     return runs
 
 

@@ -17,28 +17,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-import functools
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.common.kernel import kernel
-from piezo_ident.identification.filtered_plays import filtered_plays
-from piezo_ident.identification.solvers.lag_products import stretches_of
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
 )
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
-from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.play import initial_memory, weighted_plays
+from piezo_ident.operators.play import weighted_plays
 from scipy.optimize import Bounds, OptimizeResult
 
 __all__ = [
-    'Excerpt',
     'HysteresisFit',
+    'choose_thresholds',
     'even_thresholds',
     'factorise',
     'fine_thresholds',
@@ -54,52 +52,10 @@ WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
 STILL = 1e-8
 #: what may be left of the start of G where the samples used begin
 FORGOTTEN = 1e-13
-#: how far the voltage may move within one averaged row, as a share of its range
-ROW_SPAN = 2e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Excerpt:
-    """
-    Data for fitting H: one uniformly sampled run, and which of its samples count.
-
-    Attributes
-    ----------
-    u, x : ndarray, shape (n,)
-        Normalised voltage and displacement of the whole run; the plays need all of it.
-    use : ndarray of bool, shape (n,)
-        Samples that are fitted.
-    memory : callable, optional
-        Play outputs before the first sample, as a function of the thresholds; that of a stage
-        which last came down to zero when absent.
-    """
-
-    u: NDArray[np.float64]
-    x: NDArray[np.float64]
-    use: NDArray[np.bool_]
-    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
-
-    def start(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the play outputs before the first sample."""
-        if self.memory is None:
-            return initial_memory(float(self.u[0]), thresholds)
-        return self.memory(thresholds)
-
-    @functools.cached_property
-    def row(self) -> int:
-        """Samples that one row of the fit may average."""
-        if not self.use.any():
-            return 1
-        speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
-        span = ROW_SPAN * float(np.ptp(self.u[self.use]))
-        return max(
-            1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
-        )
-
-    @property
-    def rows(self) -> int:
-        """Rows that these samples become; white noise is independent from row to row."""
-        return sum((stop - start) // self.row for start, stop in stretches_of(self.use))
+#: numbers of evenly spaced thresholds that are tried, one after the other
+COUNTS = (10, 14, 20, 28, 40, 56, 80)
+#: a larger number must lower the held-out error by this share
+GAIN = 0.01
 
 
 def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
@@ -138,19 +94,15 @@ def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
 
 
 @kernel
-def _bin(
+def _average(
     x: NDArray[np.float64], stretches: NDArray[np.int64], row: int, out: NDArray[np.float64]
 ) -> None:
-    # averages never reach across a hole in the mask; the last incomplete row is left out
-    share = 1.0 / np.sqrt(row)
+    # a mean never reaches across a hole in the mask; the last incomplete row is left out
     place = 0
     for m in range(stretches.shape[0]):
         for i in range((stretches[m, 1] - stretches[m, 0]) // row):
             start = stretches[m, 0] + i * row
-            total = 0.0
-            for k in range(row):
-                total += x[start + k]
-            out[place] = share * total
+            out[place] = x[start : start + row].sum() / np.sqrt(row)
             place += 1
 
 
@@ -184,8 +136,8 @@ def factorise(
     def rows() -> Iterator[NDArray[np.float64]]:
         for i, excerpt in enumerate(excerpts):
             row, memory = excerpt.row, excerpt.start(thresholds)
-            stretches = np.array(stretches_of(excerpt.use), dtype=np.int64).reshape(-1, 2)
-            n = int(np.sum((stretches[:, 1] - stretches[:, 0]) // row))
+            stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
+            n = excerpt.rows
             block = np.zeros((k + m + 3, n))
             block[i] = np.sqrt(row)
             # the plays need all that came before the samples used, G only what it remembers
@@ -195,12 +147,13 @@ def factorise(
             before, u = excerpt.u[:begin], excerpt.u[begin:end]
             memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
             u = Delay(delay.samples).apply(u)
-            # the play at r = 0 is the voltage itself
-            some, linear = np.append(thresholds, 0.0), np.append(memory, u[0])
-            columns = filtered_plays(u, some, linear, G, stretches, row)
-            block[k : k + m], block[k + m + 1] = columns[:-1], columns[-1]
-            block[k + m] = filtered_plays(u**3, some[-1:], linear[-1:] ** 3, G, stretches, row)
-            _bin(np.array(excerpt.x[begin:end]), stretches, row, block[-1])
+            for j in range(m):
+                r, f = thresholds[j : j + 1], memory[j : j + 1]
+                play = weighted_plays(u, r, np.ones(1), 0.0, 0.0, f)[0]
+                _average(filter_arx(G.a, G.b, play), stretches, row, block[k + j])
+            _average(filter_arx(G.a, G.b, u**3), stretches, row, block[k + m])
+            _average(filter_arx(G.a, G.b, u), stretches, row, block[k + m + 1])
+            _average(excerpt.x[begin:end], stretches, row, block[-1])
             yield block.T
 
     return triangular_factor(rows(), k + m + 3)
@@ -386,3 +339,72 @@ def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
         places.append(float(r[pair] @ q[pair] / q[pair].sum()))
         i = pair.stop
     return np.array(places)
+
+
+def _held_loss(
+    fit: Sequence[Excerpt],
+    held: Sequence[Excerpt],
+    thresholds: NDArray[np.float64],
+    dynamics: Dynamics,
+    delay: Delay,
+) -> tuple[float, NDArray[np.float64]]:
+    n = int(sum(e.use.sum() for e in fit))
+    result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds, n)
+    h = result.hysteresis
+    R = factorise(held, h.thresholds, dynamics, delay)
+    x = np.concatenate([result.offsets, h.weights, [h.p1, h.p2]])
+    return float(np.linalg.norm(R[:, :-1] @ x - R[:, -1])), merged(h)
+
+
+def choose_thresholds(
+    fit: Sequence[Excerpt],
+    held: Sequence[Excerpt],
+    swing: float,
+    dynamics: Dynamics,
+    delay: Delay,
+    tick: Callable[[float], None] | None = None,
+) -> NDArray[np.float64]:
+    """
+    Refine the thresholds until the held-out error stops falling.
+
+    The grid grows; at each size the plays that least squares left without weight are dropped and
+    neighbours merged, and the merged set is kept where it does no worse.
+
+    Parameters
+    ----------
+    fit, held : sequence of Excerpt
+        The same runs in the same order with the fitted and the held-out samples.
+    swing : float
+        Excited range of the normalised voltage.
+    dynamics : Dynamics
+    delay : Delay
+    tick : callable, optional
+        Called with the share of the work done; may raise to stop it.
+
+    Returns
+    -------
+    ndarray
+        Thresholds, normalised.
+    """
+    best = even_thresholds(swing, COUNTS[0])
+    best_loss, places = _held_loss(fit, held, best, dynamics, delay)
+    misses = 0
+    for i, count in enumerate(COUNTS[1:]):
+        if tick is not None:
+            tick(i / len(COUNTS))
+        even = even_thresholds(swing, count)
+        loss, places = _held_loss(fit, held, even, dynamics, delay)
+        candidates = [(loss, even)]
+        if 1 < places.size < even.size:
+            candidates.append((_held_loss(fit, held, places, dynamics, delay)[0], places))
+        # the fewer thresholds win a tie
+        loss, thresholds = min(
+            candidates, key=lambda c: (c[0] * (1 + 1e-3 * c[1].size), c[1].size)
+        )
+        if loss < (1.0 - GAIN) * best_loss:
+            best, best_loss, misses = thresholds, loss, 0
+        else:
+            misses += 1
+            if misses == 2:
+                break
+    return best

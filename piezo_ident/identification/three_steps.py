@@ -14,43 +14,49 @@ for.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 import functools
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.frequency_response import frequency_response
-from piezo_ident.identification.prepare import END_HELD, Run
+from piezo_ident.common.errors import Cancelled, IdentificationError
+from piezo_ident.identification.prepare import END_HELD, Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
     OutputErrorFit,
     simulation_error,
-    Stretch,
 )
 from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_steps
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     ArxFactor,
     excited_band,
+    frequency_response,
     instrumental_variables,
     prefilter,
     scan_orders,
     stabilised,
 )
 from piezo_ident.identification.step3_hysteresis import (
-    Excerpt,
+    choose_thresholds,
+    even_thresholds,
     factorise,
     fine_thresholds,
     fit_hysteresis,
+    HysteresisFit,
 )
+from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
+from scipy.optimize import OptimizeResult
 
-__all__ = ['first_step', 'second_step', 'triangle_excerpts']
+__all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_excerpts']
+
+#: plays of the paper, where the data cannot choose their number
+PAPER_COUNT = 10
 
 #: delays that the scan tries [samples]
 MAX_DELAY = 30
@@ -68,17 +74,8 @@ CANDIDATES = 5
 SLOWEST = 5.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Noise:
-    """One noise segment: input (voltage or w) and output, prefiltered, fitted part first."""
-
-    u: NDArray[np.float64]
-    y: NDArray[np.float64]
-    n_fit: int
-    band: float
-
-
-def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
+def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> tuple[Excerpt, float]:
+    """Return input and output of a noise segment, prefiltered, and its band [Hz]."""
     rate = run.piece.sample_rate
     if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
         raise IdentificationError(
@@ -89,7 +86,7 @@ def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noi
     y = prefilter(run.x[start:stop], rate, band)
     settle = min(500, u.size // 20)
     n_fit = u.size - int(END_HELD * u.size) - settle
-    return _Noise(u[settle:], y[settle:], n_fit, band)
+    return Excerpt(u[settle:], y[settle:], np.arange(u.size - settle) < n_fit), band
 
 
 def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
@@ -178,48 +175,49 @@ def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
     return excerpts
 
 
-def _held_error(noise: _Noise, model: Dynamics, delay: int) -> float:
+def _fitted(noise: Excerpt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    n_fit = int(noise.use.sum())
+    return noise.u[:n_fit], noise.x[:n_fit]
+
+
+def _held(noise: Excerpt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    n_fit = int(noise.use.sum())
+    return noise.u[n_fit:], noise.x[n_fit:]
+
+
+def _held_error(noise: Excerpt, model: Dynamics, delay: int) -> float:
     """Free-run error on the held-out noise in % of its rms, infinite when unstable."""
     if not model.is_stable:
         return float('inf')
-    u, y = noise.u[noise.n_fit :], noise.y[noise.n_fit :]
+    u, y = _held(noise)
     delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
     e = (y - filter_arx(model.a, model.b, delayed, at_rest=False))[u.size // 5 :]
     return float(100.0 * e.std() / y.std())
 
 
 def _refined_on_noise(
-    noise: _Noise, start: Dynamics, delay: int, maxiter: int, tick: Callable[[], None]
+    noise: Excerpt, start: Dynamics, delay: int, maxiter: int, tick: Callable[[], None]
 ) -> OutputErrorFit:
-    use = np.ones(noise.n_fit, dtype=bool)
-    use[: noise.n_fit // 50] = False
-    u = noise.u[: noise.n_fit]
+    u, y = _fitted(noise)
     delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
-    stretch = Stretch(delayed, noise.y[: noise.n_fit], use)
-    return output_error([stretch], start, maxiter=maxiter, tick=tick)
-
-
-def _factor(noise: _Noise, settings: Settings, delay: int) -> ArxFactor:
-    size = max(settings.max_order, *(settings.order or (1, 1)))
-    return arx_factor(noise.u[: noise.n_fit], noise.y[: noise.n_fit], size, size + delay)
+    use = np.arange(u.size) >= u.size // 50
+    return output_error([Excerpt(delayed, y, use)], start, maxiter=maxiter, tick=tick)
 
 
 def _orders(
-    noise: _Noise,
+    noise: Excerpt,
+    band: float,
     settings: Settings,
     delay: int,
     candidates: int,
     progress: Callable[[float], None],
 ) -> list[tuple[DynamicsResult, Dynamics]]:
     """Search the orders and refine the best few."""
-    factor = _factor(noise, settings, delay)
+    size = max(settings.max_order, *(settings.order or (1, 1)))
+    u, y = _fitted(noise)
+    factor = arx_factor(u, y, size, size + delay)
     table = scan_orders(
-        factor,
-        delay,
-        settings.max_order,
-        noise.u[noise.n_fit :],
-        noise.y[noise.n_fit :],
-        lambda share: progress(0.5 * share),
+        factor, delay, settings.max_order, *_held(noise), lambda share: progress(0.5 * share)
     )
     orders = [settings.order] if settings.order else table.ranked(SLACK)[:candidates]
     if not orders:
@@ -232,7 +230,6 @@ def _orders(
     for i, (na, nb) in enumerate(orders):
         theta, _ = factor.fit(na, nb, delay)
         ls = Dynamics(a=theta[:na], b=theta[na:])
-        u, y = noise.u[: noise.n_fit], noise.y[: noise.n_fit]
         iv = instrumental_variables(u, y, ls, delay)
         errors = {
             'least squares': _held_error(noise, ls, delay),
@@ -244,7 +241,7 @@ def _orders(
         fit = _refined_on_noise(noise, stabilised(start), delay, 10, tick)
         errors['output error'] = _held_error(noise, fit.dynamics, delay)
         if np.isfinite(errors['output error']):
-            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
+            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=band)
             found.append((result, fit.dynamics))
         progress(0.5 + 0.5 * (i + 1) / len(orders))
     if not found:
@@ -281,9 +278,11 @@ def second_step(
     run, start, stop = _longest_noise(runs)
     progress('dynamics', 0.0)
     # only good enough to undo the hysteresis
-    raw = _noise(run, run.u, start, stop)
-    [(_, first)] = _orders(raw, settings, d, 1, lambda share: progress('dynamics', 0.3 * share))
-    rate, band = run.piece.sample_rate, raw.band
+    rate = run.piece.sample_rate
+    raw, band = _noise(run, run.u, start, stop)
+    [(_, first)] = _orders(
+        raw, band, settings, d, 1, lambda share: progress('dynamics', 0.3 * share)
+    )
     del raw  # of an hour's record it is a gigabyte
     G = first.without_slow_poles(SLOWEST, rate).normalised()
 
@@ -298,11 +297,13 @@ def second_step(
 
     H = undo(G)
     progress('dynamics', 0.45)
-    undone = _noise(run, H(run.u), start, stop)
     found = _orders(
-        undone, settings, d, CANDIDATES, lambda share: progress('dynamics', 0.45 + 0.2 * share)
+        *_noise(run, H(run.u), start, stop),
+        settings,
+        d,
+        CANDIDATES,
+        lambda share: progress('dynamics', 0.45 + 0.2 * share),
     )
-    del undone
     result, G = _best_in_free_run(found, runs, H, delay, progress)
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
@@ -366,13 +367,13 @@ def _best_in_free_run(
 
 def _stretches(
     runs: Sequence[Run], H: Hysteresis, delay: Delay
-) -> tuple[list[Stretch], list[Stretch]]:
+) -> tuple[list[Excerpt], list[Excerpt]]:
     """Return what G is refined on, and the same with only what was held out."""
-    fitted: list[Stretch] = []
-    held: list[Stretch] = []
+    fitted: list[Excerpt] = []
+    held: list[Excerpt] = []
     for run in runs:
         out = run.held_out()
-        use = run.mask('step', 'settle', 'noise') & run.sound
+        use = run.mask('step', 'settle', 'noise') & run.use
         if use.any():
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]
@@ -385,5 +386,91 @@ def _stretches(
                 w, y = signal.sosfilt(sos, w), signal.sosfilt(sos, y)
             for stretches, mask in ((fitted, use & ~out), (held, use & out)):
                 if mask.any():
-                    stretches.append(Stretch(w, y, mask[part]))
+                    stretches.append(Excerpt(w, y, mask[part]))
     return fitted, held
+
+
+def _stop_on_request(
+    progress: Progress, total: int
+) -> tuple[Callable[[OptimizeResult], bool], list[Cancelled]]:
+    """Return a swarm callback that reports progress, and where it leaves a request to stop."""
+    request: list[Cancelled] = []
+
+    def callback(intermediate_result: OptimizeResult) -> bool:
+        try:
+            progress('hysteresis', 0.3 + 0.6 * intermediate_result.nit / total)
+        except Cancelled as stop:
+            request.append(stop)
+            return True
+        return False
+
+    return callback, request
+
+
+def third_step(
+    fit: Sequence[Excerpt],
+    held: Sequence[Excerpt],
+    G: Dynamics,
+    delay: Delay,
+    settings: Settings,
+    progress: Progress,
+    whole: Sequence[Excerpt] | None = None,
+) -> HysteresisFit:
+    """
+    Find H: its thresholds by held-out error unless their number is given, then its weights.
+
+    Parameters
+    ----------
+    fit, held : sequence of Excerpt
+        The same runs in the same order with the fitted and the held-out samples.
+    G, delay
+        What the plays pass before they are seen.
+    settings : Settings
+    progress : callable
+    whole : sequence of Excerpt, optional
+        What the weights are fitted to in the end; `fit` when absent.
+
+    Raises
+    ------
+    Cancelled
+        When `progress` raises it, the swarm included.
+    """
+    progress('hysteresis', 0.0)
+    fitted = whole or fit
+    swing = max(float(np.ptp(e.u[e.use])) for e in fitted)
+    n, rows = int(sum(e.use.sum() for e in fitted)), sum(e.rows for e in fitted)
+    if settings.thresholds is not None:
+        r = even_thresholds(swing, settings.thresholds)
+    elif any(e.use.any() for e in held):
+        r = choose_thresholds(
+            fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.3 * share)
+        )
+    else:
+        r = even_thresholds(swing, PAPER_COUNT)
+    R = factorise(fitted, r, G, delay)
+    progress('hysteresis', 0.3)
+    callback, request = _stop_on_request(progress, settings.swarm_iterations)
+    result = fit_hysteresis(
+        R,
+        r,
+        n,
+        rows=rows,
+        solver=settings.solver,
+        polish=settings.polish,
+        rng=np.random.default_rng(settings.seed),
+        swarm_size=settings.swarm_size,
+        maxiter=settings.swarm_iterations,
+        callback=callback,
+    )
+    if request:
+        raise request[0]
+    progress('hysteresis', 1.0)
+    return result
+
+
+def model_of(
+    rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
+) -> StageModel:
+    """Return the model, its zero of displacement moved by the offset of the fit."""
+    moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
+    return StageModel(rate, moved, fit.hysteresis, G, delay)

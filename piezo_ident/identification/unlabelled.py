@@ -10,15 +10,22 @@ error from w = H[v].  What the record does not excite is left at its neutral val
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
-from piezo_ident.identification.solvers.output_error import output_error, OutputErrorFit, Stretch
+from piezo_ident.identification.prepare import Excerpt, Run, true_runs
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    Fitted,
+    key_of,
+    Progress,
+    Settings,
+)
+from piezo_ident.identification.solvers.output_error import output_error, OutputErrorFit
 from piezo_ident.identification.step1_delay import delay_from_steps, find_jumps
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
@@ -28,17 +35,21 @@ from piezo_ident.identification.step2_dynamics import (
 )
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
-    Excerpt,
     factorise,
     fit_hysteresis,
 )
+from piezo_ident.identification.three_steps import model_of, third_step
+from piezo_ident.identification.warnings import warn_of_range
 from piezo_ident.model.initial_memory import fit_memory
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import ndimage, signal
 
-__all__ = ['JointFit', 'joint_fit']
+__all__ = ['JointFit', 'fit_unlabelled', 'joint_fit']
+
+#: samples at the end of an unlabelled record that an error needs at least
+MIN_HELD = 10
 
 #: orders (na, nb) tried on a record with little dynamic content, from none upwards
 ORDERS = ((1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (5, 4), (5, 5), (6, 6))
@@ -151,13 +162,11 @@ def _search_order(
     progress: Progress,
 ) -> tuple[tuple[int, int], OutputErrorFit] | None:
     """Return the order with the smallest BIC of free-run loss that beats G = 1 clearly."""
-    stretch = Stretch(w, x, use)
+    stretch = Excerpt(w, x, use)
     n = int(use.sum())
     still = (x - w)[use]
     static_loss = float(np.mean((still - still.mean()) ** 2))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], use.astype(np.int8), [0]])))
-    longest = int(np.argmax(edges[1::2] - edges[::2]))
-    part = slice(int(edges[2 * longest]), int(edges[2 * longest + 1]))
+    part = slice(*max(true_runs(use), key=lambda run: run[1] - run[0]))
     u, y = w[part] - w[part.start], x[part] - x[part.start]
     best: tuple[float, tuple[int, int], OutputErrorFit] | None = None
     orders = [settings.order] if settings.order else list(ORDERS)
@@ -263,7 +272,7 @@ def joint_fit(
                 break
             order, fit = searched
         else:
-            fit = output_error([Stretch(view(w), view(x - offset), windows)], G, maxiter=20)
+            fit = output_error([Excerpt(view(w), view(x - offset), windows)], G, maxiter=20)
         G = fit.dynamics.normalised()
     if fit is None:
         missing.append(('dynamics', _why_static(windows, band)))
@@ -295,3 +304,76 @@ def _why_static(windows: NDArray[np.bool_], band: float) -> str:
             'statically; add steps or noise'
         )
     return 'no order up to (6, 6) explains more than the hysteresis alone; add noise'
+
+
+def fit_unlabelled(
+    runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
+) -> Fitted:
+    """
+    Fit the run that covers the widest range, but for its end.
+
+    Raises
+    ------
+    IdentificationError
+        When what is left to fit or to judge by is too short, or does not move.
+    """
+    run = max(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n))
+    piece = run.piece
+    share = max(1.5, 0.2 * piece.duration)
+    held_time = settings.hold_out or min(share, 0.25 * piece.duration)
+    n_held = round(held_time * rate)
+    if n_held < MIN_HELD:
+        raise IdentificationError(
+            f'{run.record}: holding out {held_time:.3g} s leaves {n_held} samples to judge by; '
+            f'hold out at least {MIN_HELD / rate:.3g} s (--hold-out)'
+        )
+    n_fit = piece.n - n_held
+    if n_fit < 100:
+        raise IdentificationError(
+            f'{run.record}: {piece.n} samples, of which {max(n_fit, 0)} are left to fit after '
+            f'holding out {held_time:.3g} s; record longer or hold out less (--hold-out)'
+        )
+    joint = joint_fit(run, n_fit, scaling, settings, progress)
+    delay = Delay(joint.delay.samples)
+    u, x = run.u[:n_fit], run.x[:n_fit]
+    use = run.known[:n_fit].copy()
+    if use.sum() < n_fit // 5:
+        use[:] = True
+    # what chooses the thresholds is a part of what is fitted in the end, never the held-out end
+    late = np.zeros(n_fit, dtype=bool)
+    late[n_fit - int(0.25 * use.sum()) :] = True
+    fit_part = [Excerpt(u, x, use & ~late, joint.memory)]
+    late_part = [Excerpt(u, x, use & late, joint.memory)]
+    whole = [Excerpt(u, x, use, joint.memory)]
+    hysteresis = third_step(fit_part, late_part, joint.G, delay, settings, progress, whole)
+    model = model_of(rate, scaling, hysteresis, joint.G, delay)
+    low, high = float(u.min()), float(u.max())
+    span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
+    model = replace(model, scaling=replace(model.scaling, range=span))
+    # the start of these very thresholds; the rule carried over from other ones is an approximation
+    memories = {key_of(run): fit_memory(model, piece.cut(0, n_fit))}
+    if sum(key_of(other) == key_of(run) for other in runs) > 1:
+        # nobody could tell whose start it is
+        memories = {}
+    masks: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []
+    for other in runs:
+        fitted = np.zeros(other.piece.n, dtype=bool)
+        if other is run:
+            fitted[:n_fit] = True
+        masks.append((fitted, np.zeros(other.piece.n, dtype=bool)))
+    warnings = [
+        'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
+        f'together on the first {n_fit / rate:.4g} s of {run.record}',
+        *warn_of_range(run, n_fit, scaling),
+    ]
+    progress('hysteresis', 1.0)
+    return Fitted(
+        model=model,
+        delay=joint.delay,
+        dynamics=joint.dynamics,
+        hysteresis=hysteresis,
+        masks=masks,
+        warnings=warnings,
+        not_identified=joint.not_identified,
+        memories=memories,
+    )

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an identification says against itself: remarks on the fit, its errors and its data."""
+"""Warnings of an identification: about the fit, its errors and its data."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import DelayResult, DynamicsResult, Identification
-from piezo_ident.identification.step3_hysteresis import HysteresisFit
+from piezo_ident.identification.results import DynamicsResult, Identification
 from piezo_ident.model.stage_model import Scaling, StageModel
-from piezo_ident.record.faults import line_error
-from piezo_ident.record.record import Piece
+from piezo_ident.record.faults import line_error, misspelt
+from piezo_ident.record.record import Piece, Record
 
-__all__ = ['remark_on_range', 'remarks_on_errors', 'remarks_on_fit']
+__all__ = ['warn_of_range', 'warnings_of']
 
 #: change of G within the excited band below which the band is too narrow to know G by
 HARDLY = 0.1
@@ -23,50 +22,55 @@ HARDLY = 0.1
 SLOPE_TOLERANCE = 0.05
 
 
-def remarks_on_fit(
-    model: StageModel,
-    delay: DelayResult,
-    dynamics: DynamicsResult,
-    fit: HysteresisFit,
-    floor: float | None,
+def warnings_of(
+    result: Identification, records: Sequence[Record], pieces: Sequence[Piece]
 ) -> list[str]:
     """
     Return where the steps contradict each other, or the data do not carry what was fitted.
 
     Parameters
     ----------
-    model : StageModel
-    delay, dynamics, fit
-        What the steps found.
-    floor : float or None
-        Rms of the sensor noise [m].
+    result : Identification
+    records : sequence of Record
+        What was fitted.
+    pieces : sequence of Piece
+        Those of them that have the sampling rate of the model.
     """
-    said, stroke = [], abs(model.scaling.Y)
+    warnings = [*_of_fit(result), *_of_band(result.dynamics, result.model)]
+    wrong = misspelt([label for record in records for label in record.labels])
+    if wrong:
+        warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
+    return [*warnings, *_of_errors(result, pieces)]
+
+
+def _of_fit(result: Identification) -> list[str]:
+    delay, dynamics, fit = result.delay, result.dynamics, result.hysteresis
+    warnings = []
     if delay.agree is False and delay.step is not None:
-        said.append(
+        warnings.append(
             f'steps say a delay of {delay.step.samples} samples, the ARX loss says {delay.scan}; '
             f'{"the steps were" if delay.source == "steps" else "the loss was"} followed'
         )
     measured, modelled = dynamics.slope_measured, dynamics.slope_model
     if np.isfinite(measured) and abs(measured / modelled - 1.0) > SLOPE_TOLERANCE:
-        said.append(
+        warnings.append(
             f'the small-signal gain of the noise, {measured:.3g}, is not the slope of H at its '
             f'bias, {modelled:.3g} (normalised)'
         )
-    if floor is not None and floor > 0.01 * stroke:
-        said.append(f'the sensor noise is {100 * floor / stroke:.2g} % of stroke')
+    if result.noise_floor is not None and result.noise_floor > 1.0:
+        warnings.append(f'the sensor noise is {result.noise_floor:.2g} % of stroke')
     if fit.swarm is not None and fit.swarm_loss is not None:
         excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0 else 0.0
         if excess > 0.01:
-            said.append(
+            warnings.append(
                 f'the swarm ended {100.0 * excess:.2g} % of the loss above the least-squares '
                 f'optimum{", before polishing" if fit.polished else ""}; more iterations bring it '
                 'closer'
             )
-    return [*said, *_unseen(dynamics, model)]
+    return warnings
 
 
-def _unseen(dynamics: DynamicsResult, model: StageModel) -> list[str]:
+def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     """Say when the excitation ends where G has hardly begun to act."""
     # a band that ends near half the sampling rate leaves nothing to see
     if not dynamics.band < 0.2 * model.sample_rate:
@@ -82,14 +86,13 @@ def _unseen(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     ]
 
 
-def remarks_on_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
-    """Return what the errors themselves say about the trust that they deserve."""
-    said = []
+def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
+    warnings = []
     chosen, held = result.error('selection'), result.error('held out')
     error = held if np.isfinite(held) else chosen
     line = line_error(pieces)
     if np.isfinite(error) and error > 0.5 * line:
-        said.append(
+        warnings.append(
             f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
             f'{line:.3g} %: it explains little of these data'
         )
@@ -99,24 +102,31 @@ def remarks_on_errors(result: Identification, pieces: Sequence[Piece]) -> list[s
         if row.data == 'held out' and row.segment.partition(':')[0] in ('idle', 'ramp')
     ]
     if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
-        said.append(
+        warnings.append(
             f'where the stage only rests or is moved over, the model errs by up to '
             f'{max(easy):.3g} % of stroke, more than the {chosen:.3g} % on what chose it: the '
             'stage does something that the model lacks; judge it on a record of another kind'
         )
-    return said
+    fitted = result.error('fitted')
+    # a record without noise may be fitted exactly
+    if result.dynamics.table is None and held > 3.0 * max(fitted, 1e-9):
+        warnings.append(
+            f'the held-out error is {held / max(fitted, 1e-9):.1f} times the fitted one: this '
+            'record does not pin the model down; drive the range more than once'
+        )
+    return warnings
 
 
-def remark_on_range(run: Run, n_fit: int, scaling: Scaling) -> str:
-    """Return what to say when the held-out part leaves the voltages of the fitted one."""
+def warn_of_range(run: Run, n_fit: int, scaling: Scaling) -> list[str]:
+    """Return a warning when the held-out part leaves the voltages of the fitted one."""
     fitted, held = run.u[:n_fit], run.u[n_fit:]
     if held.min() > fitted.min() - 0.01 and held.max() < fitted.max() + 0.01:
-        return ''
+        return []
     spans = [
         f'{scaling.v0 + scaling.V * u.min():.3g} .. {scaling.v0 + scaling.V * u.max():.3g} V'
         for u in (fitted, held)
     ]
-    return (
+    return [
         f'the fitted part covers {spans[0]}, the held-out part {spans[1]}: its error is partly '
         'one of extrapolation'
-    )
+    ]

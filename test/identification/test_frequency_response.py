@@ -4,7 +4,7 @@
 """Welch's estimate against a filter that is known."""
 
 import numpy as np
-from piezo_ident.identification.frequency_response import _straightened, frequency_response
+from piezo_ident.identification.step2_dynamics import _straightened, frequency_response
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
 from scipy import signal

@@ -5,13 +5,13 @@
 
 import numpy as np
 from piezo_ident.excitation.signals import triangle
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step3_hysteresis import (
+    choose_thresholds,
     even_thresholds,
-    Excerpt,
     factorise,
     fit_hysteresis,
 )
-from piezo_ident.identification.threshold_choice import choose_thresholds
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 import pytest

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear
 
-__all__ = ['bounded_least_squares', 'residual_inflation', 'singular_is_ours', 'triangular_factor']
+__all__ = ['bounded_least_squares', 'singular_is_ours', 'triangular_factor']
 
 #: rows that are factorised at once: a block of some dozen columns stays in the cache
 ROWS = 1024
@@ -87,27 +87,3 @@ def bounded_least_squares(
         result = lsq_linear(A / scale, y, (lower * scale, upper * scale), method='trf')
     x = np.clip(result.x / scale, lower, upper)
     return x, float(np.sum((A @ x - y) ** 2))
-
-
-def residual_inflation(e: NDArray[np.float64], limit: int = 2000) -> float:
-    """
-    Return by how much correlated residuals inflate a variance over white ones.
-
-    The sum ``1 + 2 sum rho_k`` of the autocorrelation up to its first crossing of zero.
-
-    Parameters
-    ----------
-    e : ndarray, shape (n,)
-        Residual.
-    limit : int, optional
-        Largest lag.
-    """
-    x = e - e.mean()
-    power = float(x @ x)
-    if power == 0.0 or x.size < 4:
-        return 1.0
-    spectrum = np.fft.rfft(x, 2 * x.size)
-    rho = np.fft.irfft(np.abs(spectrum) ** 2)[: min(limit, x.size // 2)] / power
-    negative = np.flatnonzero(rho <= 0.0)
-    end = int(negative[0]) if negative.size else rho.size
-    return float(max(1.0, 1.0 + 2.0 * rho[1:end].sum()))

@@ -19,31 +19,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.identification.solvers.lag_products import lag_products, lag_sums, stretches_of
+from piezo_ident.common.kernel import kernel
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
-__all__ = ['OutputErrorFit', 'Stretch', 'output_error', 'simulation_error']
+__all__ = ['OutputErrorFit', 'lag_products', 'output_error', 'simulation_error']
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """
-    Data for one simulation.
-
-    Attributes
-    ----------
-    w, y : ndarray, shape (n,)
-        Input, already delayed by d, and output; the run starts in equilibrium with ``w[0]``.
-    use : ndarray of bool, shape (n,)
-        Samples that count.
-    """
-
-    w: NDArray[np.float64]
-    y: NDArray[np.float64]
-    use: NDArray[np.bool_]
+#: samples whose products are summed at once
+STRETCH = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +70,70 @@ class OutputErrorFit:
         return np.asarray(J @ self.covariance @ J.T)
 
 
+@kernel
+def _first_row(
+    x: NDArray[np.float64], z: NDArray[np.float64], x_at: int, z_at: int, n: int, lags: int
+) -> NDArray[np.float64]:
+    row = np.zeros(lags)
+    # all lags of a stretch while it is in the cache
+    for start in range(0, n, STRETCH):
+        for j in range(lags):
+            total = 0.0
+            for k in range(start, min(start + STRETCH, n)):
+                total += x[x_at + k] * z[z_at + k - j]
+            row[j] += total
+    return row
+
+
+def lag_products(
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    x_at: int,
+    z_at: int,
+    n: int,
+    n_x: int,
+    n_z: int,
+) -> NDArray[np.float64]:
+    """
+    Return the sums of products of lagged signals, without the matrix of their lags.
+
+    ``S(i, j)`` is the sum over n samples of ``x(k - i) z(k - j)``.  Row 0 and column 0 are summed;
+    each further row follows from the one before:
+
+        S(i+1, j+1) = S(i, j) + x(s-1-i) z(s-1-j) - x(e-1-i) z(e-1-j)
+
+    Parameters
+    ----------
+    x, z : ndarray, shape (any,)
+    x_at, z_at : int
+        Where the n samples s .. e-1 begin in each; at least as many samples as there are lags
+        come before.
+    n : int
+    n_x, n_z : int
+        Lags of each, at least 1.
+
+    Returns
+    -------
+    ndarray, shape (n_x, n_z)
+
+    Examples
+    --------
+    >>> x = np.arange(5.0)
+    >>> lag_products(x, x, 2, 2, 3, 2, 2)
+    array([[29., 20.],
+           [20., 14.]])
+    """
+    S = np.empty((n_x, n_z))
+    S[0] = _first_row(x, z, x_at, z_at, n, n_z)
+    S[:, 0] = _first_row(z, x, z_at, x_at, n, n_x)
+    j = np.arange(1, n_z)
+    for i in range(1, n_x):
+        first = x[x_at - i] * z[z_at - j]
+        last = x[x_at + n - i] * z[z_at + n - j]
+        S[i, 1:] = S[i - 1, :-1] + (first - last)
+    return S
+
+
 Stretches = list[tuple[int, int]]
 
 
@@ -111,17 +160,17 @@ def _past(
 class _Problem:
     """Normal equations of the linearised problem, offsets eliminated stretch by stretch."""
 
-    def __init__(self, stretches: Sequence[Stretch], na: int, nb: int) -> None:
+    def __init__(self, stretches: Sequence[Excerpt], na: int, nb: int) -> None:
         self.stretches, self.na, self.nb = stretches, na, nb
         self.n = int(sum(s.use.sum() for s in stretches))
-        self.used = [stretches_of(s.use) for s in stretches]
+        self.used = [s.stretches for s in stretches]
 
     def errors(self, model: Dynamics) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
         """Return what the free run leaves of each stretch, without its mean, and the means."""
         found, offsets = [], []
         for s, used in zip(self.stretches, self.used, strict=True):
-            e = filter_arx(model.a, model.b, s.w)
-            np.subtract(s.y, e, out=e)
+            e = filter_arx(model.a, model.b, s.u)
+            np.subtract(s.x, e, out=e)
             offsets.append(_mean(e, used))
             e -= offsets[-1]
             found.append(e)
@@ -144,9 +193,9 @@ class _Problem:
             groups = []
             if na:
                 # the simulated output but for a constant, which `_past` takes out
-                y_f = _past(filter_arx(model.a, one, s.y - e), used, p, negative=True)
+                y_f = _past(filter_arx(model.a, one, s.x - e), used, p, negative=True)
                 groups.append((y_f, p - 1, slice(0, na), na))
-            w_f = _past(filter_arx(model.a, one, s.w), used, p)
+            w_f = _past(filter_arx(model.a, one, s.u), used, p)
             groups.append((w_f, p, slice(na, p), p - na))
             sums, n = np.zeros(p), 0
             for start, stop in used:
@@ -155,7 +204,9 @@ class _Problem:
                 for x, x_at, rows, n_x in groups:
                     at = start + x_at
                     g[rows] += lag_products(x, e, at, start, here, n_x, 1)[:, 0]
-                    sums[rows] += lag_sums(x, at, here, n_x)
+                    back = np.arange(1, n_x)
+                    sums[rows] += float(np.sum(x[at : at + here]))
+                    sums[rows][1:] += np.cumsum(x[at - back] - x[at + here - back])
                     for z, z_at, columns, n_z in groups:
                         if columns.start >= rows.start:
                             H[rows, columns] += lag_products(
@@ -166,14 +217,14 @@ class _Problem:
         return H, g
 
 
-def simulation_error(stretches: Sequence[Stretch], model: Dynamics) -> float:
+def simulation_error(stretches: Sequence[Excerpt], model: Dynamics) -> float:
     """Return the rms of the free-run error, an offset taken out of each stretch."""
     problem = _Problem(stretches, model.a.size, model.b.size)
     return float(np.sqrt(problem.loss(problem.errors(model)[0])))
 
 
 def output_error(
-    stretches: Sequence[Stretch],
+    stretches: Sequence[Excerpt],
     start: Dynamics,
     maxiter: int = 30,
     tol: float = 1e-7,
@@ -184,7 +235,7 @@ def output_error(
 
     Parameters
     ----------
-    stretches : sequence of Stretch
+    stretches : sequence of Excerpt
     start : Dynamics
         Stable start; its orders are kept.
     maxiter : int, optional

@@ -22,9 +22,13 @@ from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.identify import identify
+from piezo_ident.identification.identify import (
+    find_delay,
+    find_dynamics,
+    find_hysteresis,
+    identify,
+)
 from piezo_ident.identification.results import Identification, Settings, Steps
-from piezo_ident.identification.single_steps import find_delay, find_dynamics, find_hysteresis
 from piezo_ident.live.capture import refuse_incomplete, Snapshot
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs

@@ -7,12 +7,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
-    residual_inflation,
     ROWS,
     triangular_factor,
 )
 import pytest
-from scipy import signal
 from scipy.optimize import lsq_linear
 
 
@@ -69,16 +67,3 @@ def test_column_of_zeros_is_no_obstacle():
     assert_allclose(x[[0, 2]], [1, 1], atol=1e-9)
     assert loss < 1e-18
     assert np.all(np.isfinite(x))
-
-
-@pytest.mark.parametrize('phi', [0.0, 0.5, 0.9])
-def test_inflation_of_a_first_order_process(phi):
-    # 1 + 2 sum phi^k = (1 + phi)/(1 - phi)
-    e = signal.lfilter([1], [1, -phi], np.random.default_rng(5).standard_normal(400_000))
-    assert residual_inflation(e) == pytest.approx((1 + phi) / (1 - phi), rel=0.06)
-
-
-def test_inflation_of_nothing():
-    assert residual_inflation(np.zeros(100)) == 1.0
-    assert residual_inflation(np.array([1.0, 2.0])) == 1.0
-    assert residual_inflation(np.tile([1.0, -1.0], 50)) == 1.0

@@ -3,9 +3,17 @@
 
 """Refinement by output error: its gradient, its result, its covariance."""
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
-from piezo_ident.identification.solvers.output_error import _Problem, output_error, RADIUS, Stretch
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.solvers.output_error import (
+    _Problem,
+    lag_products,
+    output_error,
+    RADIUS,
+)
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
 
@@ -16,7 +24,7 @@ def stretch(seed=0, n=3000, noise=0.0, offset=0.0, G=G, start=0.0):
     rng = np.random.default_rng(seed)
     w = start + rng.standard_normal(n)
     y = filter_arx(G.a, G.b, w) + offset + noise * rng.standard_normal(n)
-    return Stretch(w, y, np.ones(n, dtype=bool))
+    return Excerpt(w, y, np.ones(n, dtype=bool))
 
 
 @pytest.mark.parametrize(('na', 'nb'), [(2, 2), (1, 3), (3, 1)])
@@ -26,7 +34,7 @@ def test_gradient_against_finite_differences(na, nb):
     some = stretch(2, 400, noise=0.1, offset=3.0, start=0.7)
     use = np.ones(400, dtype=bool)
     use[:37] = use[200:230] = False
-    problem = _Problem([Stretch(some.w, some.y, use), stretch(3, 200)], na, nb)
+    problem = _Problem([Excerpt(some.u, some.x, use), stretch(3, 200)], na, nb)
     _, g = problem.normal(model, problem.errors(model)[0])
     theta = np.concatenate([model.a, model.b])
     numerical = []
@@ -56,9 +64,9 @@ def test_several_stretches_have_their_own_offsets_and_holes():
     one, two = stretch(0, offset=1.0), stretch(1, offset=-2.0, start=0.5)
     use = np.ones(3000, dtype=bool)
     use[1000:2000] = False
-    y = two.y.copy()
+    y = two.x.copy()
     y[1000:2000] = 1e6
-    fit = output_error([one, Stretch(two.w, y, use)], Dynamics([-1.4, 0.7], [0.1, 0.3]))
+    fit = output_error([one, Excerpt(two.u, y, use)], Dynamics([-1.4, 0.7], [0.1, 0.3]))
     assert_allclose(fit.dynamics.a, G.a, atol=1e-6)
     assert_allclose(fit.offsets, [1.0, -2.0], atol=1e-5)
 
@@ -70,7 +78,7 @@ def test_never_unstable_and_never_worse(seed):
     w = rng.standard_normal(800)
     wild = np.cumsum(np.cumsum(rng.standard_normal(800)))
     start = Dynamics([-1.9, 0.95], [0.1, 0.1])
-    some = Stretch(w, wild, np.ones(800, dtype=bool))
+    some = Excerpt(w, wild, np.ones(800, dtype=bool))
     fit = output_error([some], start)
     assert fit.dynamics.radius < RADIUS
     problem = _Problem([some], 2, 2)
@@ -138,3 +146,24 @@ def test_a_model_without_poles_is_fitted_too():
     fit = output_error([stretch(G=Dynamics([], [0.6, 0.3]))], Dynamics([], [0.2, 0.1]))
     assert fit.dynamics.a.size == 0
     assert_allclose(fit.dynamics.b, [0.6, 0.3], atol=1e-9)
+
+
+def lags_of(x, at, n, lags):
+    return np.stack([x[at - i : at - i + n] for i in range(lags)])
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 40),
+    st.integers(1, 9),
+    st.integers(1, 9),
+    st.integers(9, 15),
+    st.integers(9, 15),
+)
+def test_products_are_those_of_the_matrix_of_lags(seed, n, n_x, n_z, x_at, z_at):
+    rng = np.random.default_rng(seed)
+    x, z = rng.standard_normal(x_at + n), rng.standard_normal(z_at + n)
+    expected = lags_of(x, x_at, n, n_x) @ lags_of(z, z_at, n, n_z).T
+    got = lag_products(x, z, x_at, z_at, n, n_x, n_z)
+    assert_allclose(got, expected, atol=1e-12)
