@@ -40,12 +40,9 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main as piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.model.files import load
-from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.common.files import write_together
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.figures import identification  # noqa: F401 - loaded once, not per copy
-from piezo_ident.report.folder import put_in_place
-from piezo_ident.report.html import Shown
 from reliability.rows import write_rows
 
 #: kills of a whole study
@@ -61,17 +58,7 @@ RATE = 20_000.0
 
 @dataclass(frozen=True)
 class Job:
-    """
-    Work that writes.
-
-    Attributes
-    ----------
-    kind, name : str
-    run : callable
-        Does it, given the folder to write to, and returns the exit code.
-    outputs : tuple of str
-        Names of what it writes there.
-    """
+    """Work that writes `outputs` into the folder that `run` is given; it returns the exit code."""
 
     kind: str
     name: str
@@ -86,76 +73,62 @@ def record(n: int, seed: int = 1) -> Record:
     return Record((Piece(v, 7.5e-6 * v + 1e-9 * rng.standard_normal(n), RATE),))
 
 
-def _save(model: Path) -> Callable[[Path], int]:
-    def run(folder: Path) -> int:
-        loaded = load(model)
-        for _ in range(100):
-            loaded.save(folder / 'model.yaml')
-        return 0
-
-    return run
+def _save(folder: Path) -> int:
+    model = pi.SimulatedStage.load('paper').model
+    for _ in range(100):
+        model.save(folder / 'model.yaml')
+    return 0
 
 
-def _report(model: Path) -> Callable[[Path], int]:
-    def run(folder: Path) -> int:
-        shown = [Shown('loops', 'loops', '', bytes(300_000))]
-        texts = {'identification.json': '{}\n', 'model.yaml': model.read_text()}
-        texts['report.html'] = '<p>' + 'x' * 300_000
-        for _ in range(40):
-            put_in_place(folder, texts, shown, ())
-        return 0
-
-    return run
+def _report(folder: Path) -> int:
+    files = {'numbers.json': b'{}', 'loops.png': bytes(300_000), 'report.html': b'x' * 300_000}
+    for _ in range(40):
+        write_together(folder, files)
+    return 0
 
 
 def jobs(inputs: Path, *, slow: bool) -> list[Job]:
-    """
-    Return the work, and make what it reads.
-
-    Parameters
-    ----------
-    inputs : Path
-        Folder for the inputs.
-    slow : bool
-        Whether identifications and diagnoses are among it.
-    """
-    stage, samples = inputs / 'model.yaml', inputs / 'record.npz'
-    SimulatedStage.load('stage_paper').model.save(stage)
+    """Return the work, `slow` with identification and diagnosis, and make what it reads."""
+    stage, samples, programme = (inputs / x for x in ('model.yaml', 'record.npz', 'program.yaml'))
+    pi.SimulatedStage.load('paper').model.save(stage)
     pi.write(record(60_000), samples, overwrite=True)
-
-    def command(*words: object) -> Callable[[Path], int]:
-        return lambda folder: piezo_ident([str(w).replace('OUT', str(folder)) for w in words])
-
-    programme = inputs / 'programme.yaml'
     programme.write_text('{limits: [0, 10], segments: [{signal: hold, level: 5, duration: 2}]}')
-    found = [
-        Job('save', 'save', _save(stage), ('model.yaml',)),
-        Job('report', 'report', _report(stage),
-            ('report.html', 'identification.json', 'model.yaml', 'loops.png')),
-        *(
-            Job('convert', f'convert to {x}', command('convert', samples, f'OUT/{x}',
-                '--overwrite'), (x,)) for x in FORMATS
-        ),
-        Job('simulate', 'simulate', command('simulate', '--program', programme, 'OUT/r.npz',
-            '--overwrite'), ('r.npz',)),
-        Job('predict', 'predict', command('predict', stage, samples, '--out', 'OUT/p.csv',
-            '--plot', 'OUT/p.png'), ('p.csv', 'p.png')),
-    ]  # fmt: skip
+
+    def command(kind: str, words: str, *outputs: str) -> Job:
+        given = [word for word in words.split() if not word.startswith('-')]
+        name = f'{kind} to {given[-1][4:]}' if kind == 'convert' else kind
+        places = {'STAGE': stage, 'SAMPLES': samples, 'PROGRAM': programme, 'IN': inputs}
+
+        def run(folder: Path) -> int:
+            line = [kind]
+            for word in words.split():
+                head, _, name = word.partition('/')
+                place = {**places, 'OUT': folder}.get(head)
+                line.append(word if place is None else str(place / name))
+            return piezo_ident(line)
+
+        return Job(kind, name, run, outputs)
+
+    works = [
+        Job('save', 'save', _save, ('model.yaml',)),
+        Job('report', 'report', _report, ('numbers.json', 'loops.png', 'report.html')),
+        *(command('convert', f'--overwrite SAMPLES OUT/{x}', x) for x in FORMATS),
+        command('simulate', '--overwrite --program PROGRAM OUT/r.npz', 'r.npz'),
+        command('predict', 'STAGE SAMPLES --out OUT/p.csv --plot OUT/p.png', 'p.csv', 'p.png'),
+    ]
     if slow:
         for name, wanted in (('identification', 'learn.npz'), ('validation', 'check.npz')):
             assert not piezo_ident(
                 ['simulate', '--program', name, str(inputs / wanted), '--overwrite']
             )
-        found += [
-            Job('identify', 'identify', command('identify', inputs / 'learn.npz', '--model',
-                'OUT/model.yaml', '--report', 'OUT/report'),
-                ('model.yaml', 'report/report.html', 'report/identification.json',
-                 'report/model.yaml')),
-            Job('diagnose', 'diagnose', command('diagnose', stage, inputs / 'check.npz', '--only',
-                'creep', '--model', 'OUT/refined.yaml', '--report', 'OUT/report'),
-                ('refined.yaml', 'report/report.html', 'report/diagnosis.json')),
+        works += [
+            command('identify', 'IN/learn.npz --model OUT/model.yaml --report OUT/report',
+                    'model.yaml', 'report/report.html', 'report/identification.json'),
+            command('diagnose', 'STAGE IN/check.npz --only creep --model OUT/refined.yaml '
+                    '--report OUT/report',
+                    'refined.yaml', 'report/report.html', 'report/diagnosis.json'),
         ]  # fmt: skip
-    return found
+    return works
 
 
 def digest(path: Path) -> str:
@@ -171,20 +144,34 @@ def digest(path: Path) -> str:
     return hashlib.sha1(path.read_bytes()).hexdigest()
 
 
-@contextmanager
-def _started(job: Job, folder: Path) -> Iterator[int]:
-    """Run the work in a copy of this process, and end that in any case."""
+def _forked(job: Job, folder: Path, errors: int) -> int:
+    """Start the work in a copy of this process, and return the id of that."""
     sys.stdout.flush()
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')  # threads of libraries, none of which is at work
         pid = os.fork()
-    if not pid:
-        code = 70
+    if pid:
+        return pid
+    code = 70
+    try:
+        os.dup2(os.open(os.devnull, os.O_RDWR), 1)
+        os.dup2(errors, 2)
+        # a test runner may have put others in their places
+        sys.stdout, sys.stderr = os.fdopen(1, 'w'), os.fdopen(2, 'w')
         try:
-            null = os.open(os.devnull, os.O_RDWR)
-            code = _quietly(job, folder, null, null)
-        finally:
-            os._exit(code)
+            code = job.run(folder)
+        except PiezoIdentError as error:
+            print(error, file=sys.stderr)
+            code = 2
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+@contextmanager
+def _started(job: Job, folder: Path) -> Iterator[int]:
+    """Run the work in a copy of this process, and end that in any case."""
+    pid = _forked(job, folder, os.open(os.devnull, os.O_RDWR))
     try:
         yield pid
     finally:
@@ -193,42 +180,28 @@ def _started(job: Job, folder: Path) -> Iterator[int]:
         os.waitpid(pid, 0)
 
 
-def _quietly(job: Job, folder: Path, null: int, errors: int) -> int:
-    os.dup2(null, 1)
-    os.dup2(errors, 2)
-    # whoever looks after a test may have put others in their places
-    sys.stdout, sys.stderr = os.fdopen(1, 'w'), os.fdopen(2, 'w')
-    code = job.run(folder)
-    sys.stderr.flush()
-    return code
+def _leftovers(folder: Path) -> bool:
+    return any(LEFTOVER.fullmatch(n) for _, d, f in os.walk(folder) for n in (*d, *f))
 
 
-def _leftovers(folder: Path) -> list[str]:
-    return [n for _, d, f in os.walk(folder) for n in (*d, *f) if LEFTOVER.fullmatch(n)]
-
-
-def _strangers(folder: Path, known: set[str]) -> list[str]:
-    """Return names in a folder that are neither outputs nor leftovers."""
-    found = []
-    for path in folder.rglob('*'):
-        inside = path.relative_to(folder)
-        if not any(LEFTOVER.fullmatch(part) for part in inside.parts) and path.is_file():
-            found.append(str(inside))
-    return sorted(set(found) - known)
+def _files(folder: Path) -> set[str]:
+    """Return the names of the files that no killed process has left behind."""
+    inside = (p.relative_to(folder) for p in folder.rglob('*') if p.is_file())
+    return {str(p) for p in inside if not any(map(LEFTOVER.fullmatch, p.parts))}
 
 
 @dataclass
 class Tried:
-    """One kind of work and what was found after its kills."""
+    """Work that ran to its end once: its files, what its outputs may be, and its time [s]."""
 
     job: Job
-    whole: set[str]
+    files: set[str]
     states: dict[str, set[str]]
     seconds: float
 
 
-def rehearse(job: Job, folder: Path, old: Path) -> Tried:
-    """Run the work once to its end: what it writes then is the new."""
+def rehearse(job: Job, folder: Path, old: Path) -> Tried | None:
+    """Run the work once to its end: its outputs then are the new; None where it fails."""
     shutil.copytree(old, folder)
     before = {name: digest(folder / name) for name in job.outputs}
     start = time.perf_counter()
@@ -236,32 +209,17 @@ def rehearse(job: Job, folder: Path, old: Path) -> Tried:
         # not reaped yet: the end of the block does that
         status = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT).si_status
         seconds = time.perf_counter() - start
-    return (
-        Tried(job, set(), {}, seconds)
-        if status
-        else Tried(
-            job,
-            {str(p.relative_to(folder)) for p in folder.rglob('*') if p.is_file()},
-            {name: {before[name], digest(folder / name)} for name in job.outputs},
-            seconds,
-        )
-    )
+    states = {name: {before[name], digest(folder / name)} for name in job.outputs}
+    return None if status else Tried(job, _files(folder), states, seconds)
 
 
 def kill(tried: Tried, folder: Path, old: Path, rng: random.Random, *, writing: bool) -> str:
-    """
-    Kill the work once.
-
-    Returns
-    -------
-    str
-        What stood there: 'old', 'new' or 'old and new'; anything else is a finding.
-    """
+    """Kill the work once, and say what is there: one of `GOOD`, or what is wrong."""
     shutil.copytree(old, folder)
     before = {name: digest(folder / name) for name in tried.job.outputs}
     with _started(tried.job, folder) as pid:
         end = time.perf_counter() + tried.seconds * (3.0 if writing else rng.random())
-        while time.perf_counter() < end and (not writing or not _leftovers(folder)):
+        while time.perf_counter() < end and not (writing and _leftovers(folder)):
             if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
                 break
         time.sleep(rng.random() * 0.05 if writing else 0.0)
@@ -274,10 +232,8 @@ def kill(tried: Tried, folder: Path, old: Path, rng: random.Random, *, writing: 
         if now not in states:
             return f'{name}: neither the old nor the new'
         seen.add('old' if now == before[name] else 'new')
-    strangers = _strangers(folder, tried.whole | {'old.txt'})
-    if strangers:
-        return f'unknown names {strangers}'
-    return ' and '.join(sorted(seen, reverse=True))
+    strangers = _files(folder) - tried.files
+    return f'unknown names {strangers}' if strangers else ' and '.join(sorted(seen, reverse=True))
 
 
 def old_outputs(folder: Path, works: list[Job]) -> None:
@@ -295,13 +251,13 @@ def old_outputs(folder: Path, works: list[Job]) -> None:
 
 
 def kills(counts: dict[str, int], place: Path, works: list[Job]) -> Iterator[tuple[Job, str]]:
-    """Yield the work that was killed and what stood there afterwards."""
+    """Yield the work that was killed and what was there afterwards."""
     rng = random.Random(1)
     for number, job in enumerate(works):
         old = place / f'old{number}'
         old_outputs(old, [job])
         tried = rehearse(job, place / f'whole{number}', old)
-        if not tried.states:
+        if tried is None:
             yield job, 'does not run'
             continue
         same = sum(1 for other in works if other.kind == job.kind)
@@ -329,37 +285,18 @@ def mounted(folder: Path, options: str) -> Iterator[bool]:
 
 
 def refused(job: Job, folder: Path) -> str:
-    """
-    Run work where it cannot write.
-
-    Returns
-    -------
-    str
-        Empty when it is refused as it should; else what is wrong.
-    """
+    """Run work where it cannot write; return what is wrong, empty when it is refused well."""
     names = sorted(os.listdir(folder))
     before = {name: digest(folder / name) for name in job.outputs}
     reader, writer = os.pipe()
-    pid = os.fork()
-    if not pid:
-        code = 70
-        try:
-            try:
-                code = _quietly(job, folder, os.open(os.devnull, os.O_RDWR), writer)
-            except PiezoIdentError as error:
-                os.write(2, f'{error}\n'.encode())
-                code = 2
-        finally:
-            os._exit(code)
+    pid = _forked(job, folder, writer)
     os.close(writer)
     with open(reader, errors='replace') as stream:
-        said = stream.read()
+        message = stream.read()
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    wrong = []
-    if code != 2:
-        wrong.append(f'exit code {code}')
-    if said.count('\n') != 1 or 'cannot be written' not in said:
-        wrong.append(f'said {said[-300:]!r}')
+    wrong = [f'exit code {code}'] if code != 2 else []
+    if message.count('\n') != 1 or 'cannot be written' not in message:
+        wrong.append(f'message {message[-300:]!r}')
     if before != {name: digest(folder / name) for name in job.outputs}:
         wrong.append('lost what was there')
     if sorted(os.listdir(folder)) != names:
@@ -392,33 +329,23 @@ def _fill(path: Path) -> None:
 # --- the study ------------------------------------------------------------------------------
 
 
-def rows_of(killed: list[tuple[Job, str]], starved: dict[str, list[tuple[Job, str]]]) -> list:
+def rows_of(
+    killed: list[tuple[Job, str]], starved: dict[str, list[tuple[Job, str]]]
+) -> list[dict[str, str]]:
     """Return the rows of the table."""
     rows = []
-    good = GOOD
     for kind in KILLS:
-        said = [x for job, x in killed if job.kind == kind]
-        counted = ', '.join(f'{n} {x}' for x, n in Counter(said).most_common())
-        bad = sum(x not in good for x in said)
-        rows.append(
-            {
-                'what': f'SIGKILL: {kind}',
-                'how_often': f'{len(said)} kills',
-                'result': f'{counted}; {bad} damaged',
-                'command': 'make crash',
-            }
-        )
-    for what, found in starved.items():
-        bad = [f'{job.name}: {x}' for job, x in found if x]
-        rows.append({
-            'what': what,
-            'how_often': f'{len(found)} commands and formats',
-            'result': '; '.join(bad)
-            or ('one line, exit code 2, nothing lost, nothing left' if found
-                else 'skipped: mounting is not allowed here'),
-            'command': 'make crash',
-        })  # fmt: skip
-    return rows
+        states = [state for job, state in killed if job.kind == kind]
+        counted = ', '.join(f'{n} {state}' for state, n in Counter(states).most_common())
+        bad = sum(state not in GOOD for state in states)
+        rows.append((f'SIGKILL: {kind}', f'{len(states)} kills', f'{counted}; {bad} damaged'))
+    for what, outcomes in starved.items():
+        good = 'one line, exit code 2, nothing lost, nothing left'
+        bad_ones = '; '.join(f'{job.name}: {wrong}' for job, wrong in outcomes if wrong)
+        result = bad_ones or (good if outcomes else 'skipped: mounting is not allowed here')
+        rows.append((what, f'{len(outcomes)} commands and formats', result))
+    keys = ('what', 'how_often', 'result', 'command')
+    return [dict(zip(keys, (*row, 'make crash'), strict=True)) for row in rows]
 
 
 def main() -> int:
@@ -433,14 +360,14 @@ def main() -> int:
         (place / 'inputs').mkdir()
         works = jobs(place / 'inputs', slow=True)
         killed = []
-        for job, said in kills(counts, place, works):
-            killed.append((job, said))
-            print(json.dumps([job.name, said]), flush=True)
+        for job, state in kills(counts, place, works):
+            killed.append((job, state))
+            print(json.dumps([job.name, state]), flush=True)
         starved = {}
         for what, options in (('disk full', 'full'), ('read-only file system', 'ro')):
             starved[what] = list(without_room(place, works, options))
-            for job, said in starved[what]:
-                print(json.dumps([what, job.name, said or 'refused']), flush=True)
+            for job, wrong in starved[what]:
+                print(json.dumps([what, job.name, wrong or 'refused']), flush=True)
     rows = rows_of(killed, starved)
     if args.kills is None:
         write_rows('crash', rows)

@@ -34,19 +34,19 @@ def works(tmp_path_factory):
 @pytest.mark.parametrize('name', KINDS)
 def test_sigkill(tmp_path, works, name):
     job = works[name]
-    found = [said for _, said in crash.kills({job.kind: 2}, tmp_path, [job])]
-    assert len(found) == 2
-    assert crash.GOOD.issuperset(found)
+    states = [state for _, state in crash.kills({job.kind: 2}, tmp_path, [job])]
+    assert len(states) == 2
+    assert crash.GOOD.issuperset(states)
 
 
 @pytest.mark.parametrize('options', ['full', 'ro'])
 def test_no_room_and_no_right(tmp_path, works, options):
     some = [job for name, job in works.items() if name != 'convert to r.csv']
-    found = list(crash.without_room(tmp_path, some, options))
-    if not found:
+    outcomes = list(crash.without_room(tmp_path, some, options))
+    if not outcomes:
         pytest.skip('mounting a small disk is not allowed here')
-    assert {job.name: said for job, said in found if said} == {}
-    assert len(found) == len(some)
+    assert {job.name: wrong for job, wrong in outcomes if wrong} == {}
+    assert len(outcomes) == len(some)
 
 
 @pytest.mark.parametrize('swaps', [True, False])
