@@ -185,9 +185,9 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
     DataError
         When no topic carries samples.
     """
-    found = {}
+    carried = {}
     for connection in bag.connections:
-        if connection.msgtype != MESSAGE_TYPE or connection.topic in found:
+        if connection.msgtype != MESSAGE_TYPE or connection.topic in carried:
             continue
         for topic, _, message in _messages(bag, [connection]):
             base = topic.rpartition('/')[2]
@@ -195,15 +195,15 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
             ours = base if base in ('voltage', 'displacement') else None
             quantity = quantity_of(message.layout.dim) or ours
             if quantity:
-                found[topic] = quantity
+                carried[topic] = quantity
             break
-    if not found:
+    if not carried:
         topics = ', '.join(sorted({c.topic for c in bag.connections})) or 'none'
         raise DataError(
             f"{bag.path}: no topic carries blocks with layout 't,voltage' and 't,displacement' "
             f"(topics: {topics}); record the stage's voltage and displacement"
         )
-    return found
+    return carried
 
 
 def is_computed(topic: str) -> bool:
@@ -218,48 +218,12 @@ def _choose(
     path: Path,
 ) -> dict[str, str]:
     """Return the topic of each quantity, and of the applied voltage where it is there."""
-    prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
-    chosen = {}
-    for quantity, wish in asked.items():
-        if wish is not None:
-            topic = f'/{wish.lstrip("/")}'
-            if topic not in carried:
-                raise DataError(
-                    f'{path}: no samples on topic {topic}; topics with samples: '
-                    + ', '.join(sorted(carried))
-                )
-            if carried[topic] != quantity:
-                fit = sorted(t for t, q in carried.items() if q == quantity)
-                raise DataError(
-                    f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
-                    f'{quantity}: {", ".join(fit) or "none"}'
-                )
-            chosen[quantity] = topic
-            continue
-        there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
-        # a model fitted to the prediction of another would look perfect
-        measured = [t for t in there if not is_computed(t)]
-        if there and not measured:
-            raise DataError(
-                f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
-                f'measured {quantity}; record that, or name the topic to take'
-            )
-        # applied_voltage carries the same quantity under another name
-        commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured
-        named = [t for t in commanded if t.rpartition('/')[2] == quantity]
-        fit = named if len(commanded) > 1 and named else commanded
-        if not fit:
-            raise DataError(
-                f"{path}: no topic carries 't,{quantity}'"
-                f'{"" if namespace is None else f" below {prefix}"}; topics with samples: '
-                + ', '.join(sorted(carried))
-            )
-        if len(fit) > 1:
-            raise DataError(
-                f'{path}: several topics carry {quantity}: {", ".join(sorted(fit))}; '
-                'name the stage with a namespace, or the topics'
-            )
-        chosen[quantity] = fit[0]
+    chosen = {
+        quantity: _measured_topic(carried, quantity, namespace, path)
+        if topic is None
+        else _asked_topic(carried, quantity, f'/{topic.lstrip("/")}', path)
+        for quantity, topic in asked.items()
+    }
     home = chosen['voltage'].rpartition('/')[0] + '/'
     applied = f'{home}{APPLIED}'
     if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
@@ -273,6 +237,52 @@ def _choose(
                 )
             chosen[quantity] = topic
     return chosen
+
+
+def _asked_topic(carried: Mapping[str, str], quantity: str, topic: str, path: Path) -> str:
+    if topic not in carried:
+        raise DataError(
+            f'{path}: no samples on topic {topic}; topics with samples: '
+            + ', '.join(sorted(carried))
+        )
+    if carried[topic] != quantity:
+        fit = sorted(t for t, q in carried.items() if q == quantity)
+        raise DataError(
+            f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
+            f'{quantity}: {", ".join(fit) or "none"}'
+        )
+    return topic
+
+
+def _measured_topic(
+    carried: Mapping[str, str], quantity: str, namespace: str | None, path: Path
+) -> str:
+    """Return the one topic with a measured quantity below a namespace."""
+    prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
+    there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
+    # a model fitted to the prediction of another would look perfect
+    measured = [t for t in there if not is_computed(t)]
+    if there and not measured:
+        raise DataError(
+            f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
+            f'measured {quantity}; record that, or name the topic to take'
+        )
+    # applied_voltage carries the same quantity under another name
+    commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured
+    named = [t for t in commanded if t.rpartition('/')[2] == quantity]
+    fit = named if len(commanded) > 1 and named else commanded
+    if not fit:
+        below = '' if namespace is None else f' below {prefix}'
+        raise DataError(
+            f"{path}: no topic carries 't,{quantity}'{below}; topics with samples: "
+            + ', '.join(sorted(carried))
+        )
+    if len(fit) > 1:
+        raise DataError(
+            f'{path}: several topics carry {quantity}: {", ".join(sorted(fit))}; '
+            'name the stage with a namespace, or the topics'
+        )
+    return fit[0]
 
 
 def _blocks(bag: Bag, topics: Mapping[str, str]) -> Iterator[tuple[str, Samples, int]]:
