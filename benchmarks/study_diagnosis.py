@@ -14,7 +14,7 @@ record and judged on another that nothing saw.  Finished cases are kept beside t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 import json
@@ -187,10 +187,10 @@ def judged(case: Case) -> Row:
             identify_time=took,
             diagnose_time=spent,
         )
-    # what a case dies of is its row, not the end of hours of others
+    # one failed case must not end hours of others
     except Exception as error:  # noqa: BLE001
-        nan, said = float('nan'), f'{type(error).__name__}: {error}'
-        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, nan, nan, said)
+        nan, reason = float('nan'), f'{type(error).__name__}: {error}'
+        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, nan, nan, reason)
 
 
 def outcome(case: Case, row: Row) -> str:
@@ -204,115 +204,121 @@ def outcome(case: Case, row: Row) -> str:
     return {'partly_explained': 'partly'}.get(row.verdict, row.verdict)
 
 
+KINDS = ('exact', 'class', 'partly', 'unexplained', 'none', 'wrong')
+NOTE = (
+    'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
+    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. Its laws are '
+    'not those of the candidates (below). An effect counts by its size: the free-run error that '
+    'is left on held-out blocks after the best refit of the base model, in % of stroke; '
+    f'{COUNTS} % and more is counted.'
+)
+Done = Sequence[tuple[Case, Row]]
+
+
+def markdown(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
+    """Return a section with a table; the heads are separated by commas."""
+    head, *lines = ('| ' + ' | '.join(map(str, row)) + ' |' for row in (heads.split(', '), *rows))
+    return '\n'.join([f'## {title}', '', head, '|' + '---|' * (head.count('|') - 1), *lines])
+
+
+def single(done: Done) -> str:
+    """Return the section of stages with one effect."""
+
+    def line(effect: str) -> list[object]:
+        own = [(c, r) for c, r in counted if c.effects == (effect,)]
+        outcomes = [outcome(case, row) for case, row in own]
+        medians = [
+            f'{np.median([getattr(r, name) for _, r in own]):.3f}' if own else ''
+            for name in ('unseen_before', 'unseen_after')
+        ]
+        return [effect, len(own), *(outcomes.count(kind) for kind in KINDS), *medians]
+
+    counted = [(c, r) for c, r in done if c.kind == 'one' and r.size >= COUNTS]
+    heads = f'effect, counted, {", ".join(KINDS)}, unseen error before, after'
+    outcomes = [outcome(case, row) for case, row in counted]
+    exact, named, wrong = (
+        f'{n} of {len(counted)} ({n / max(len(counted), 1):.0%})'
+        for n in (
+            outcomes.count('exact'),
+            outcomes.count('exact') + outcomes.count('class'),
+            outcomes.count('wrong'),
+        )
+    )
+    text = markdown('One effect', heads, map(line, EFFECTS))
+    text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}.'
+    ratios = [
+        r.unseen_before / r.unseen_after for _, r in counted if r.verdict in ('named', 'class')
+    ]
+    growth = [r.unseen_after / r.unseen_before - 1.0 for _, r in done if r.verdict != 'failed']
+    if ratios:
+        text += (
+            '\n\nUnseen record, where an effect was named: error before over after, median '
+            f'{np.median(ratios):.1f}; largest growth of the error in any case of the study '
+            f'{max(*growth, 0.0):.1%}.'
+        )
+    return text
+
+
+def none(done: Done) -> str:
+    """Return the section of stages without an effect."""
+
+    def line(noise: str) -> list[object]:
+        own = [r for c, r in done if c.kind == 'none' and c.noise == noise]
+        others = [f'{r.verdict} ({", ".join(r.found)})' for r in own if r.verdict != 'none']
+        return [noise, len(own), len(own) - len(others), '; '.join(others)]
+
+    return markdown('No effect', 'noise, cases, none, other verdicts', map(line, COLOURS))
+
+
+def outside(done: Done) -> str:
+    """Return the section of effects that are not among the candidates."""
+    own = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
+    wrong = sum(r.verdict == 'named' for _, r in own)
+    return markdown(
+        'The own candidate taken out of the catalogue, and effects outside it',
+        'truth, seed, size, verdict, added, class',
+        ([c.effects[0], c.seed, f'{r.size:.2f}', *_names(r)] for c, r in own),
+    ) + (f'\n\nA wrong name in {wrong} of {len(own)} ({wrong / max(len(own), 1):.0%}).')
+
+
+def _names(row: Row) -> list[str]:
+    return [row.verdict, ', '.join(row.found), ', '.join(row.group)]
+
+
 def table(rows: dict[str, Row], todo: Sequence[Case], command: str) -> str:
     """Return the study as text."""
     done = [(case, rows[case.key]) for case in todo if case.key in rows]
-    text = [
+    unseen = {c.key: [f'{r.unseen_before:.3f}', f'{r.unseen_after:.3f}'] for c, r in done}
+    sections = [
         '# How often the diagnosis is right',
-        '',
-        f'Made by `{command}`; {len(done)} of {len(todo)} cases done.',
+        f'Made by `{command}`; {len(done)} of {len(todo)} cases done.\n'
         f'Machine: {platform.machine()}, {os.cpu_count()} cores, Python '
         f'{platform.python_version()}, numpy {np.__version__}.',
-        '',
-        'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on '
-        'a record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. Its '
-        'laws are not those of the candidates (below). An effect counts by its size: the free-run '
-        'error that is left on held-out blocks after the best refit of the base model, in % of '
-        f'stroke; {COUNTS} % and more is counted.',
-        '',
-        '## One effect',
-        '',
-        '| effect | counted | exact | class | partly | unexplained | none | wrong | '
-        'unseen error before | after |',
-        '|---|---|---|---|---|---|---|---|---|---|',
+        NOTE,
+        single(done),
+        none(done),
+        outside(done),
+        markdown(
+            'Pairs',
+            'truth, size, verdict, added, class, unseen before, after',
+            (
+                [', '.join(c.effects), f'{r.size:.2f}', *_names(r), *unseen[c.key]]
+                for c, r in done
+                if c.kind == 'pair'
+            ),
+        ),
+        markdown(
+            'Laws of the stages',
+            'effect, law',
+            ([name, describe(name)] for name in (*EFFECTS, *OUTSIDE)),
+        ),
+        markdown(
+            'Every case',
+            'case, verdict, added, class, size, unseen',
+            ([r.key, *_names(r), f'{r.size:.3f}', ' → '.join(unseen[c.key])] for c, r in done),
+        ),
     ]
-    kinds = ('exact', 'class', 'partly', 'unexplained', 'none', 'wrong')
-    total: dict[str, int] = dict.fromkeys(kinds, 0)
-    ratios, worst = [], -1.0
-
-    def line(name: str, found: list[tuple[Case, Row]]) -> str:
-        said = [outcome(case, row) for case, row in found]
-        counts = [said.count(kind) for kind in kinds]
-        middle = [
-            f'{np.median([getattr(r, a) for _, r in found]):.3f}' if found else ''
-            for a in ('unseen_before', 'unseen_after')
-        ]
-        return f'| {name} | {len(found)} | {" | ".join(map(str, counts))} | {" | ".join(middle)} |'
-
-    single = [(c, r) for c, r in done if c.kind == 'one' and r.size >= COUNTS]
-    for effect in EFFECTS:
-        found = [(c, r) for c, r in single if c.effects == (effect,)]
-        text.append(line(effect, found))
-    for case, row in single:
-        total[outcome(case, row)] = total.get(outcome(case, row), 0) + 1
-    for case, row in done:
-        if row.verdict == 'failed':
-            continue
-        worst = max(worst, row.unseen_after / row.unseen_before - 1.0)
-        if case.kind == 'one' and row.size >= COUNTS and row.verdict in ('named', 'class'):
-            ratios.append(row.unseen_before / row.unseen_after)
-    n = max(len(single), 1)
-    text += [
-        '',
-        f'Exact name: {total["exact"]} of {n} ({total["exact"] / n:.0%}); exact name or its '
-        f'class: {total["exact"] + total["class"]} ({(total["exact"] + total["class"]) / n:.0%}); '
-        f'wrong: {total["wrong"]} ({total["wrong"] / n:.0%}).',
-        '',
-    ]
-    if ratios:
-        text += [
-            'Unseen record, where an effect was named: error before over after, median '
-            f'{np.median(ratios):.1f}; largest growth of the error in any case of the study '
-            f'{max(worst, 0.0):.1%}.',
-            '',
-        ]
-    text += ['## No effect', '', '| noise | cases | none | other verdicts |', '|---|---|---|---|']
-    for noise in COLOURS:
-        found = [r for c, r in done if c.kind == 'none' and c.noise == noise]
-        others = [f'{r.verdict} ({", ".join(r.found)})' for r in found if r.verdict != 'none']
-        text.append(
-            f'| {noise} | {len(found)} | {len(found) - len(others)} | {"; ".join(others)} |'
-        )
-    text += [
-        '',
-        '## The own candidate taken out of the catalogue, and effects outside it',
-        '',
-        '| truth | seed | size | verdict | added | class |',
-        '|---|---|---|---|---|---|',
-    ]
-    removed = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
-    for case, row in removed:
-        text.append(
-            f'| {case.effects[0]} | {case.seed} | {row.size:.2f} | {row.verdict} | '
-            f'{", ".join(row.found)} | {", ".join(row.group)} |'
-        )
-    wrong = sum(r.verdict == 'named' for _, r in removed)
-    text += [
-        '',
-        f'A wrong name in {wrong} of {len(removed)} ({wrong / max(len(removed), 1):.0%}).',
-        '',
-        '## Pairs',
-        '',
-        '| truth | size | verdict | added | class | unseen before | after |',
-        '|---|---|---|---|---|---|---|',
-    ]
-    for case, row in done:
-        if case.kind == 'pair':
-            text.append(
-                f'| {", ".join(case.effects)} | {row.size:.2f} | {row.verdict} | '
-                f'{", ".join(row.found)} | {", ".join(row.group)} | {row.unseen_before:.3f} | '
-                f'{row.unseen_after:.3f} |'
-            )
-    text += ['', '## Laws of the stages', '', '| effect | law |', '|---|---|']
-    text += [f'| {name} | {describe(name)} |' for name in (*EFFECTS, *OUTSIDE)]
-    text += ['', '## Every case', '', '| case | verdict | added | class | size | unseen |']
-    text.append('|---|---|---|---|---|---|')
-    for _, row in done:
-        text.append(
-            f'| {row.key} | {row.verdict} | {", ".join(row.found)} | {", ".join(row.group)} | '
-            f'{row.size:.3f} | {row.unseen_before:.3f} → {row.unseen_after:.3f} |'
-        )
-    return '\n'.join(text) + '\n'
+    return '\n\n'.join(sections) + '\n'
 
 
 def main() -> None:
@@ -321,9 +327,14 @@ def main() -> None:
     parser.add_argument('out', type=Path)
     parser.add_argument('--kept', type=Path, default=Path('build/study_diagnosis.jsonl'))
     parser.add_argument('--short', action='store_true', help='one seed, one size')
+    parser.add_argument('--sample', type=int, help='only so many cases, drawn at random')
     parser.add_argument('--processes', type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     todo = list(cases(arguments.short))
+    if arguments.sample:
+        # the same ones every time, so that two versions of the package can be compared
+        drawn = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
+        todo = [todo[i] for i in drawn]
     arguments.kept.parent.mkdir(parents=True, exist_ok=True)
     rows: dict[str, Row] = {}
     if arguments.kept.exists():

@@ -11,25 +11,19 @@ Nothing here knows the package that is judged.  A stage answers a voltage from r
     y = stage.respond(t, v)
 """
 
-from .faults import spoil
-from .leftover import left_over
 from .programmes import other_axis, programme, table_one_sines
 from .stage import make_stage, SPAN, Stage
-from .table import describe, EFFECTS, FAULTS, LATER, OUTSIDE, VARIANTS
+from .table import describe, EFFECTS, LATER, OUTSIDE
 
 __all__ = [
     'EFFECTS',
-    'FAULTS',
     'LATER',
     'OUTSIDE',
     'SPAN',
-    'VARIANTS',
     'Stage',
     'describe',
-    'left_over',
     'make_stage',
     'other_axis',
     'programme',
-    'spoil',
     'table_one_sines',
 ]

@@ -21,7 +21,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Density', 'Row', 'bouc_wen', 'everett', 'plays']
+__all__ = ['Density', 'Row', 'everett', 'plays']
 
 Array = NDArray[np.float64]
 
@@ -228,28 +228,4 @@ def plays(
         curve,
         out,
     )
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _bouc_wen(u: Array, yield_at: float, skew: float, out: Array) -> None:
-    z, last = 0.0, 0.0
-    for k in range(u.size):
-        du = u[k] - last
-        last = u[k]
-        # dz = (1 - |z|^n (skew sgn(z du) + 1 - skew)) du / yield_at with n = 1, exact for one sign
-        rate = (skew if z * du >= 0 else -skew) + (1.0 - skew)
-        change = rate * abs(du) / yield_at
-        z += (
-            (math.copysign(1.0, du) - z * rate) * (1.0 - math.exp(-change)) / rate
-            if abs(rate) > 1e-9
-            else du / yield_at
-        )
-        out[k] = z
-
-
-def bouc_wen(u: Array, yield_at: float, skew: float = 0.7) -> Array:
-    """Return the hysteretic variable of a Bouc-Wen model with n = 1, from z = 0."""
-    out = np.empty(u.size)
-    _bouc_wen(np.ascontiguousarray(u), yield_at, skew, out)
     return out

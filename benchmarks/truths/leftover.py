@@ -55,7 +55,7 @@ def difference(
 ) -> tuple[Array, float]:
     """Return what the effects change [m], shape (n,), and the stroke without them [m]."""
     with_them = stage.respond(t, v, channels=channels, clean=True)
-    without = stage.without().respond(t, v, clean=True)
+    without = stage.without_effects().respond(t, v, clean=True)
     return with_them - without, float(np.ptp(without))
 
 

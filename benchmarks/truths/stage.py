@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import laws
-from .cores import bouc_wen, Density, everett, plays
+from .cores import Density, everett, plays
 from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
 from .sizes import gain_of
 from .table import EFFECTS, LATER, OUTSIDE, VARIANTS
@@ -39,7 +39,7 @@ class Base:
 
     Attributes
     ----------
-    core : {'plays', 'everett', 'bouc_wen'}
+    core : {'plays', 'everett'}
         How the hysteresis is computed.
     density : Density
         Of the thresholds.
@@ -67,10 +67,10 @@ class Base:
         return delayed(self.dynamics(h), self.delay)
 
 
-def make_base(seed: int, core: str | None = None) -> Base:
+def make_base(seed: int) -> Base:
     """Draw a stage; the same seed gives the same stage, whatever effect is added."""
     rng = np.random.default_rng([7321, seed])
-    drawn = ('plays', 'everett')[int(rng.integers(2))]
+    core = ('plays', 'everett')[int(rng.integers(2))]
     n = int(rng.integers(2, 4))
     density = Density(
         rng.uniform(0.3, 1.0, n),
@@ -92,7 +92,7 @@ def make_base(seed: int, core: str | None = None) -> Base:
     poles = (rng.uniform(2000.0, 5000.0), rng.uniform(3000.0, 8000.0))
     paper = rng.random() < 0.25
     return Base(
-        core or drawn,
+        core,
         density,
         (c1, c3, c5),
         ARX() if paper else Cascade(tuple(modes), poles),
@@ -112,8 +112,6 @@ class Stage:
         Parameter of every effect's law; 0 (infinity for slew_limit) is none.
     variants : mapping of str to int
         Which form of its law every effect takes.
-    later : tuple of str
-        Effects that set in after the identification.
     seed : int
     noise : {'white', '1/f', '10-bit', 'none'}
     noise_rms : float
@@ -123,21 +121,13 @@ class Stage:
     base: Base
     gains: Mapping[str, float] = field(default_factory=dict)
     variants: Mapping[str, int] = field(default_factory=dict)
-    later: tuple[str, ...] = LATER
     seed: int = 0
     noise: str = 'none'
     noise_rms: float = 2e-5
 
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of what the stage has beyond its base."""
-        return tuple(self.gains)
-
-    def without(self, *names: str) -> Stage:
-        """Return the same stage without some effects (all when none is named)."""
-        kept = {n: g for n, g in self.gains.items() if names and n not in names}
-        # the core stays in the form that the effect needed
-        return replace(self, gains=MappingProxyType(kept))
+    def without_effects(self) -> Stage:
+        """Return the same stage without effects; the core keeps the form that they needed."""
+        return replace(self, gains=MappingProxyType({}))
 
     def respond(
         self,
@@ -155,11 +145,11 @@ class Stage:
         Parameters
         ----------
         t : array_like, shape (n,)
-            Time [s], uniform, 2 kHz and faster.
+            Time [s], at `RATE`.
         v : array_like, shape (n,)
             Command held between samples [V], 0 .. 10.
         changed : bool
-            False: as it was before the effects of `later` set in.
+            False: as it was before the effects of `LATER` set in.
         channels : mapping of str to array_like, optional
             ``other``: voltage of another axis [V]; at rest when absent.
         take : int
@@ -169,21 +159,13 @@ class Stage:
         """
         time = np.asarray(t, dtype=np.float64)
         volts = np.ascontiguousarray(v, dtype=np.float64)
-        rate = (time.size - 1) / (time[-1] - time[0])
         others = {
             k: np.ascontiguousarray(x, dtype=np.float64) for k, x in (channels or {}).items()
         }
         # a record's own draws: its phases are not those of the next
         key = zlib.crc32(volts.tobytes())
-        gains = {n: g for n, g in self.gains.items() if changed or n not in self.later}
-        if abs(rate / RATE - 1) < 1e-6:
-            y = self._displacement(time, volts / VOLTS, gains, others, (key, take))
-        else:
-            ticks = np.arange(math.floor((time[-1] - time[0]) * RATE + 1e-6) + 1) / RATE + time[0]
-            index = np.searchsorted(time, ticks + 1e-9, side='right') - 1
-            held = {k: x[index] for k, x in others.items()}
-            fine = self._displacement(ticks, volts[index] / VOLTS, gains, held, (key, take))
-            y = np.interp(time, ticks, fine)
+        gains = {n: g for n, g in self.gains.items() if changed or n not in LATER}
+        y = self._displacement(time, volts / VOLTS, gains, others, (key, take))
         if not clean:
             y = y + self._sensor_noise(y, np.random.default_rng([3, self.seed, key, take]))
         return np.asarray(y * SPAN)
@@ -246,8 +228,6 @@ class Stage:
         h = base.single_valued(u)
         if 'even_nonlinearity' in gains:
             h = h + laws.bent(u, gains['even_nonlinearity'], kind['even_nonlinearity'])
-        if base.core == 'bouc_wen':
-            return np.asarray(h + base.density.width() * 0.7 * bouc_wen(u, 0.15))
         kappa = gains.get('noncongruent_minor_loops', 0.0)
         if base.core == 'everett':
             return h + everett(u, base.density, kappa)
@@ -302,10 +282,6 @@ def make_stage(
     seed: int = 0,
     noise: str = 'white',
     noise_rms: float = 2e-5,
-    *,
-    core: str | None = None,
-    variant: int | None = None,
-    later: tuple[str, ...] = LATER,
 ) -> Stage:
     """
     Return a stage with undeclared effects.
@@ -324,12 +300,6 @@ def make_stage(
         to 1/1024 of the span.
     noise_rms : float
         Share of the span.
-    core : {'plays', 'everett', 'bouc_wen'}, optional
-        Instead of the one that the seed draws.
-    variant : int, optional
-        Form of the law, instead of the one that the seed draws.
-    later : tuple of str
-        Effects that set in after the identification.
 
     Raises
     ------
@@ -342,22 +312,15 @@ def make_stage(
             raise ValueError(f'no law for {name!r}; there are {", ".join(EFFECTS + OUTSIDE)}')
     if noise not in ('white', '1/f', '10-bit', 'none'):
         raise ValueError(f'noise must be white, 1/f, 10-bit or none, got {noise!r}')
-    kind = {n: seed % VARIANTS[n] if variant is None else variant for n in names}
-    base = make_base(seed, core)
+    kind = {n: seed % VARIANTS[n] for n in names}
+    base = make_base(seed)
     if kind.get('changed_dynamics') == 0 and isinstance(base.dynamics, ARX):
         kind['changed_dynamics'] = 1
-    if 'noncongruent_minor_loops' in kind and core is None:
+    if 'noncongruent_minor_loops' in kind:
         form = ('everett', 'plays')[kind['noncongruent_minor_loops']]
         base = replace(base, core=form)
     if any(n in _PLAYS for n in names):
         base = replace(base, core='plays')
     gains = {n: gain_of(n, kind[n], strength) for n in names}
-    return Stage(
-        base,
-        MappingProxyType(gains),
-        MappingProxyType(kind),
-        later,
-        seed,
-        noise,
-        noise_rms,
-    )
+    kinds = MappingProxyType(kind)
+    return Stage(base, MappingProxyType(gains), kinds, seed, noise, noise_rms)

@@ -1,11 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names of the effects and faults, and their laws in a line each."""
+"""Names of the effects, and their laws in a line each."""
 
 from __future__ import annotations
 
-__all__ = ['EFFECTS', 'FAULTS', 'LATER', 'LAWS', 'OUTSIDE', 'VARIANTS', 'describe']
+__all__ = ['EFFECTS', 'LATER', 'LAWS', 'OUTSIDE', 'VARIANTS', 'describe']
 
 #: law of each effect, one entry a variant; which one a stage takes is drawn from its seed
 LAWS: dict[str, tuple[str, ...]] = {
@@ -90,7 +90,6 @@ OUTSIDE = (
     'memory_fade',
 )
 EFFECTS = tuple(name for name in LAWS if name not in OUTSIDE)
-FAULTS = ('missed_samples', 'timing_jitter', 'quantisation', 'outliers', 'clipping')
 VARIANTS = {name: len(forms) for name, forms in LAWS.items()}
 
 #: what sets in after the identification; G would have swallowed the linear ones

@@ -131,7 +131,6 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
 
     Parameters
     ----------
-    equations : NormalEquations
     sets : ndarray of int, shape (blocks,)
         Blocks of one set are left out together.
     prior : ndarray, shape (p,)
@@ -192,7 +191,6 @@ def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
 
     Parameters
     ----------
-    rows : Rows
     M : ndarray, shape (n, p)
         Derivatives of the prediction.
     e : ndarray, shape (n,)
@@ -241,7 +239,6 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
 
     Parameters
     ----------
-    rows : Rows
     given : ndarray, shape (n,)
         Residual of the model as given, normalised.
     transfer : ndarray, shape (blocks,)

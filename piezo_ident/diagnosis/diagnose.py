@@ -126,6 +126,11 @@ def diagnose(
         if is_whole:
             raise
         raise IdentificationError(f'{error} ({part_searched(records, part)})') from None
+    except np.linalg.LinAlgError as error:
+        names = ', '.join(record.name for record in records)
+        raise IdentificationError(
+            f'{names}: a fit is singular ({error}); are all values of a plausible size?'
+        ) from None
     warnings = [warning for record in records for warning in model.extrapolation(record)]
     if not is_whole:
         warnings.append(part_searched(records, part))

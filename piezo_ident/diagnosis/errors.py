@@ -22,7 +22,6 @@ def errors_of(rows: Rows, e: NDArray[np.float64], noise: float = 0.0) -> Errors:
 
     Parameters
     ----------
-    rows : Rows
     e : ndarray, shape (n,)
         Residual of the rows, normalised.
     noise : float, optional

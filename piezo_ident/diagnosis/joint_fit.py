@@ -158,12 +158,10 @@ def fit_jointly(
 
     Parameters
     ----------
-    simulator : Simulator
     state : State
         Where to start; its thresholds stay.
     base : BaseColumns
         Of its thresholds.
-    iterations : int, optional
     tick : callable, optional
         Called between the steps; may raise `piezo_ident.common.errors.Cancelled`.
 

@@ -55,10 +55,6 @@ def warnings_of(
 
     Parameters
     ----------
-    given : StageModel
-    refined : Refined
-    findings : Findings
-    floor : NoiseFloor
     bent : float
         Share of the explainable part that goes with a retuned G alone.
     """
@@ -111,10 +107,8 @@ def sentence(
 
     Parameters
     ----------
-    findings : Findings
     errors : (Errors, Errors, Errors)
         Before, with the base model refitted, and after.
-    rest : Unexplained
     smallest : float or None
         Smallest detectable effect, rms in % of stroke.
     is_given : bool

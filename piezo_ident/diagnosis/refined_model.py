@@ -60,12 +60,10 @@ def refine(
 
     Parameters
     ----------
-    simulator : Simulator
     given : State
         The model as it was given.
     base, fitted : Fitted
         Refitted without and with what was found.
-    findings : Findings
     before, refit : Errors
         Of the model as given, and of the base model refitted.
     """

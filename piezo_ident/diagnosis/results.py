@@ -97,16 +97,10 @@ class FoundParameter:
 @dataclass(frozen=True, eq=False)
 class FoundEffect:
     """
-    An effect that was added to the model.
+    An effect that was added to the model, in one of the slots of its chain.
 
-    Attributes
-    ----------
-    name, slot : str
-    share : float
-        Of the explainable part of the residual, 0 .. 1.
-    rms_percent : float
-        Of what it explains, % of stroke.
-    parameters : mapping of str to FoundParameter
+    It explains a `share` (0 .. 1) of the explainable part of the residual, of `rms_percent` % of
+    stroke.
     """
 
     name: str
@@ -126,16 +120,7 @@ class Class:
 
 @dataclass(frozen=True)
 class Candidate:
-    """
-    A candidate that was not added.
-
-    Attributes
-    ----------
-    name : str
-    share : float
-        Of the explainable part, when it is added alone.
-    why_not : str
-    """
+    """A candidate that was not added: its share of the explainable part alone, and why not."""
 
     name: str
     share: float
@@ -161,17 +146,7 @@ class Untestable:
 
 @dataclass(frozen=True)
 class Errors:
-    """
-    Free-run errors in % of stroke.
-
-    Attributes
-    ----------
-    overall : float
-    by_segment : mapping of str to float
-        By segment label.
-    by_frequency : mapping of str to float
-        By the frequency of a sine [Hz].
-    """
+    """Free-run errors in % of stroke: overall, by segment label, by a sine's frequency [Hz]."""
 
     overall: float
     by_segment: Mapping[str, float]
@@ -209,17 +184,10 @@ class Unseen:
 @dataclass(frozen=True, eq=False)
 class Residual:
     """
-    One piece with its residuals, for pictures.
+    One piece with its residuals, measured minus predicted [m], shape (n,).
 
-    Attributes
-    ----------
-    record : str
-    piece : Piece
-    given, before, after : ndarray, shape (n,)
-        Measured minus predicted [m]: by the model as given, by the base model refitted, and by
-        the refined model.
-    sound : ndarray of bool, shape (n,)
-        Samples that count.
+    By the model as given, by the base model refitted (`before`), and by the refined model; the
+    samples of `sound` count.
     """
 
     record: str

@@ -26,6 +26,10 @@ from piezo_ident.record.record import Record
 
 __all__ = ['Rows', 'centred', 'make_rows']
 
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
 #: blocks altogether, about, and how many sets of them are held out in turn
@@ -33,7 +37,7 @@ BLOCKS, FOLDS = 80, 5
 #: whole stretches of one kind that are held out in turn, at most
 GROUPS = 8
 
-Memory = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Memory = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +80,18 @@ class Rows:
     """
 
     runs: tuple[Run, ...]
-    record: NDArray[np.int64]
+    record: Integers
     names: tuple[str, ...]
-    begin: NDArray[np.float64]
+    begin: Array
     duration: float
     memories: tuple[Memory, ...]
     m: int
-    keep: tuple[NDArray[np.bool_], ...]
-    x: NDArray[np.float64]
-    block: NDArray[np.int64]
-    of_record: NDArray[np.int64]
-    fold: NDArray[np.int64]
-    group: NDArray[np.int64]
+    keep: tuple[Mask, ...]
+    x: Array
+    block: Integers
+    of_record: Integers
+    fold: Integers
+    group: Integers
     label: tuple[str, ...]
     labels: tuple[str, ...]
     stroke: float
@@ -106,20 +110,10 @@ class Rows:
         travel = sum(float(np.abs(np.diff(means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
 
-    def time(self, i: int, start: int = 0, stop: int | None = None) -> NDArray[np.float64]:
-        """
-        Return the time of samples of a run since its record began [s].
-
-        Parameters
-        ----------
-        i : int
-            Of the run.
-        start, stop : int, optional
-            First sample, and the one behind the last; all of them when absent.
-        """
+    def time(self, i: int) -> Array:
+        """Return the time of the samples of a run since its record began [s]."""
         run = self.runs[i]
-        stop = run.u.size if stop is None else min(stop, run.u.size)
-        return run.piece.time(start, stop) - float(self.begin[i])
+        return run.piece.time(0, run.u.size) - float(self.begin[i])
 
     @property
     def longest(self) -> int:
@@ -127,36 +121,25 @@ class Rows:
         return int(np.bincount(self.of_record, minlength=len(self.names)).argmax())
 
     @property
-    def edges(self) -> NDArray[np.int64]:
+    def edges(self) -> Integers:
         """First row of each block, and the end; shape (blocks + 1,)."""
         starts = np.flatnonzero(np.diff(self.block, prepend=-1))
         return np.append(starts, self.n)
 
-    def of(self, signals: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """
-        Return the rows of signals given at the full rate.
-
-        Parameters
-        ----------
-        signals : sequence of ndarray
-            One a run.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-        """
+    def of(self, signals: Sequence[Array]) -> Array:
+        """Return the rows, shape (n,), of signals given at the full rate, one a run."""
         parts = [means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
         return np.concatenate(parts)
 
 
-def means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
+def means(x: Array, m: int) -> Array:
     """Return the means over each m neighbours; what is left at the end is dropped."""
     n = x.size // m
     # a product with a vector is several times faster than a mean along a short axis
     return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
-def centred(x: NDArray[np.float64], of_record: NDArray[np.int64]) -> NDArray[np.float64]:
+def centred(x: Array, of_record: Integers) -> Array:
     """Return rows without the mean of the record that each belongs to."""
     mean = np.bincount(of_record, x) / np.bincount(of_record)
     return np.asarray(x - mean[of_record])
@@ -165,7 +148,7 @@ def centred(x: NDArray[np.float64], of_record: NDArray[np.int64]) -> NDArray[np.
 def make_rows(
     model: StageModel,
     records: Sequence[Record],
-    bad: Sequence[NDArray[np.bool_] | None] | None = None,
+    bad: Sequence[Mask | None] | None = None,
 ) -> Rows:
     """
     Cut records into rows and blocks.
@@ -174,7 +157,6 @@ def make_rows(
     ----------
     model : StageModel
         Its scaling and sampling rate hold.
-    records : sequence of Record
     bad : sequence of (ndarray of bool or None), optional
         For each run, samples that are not used.
 
@@ -205,7 +187,7 @@ def make_rows(
             'record that drives the stage over its range'
         )
     longest = max(1, kept // BLOCKS)
-    blocks: list[NDArray[np.int64]] = []
+    blocks: list[Integers] = []
     labels: list[str] = []
     first = 0
     for run, good in zip(runs, keep, strict=True):
@@ -255,7 +237,7 @@ def _has_clock(model: StageModel) -> bool:
     return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
-def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None) -> float:
+def _stroke(runs: Sequence[Run], bad: Sequence[Mask | None] | None) -> float:
     """Return the largest stroke of a record, its faults left out."""
     used = (
         (run.record, run.x[run.use if out is None else run.use & ~out])
@@ -265,7 +247,7 @@ def _stroke(runs: Sequence[Run], bad: Sequence[NDArray[np.bool_] | None] | None)
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
-    """Return label, first and last row of the segments of a run; everything belongs to one."""
+    """Return label, first row and end of the segments of a run; everything belongs to one."""
     n = run.piece.n // m
     if not run.piece.segments:
         # without labels, fifths of the time stand for kinds
@@ -288,9 +270,7 @@ def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
     return found
 
 
-def _groups(
-    labels: Sequence[str], sizes: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str, ...]]:
     """Return which blocks make a stretch of one kind; the smallest kinds are put together."""
     size: dict[str, int] = {}
     for label, n in zip(labels, sizes, strict=True):

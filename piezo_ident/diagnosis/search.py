@@ -95,8 +95,6 @@ def search_round(
 
     Parameters
     ----------
-    simulator : Simulator
-    before : Fitted
     effects : sequence of type of Effect
         Candidates.
     lines : sequence of float
@@ -105,7 +103,6 @@ def search_round(
         Mean square of the noise of a row.
     rng : numpy.random.Generator
         Draws the shifts of the surrogates.
-    tick : callable
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, SURROGATES)
@@ -209,7 +206,6 @@ def drop_needless(
 
     Parameters
     ----------
-    simulator : Simulator
     fitted : Fitted
         Whose last effect stays.
     least : float
@@ -217,7 +213,6 @@ def drop_needless(
 
     Returns
     -------
-    fitted : Fitted
     dropped : tuple of int
         Places of the effects that went, falling.
     """

@@ -106,7 +106,6 @@ class Simulator:
     ----------
     model : StageModel
         Its G, delay and scaling stay as they are, and so do the effects that it has.
-    rows : Rows
     """
 
     def __init__(self, model: StageModel, rows: Rows) -> None:
@@ -177,7 +176,6 @@ class Simulator:
 
         Parameters
         ----------
-        state : State
         effect : type of Effect or None
             The one that was added or changed, None for G; the chain is only run from there.
         """
@@ -221,7 +219,6 @@ def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -
 
     Parameters
     ----------
-    dynamics : Dynamics
     retuning : sequence of float
         The coefficients; c_1 acts like minus a delay in samples at low frequencies.
     sample_rate : float

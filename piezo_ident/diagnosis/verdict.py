@@ -87,8 +87,6 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
 
     Parameters
     ----------
-    rows : Rows
-    this : Round
     noise : float
         Mean square of the noise of a row.
     explainable : float
@@ -168,7 +166,6 @@ def judge(
 
     Parameters
     ----------
-    rows : Rows
     base, fitted : Fitted
         Before and after everything that was added.
     taken : sequence of Round
@@ -222,8 +219,6 @@ def rivals_of(
 
     Parameters
     ----------
-    rows : Rows
-    contenders : sequence of Contender
     noise : float
         Mean square of the noise of a row.
     explainable : float
@@ -323,8 +318,6 @@ def untestable_of(
 
     Parameters
     ----------
-    first : Round
-    settings : DiagnosisSettings
     tested : collection of str
         Effects that were tested otherwise, or are in the model as it was given.
     """

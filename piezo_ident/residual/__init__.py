@@ -6,7 +6,6 @@
 from piezo_ident.residual.analysis import (
     analyse,
     FrequencyRow,
-    RecordRow,
     ResidualAnalysis,
     SegmentRow,
 )
@@ -26,7 +25,6 @@ __all__ = [
     'Line',
     'LineSearch',
     'NoiseFloor',
-    'RecordRow',
     'ResidualAnalysis',
     'ResidualPart',
     'SegmentRow',

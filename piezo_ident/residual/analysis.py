@@ -28,35 +28,20 @@ from piezo_ident.residual.whiteness import (
     whiteness,
 )
 
-__all__ = ['FrequencyRow', 'RecordRow', 'ResidualAnalysis', 'SegmentRow', 'analyse']
+__all__ = ['FrequencyRow', 'ResidualAnalysis', 'SegmentRow', 'analyse']
 
 #: what is dropped at the start of a sine: this time and at least one period [s]
 SETTLING = 1.0
 
 
 @dataclass(frozen=True)
-class RecordRow:
-    """
-    The residual of one record: n sound samples, stroke and mean residual in metres.
-
-    `percent` is ``100 rms(e) / stroke``, `explainable` the share of the mean square that is above
-    the noise floor (None without a floor).
-    """
-
-    record: str
-    n: int
-    stroke: float
-    percent: float
-    mean: float
-    explainable: float | None
-
-
-@dataclass(frozen=True)
 class SegmentRow:
     """
-    The residual of one segment, 'all' for a piece without segments; as in `RecordRow`.
+    The residual of n sound samples of one segment, 'all' for a piece without segments.
 
-    `percent` is by the stroke of the whole record, `share` of the sum of squares of all records.
+    `percent` is ``100 rms(e) / stroke`` by the stroke of the whole record, `mean` in metres,
+    `share` of the sum of squares of all records, `explainable` the share of the mean square that
+    is above the noise floor (None without a floor).
     """
 
     record: str
@@ -101,7 +86,6 @@ class ResidualAnalysis:
     floor : NoiseFloor
     explainable : float or None
         Share of the mean square that a model could explain; None when the floor is unknown.
-    records : tuple of RecordRow
     segments : tuple of SegmentRow
     frequencies : tuple of FrequencyRow
     whiteness : Whiteness or None
@@ -113,10 +97,6 @@ class ResidualAnalysis:
     faults : tuple of Fault
     bad : tuple of ndarray of bool
         For each part the samples that are missed, outliers or clipped; a fit leaves them out.
-    jitter : float
-        Rms of the sampling instants [s], 0 when none is seen.
-    quantum : float
-        Step of the readings [m], 0 when there is none.
     """
 
     parts: tuple[ResidualPart, ...]
@@ -124,7 +104,6 @@ class ResidualAnalysis:
     percent: float
     floor: NoiseFloor
     explainable: float | None
-    records: tuple[RecordRow, ...]
     segments: tuple[SegmentRow, ...]
     frequencies: tuple[FrequencyRow, ...]
     whiteness: Whiteness | None
@@ -134,8 +113,6 @@ class ResidualAnalysis:
     curves: tuple[Curve, ...]
     faults: tuple[Fault, ...]
     bad: tuple[NDArray[np.bool_], ...]
-    jitter: float
-    quantum: float
 
     def curve(self, against: str, branch: str | None = None) -> Curve | None:
         """Return the curve over a quantity, the first branch without a name; None without data."""
@@ -161,15 +138,7 @@ def analyse(
     Faults of the data come first: missed readings and outliers are bridged, clipped ones left out
     before anything else is read from the residual; the tables hold the residual as it was.
 
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
-
-    Returns
-    -------
-    ResidualAnalysis
+    `tick` is called with the share of the work done, and may raise to stop it.
 
     Raises
     ------
@@ -206,7 +175,6 @@ def analyse(
         percent=100.0 * float(np.sqrt(relative / sum(int(p.mask.sum()) for p in parts))),
         floor=floor,
         explainable=floor.share(float(squares.mean())) if squares.size else None,
-        records=_record_rows(parts, floor),
         segments=_segment_rows(parts, floor),
         frequencies=_frequency_rows(parts),
         whiteness=white,
@@ -216,8 +184,6 @@ def analyse(
         curves=curves_of(quiet, stretches),
         faults=faults.faults,
         bad=faults.bad,
-        jitter=faults.jitter,
-        quantum=faults.quantum,
     )
 
 
@@ -233,19 +199,6 @@ def _repaired(part: ResidualPart, bad: NDArray[np.bool_], out: NDArray[np.bool_]
 
 
 # -- tables ---------------------------------------------------------------------------------------
-
-
-def _record_rows(parts: Sequence[ResidualPart], floor: NoiseFloor) -> tuple[RecordRow, ...]:
-    """Return one row a record, in order of appearance."""
-    rows = []
-    for name, stroke in strokes_of(parts).items():
-        e = np.concatenate([p.e[p.mask] for p in parts if p.record == name])
-        y = np.concatenate([p.piece.y[p.mask] for p in parts if p.record == name])
-        if e.size:
-            percent = percent_of_stroke(y, y - e, stroke)
-            share = floor.share(float(np.mean(e * e)))
-            rows.append(RecordRow(name, e.size, stroke, percent, float(e.mean()), share))
-    return tuple(rows)
 
 
 def _segment_rows(parts: Sequence[ResidualPart], floor: NoiseFloor) -> tuple[SegmentRow, ...]:

@@ -102,11 +102,6 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     ----------
     parts : sequence of ResidualPart
         Of one sampling rate.
-    stretches : sequence of Stretch
-
-    Returns
-    -------
-    LineSearch
     """
     series, rate, high = series_of(parts, stretches)
     if not series:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
 __all__ = ['FloorSource', 'NoiseFloor', 'residual_noise_floor']
+
+Array = NDArray[np.float64]
 
 #: a frame of differences is freed of a slow change of this order
 ORDER = 3
@@ -27,20 +29,7 @@ LONGEST_BLOCK = 4096
 
 @dataclass(frozen=True)
 class FloorSource:
-    """
-    One stretch in which the noise was read.
-
-    Attributes
-    ----------
-    record, segment : str
-    kind : {'repeat', 'rest'}
-    start_time : float
-        [s]
-    n : int
-        Samples read.
-    rms : float
-        [m]
-    """
+    """One stretch, 'repeat' or 'rest', in which the noise was read: n samples from a time [s]."""
 
     record: str
     segment: str
@@ -73,16 +62,10 @@ class NoiseFloor:
     rms: float | None
     source: str
     sources: tuple[FloorSource, ...] = ()
-    blocks: NDArray[np.int64] = None  # type: ignore[assignment]
-    block_rms: NDArray[np.float64] = None  # type: ignore[assignment]
-    frequency: NDArray[np.float64] = None  # type: ignore[assignment]
-    density: NDArray[np.float64] = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        for name in ('blocks', 'block_rms', 'frequency', 'density'):
-            if getattr(self, name) is None:
-                kind = np.int64 if name == 'blocks' else np.float64
-                object.__setattr__(self, name, np.zeros(0, kind))
+    blocks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    block_rms: Array = field(default_factory=lambda: np.zeros(0))
+    frequency: Array = field(default_factory=lambda: np.zeros(0))
+    density: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def known(self) -> bool:
@@ -111,13 +94,9 @@ class NoiseFloor:
 
     def share(self, mean_square: float, m: float = 1.0) -> float | None:
         """
-        Return the share of a residual that a model could explain: 1 - floor^2 / mean square.
+        Return the share that a model could explain: 1 - floor^2 / mean square.
 
-        Parameters
-        ----------
-        mean_square : float
-            Of the residual, or of its means over m samples [m^2].
-        m : float, optional
+        The mean square [m^2] is that of the residual, or of its means over m samples.
         """
         floor = self.at(m)
         if floor is None:
@@ -131,8 +110,8 @@ class NoiseFloor:
 class _Reading:
     source: FloorSource
     blocks: NDArray[np.int64]
-    variances: NDArray[np.float64]
-    series: NDArray[np.float64]
+    variances: Array
+    series: Array
     sample_rate: float
 
 
@@ -140,7 +119,7 @@ def residual_noise_floor(
     parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
 ) -> NoiseFloor:
     """
-    Return the noise floor of some residuals.
+    Return the noise floor of residuals.
 
     Where v repeats, the residual's differences between consecutive periods, from the second
     period on, have twice the variance of the noise; whatever a model may lack repeats and drops
@@ -148,29 +127,15 @@ def residual_noise_floor(
     freed of parabolas in time and in its logarithm, which is how creep goes.  Of several stretches
     the weighted median counts, so that one that is still settling does no harm.
 
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-    stretches : sequence of Stretch
-        From `piezo_ident.residual.stretches.stretches_of`.
-
-    Returns
-    -------
-    NoiseFloor
-
     Notes
     -----
     Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012),
     section 2.5, doi:10.1002/9781118287422.  Noise slower than a period, or than a rest, looks
     like drift and is not counted.
     """
-    for kind in ('repeat', 'rest'):
-        readings = []
-        for s in stretches:
-            if s.kind == kind:
-                reading = _repeat(parts[s.part], s) if s.period else _rest(parts[s.part], s)
-                if reading is not None:
-                    readings.append(reading)
+    for kind, read in (('repeat', _repeat), ('rest', _rest)):
+        every = [read(parts[s.part], s) for s in stretches if s.kind == kind]
+        readings = [reading for reading in every if reading is not None]
         if readings:
             return _pooled(readings, kind)
     return NoiseFloor(None, 'floor unknown: the voltage neither repeats three times nor rests')
@@ -199,16 +164,14 @@ def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
     return _reading(part, s, series, n, n // 16, basis.shape[1])
 
 
-def _polynomial(n: int) -> NDArray[np.float64]:
+def _polynomial(n: int) -> Array:
     order = ORDER if n > 16 * ORDER else 0
     return np.asarray(
         np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), order), dtype=np.float64
     )
 
 
-def _detrended(
-    x: NDArray[np.float64], frame: int, basis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _detrended(x: Array, frame: int, basis: Array) -> Array:
     """Return x without what the basis explains of each frame, cut to whole frames."""
     rows = x[: x.size // frame * frame].reshape(-1, frame)
     q, _ = np.linalg.qr(basis)
@@ -218,7 +181,7 @@ def _detrended(
 def _reading(
     part: ResidualPart,
     s: Stretch,
-    series: NDArray[np.float64],
+    series: Array,
     frame: int,
     longest: int,
     removed: int,
@@ -264,14 +227,13 @@ def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:
         widest.series, widest.sample_rate, nperseg=min(4096, max(16, widest.series.size // 8))
     )
     seconds = sum(r.source.n / r.sample_rate for r in readings)
-    how = (
-        f'differences of repeated periods, {len(readings)} stretches, {seconds:.3g} s'
-        if kind == 'repeat'
-        else f'rests of the voltage without creep, {len(readings)} stretches, {seconds:.3g} s'
-    )
+    how = {
+        'repeat': 'differences of repeated periods',
+        'rest': 'rests of the voltage without creep',
+    }[kind]
     return NoiseFloor(
         rms=float(np.sqrt(single)),
-        source=how,
+        source=f'{how}, {len(readings)} stretches, {seconds:.3g} s',
         sources=sources,
         blocks=2 ** np.arange(longest),
         block_rms=np.sqrt(variances),

@@ -59,7 +59,6 @@ class ResidualPart:
     ----------
     record : str
         Name of the record.
-    piece : Piece
     e : ndarray, shape (n,)
         Measured minus simulated displacement, free run [m].
     sound : ndarray of bool, shape (n,), optional

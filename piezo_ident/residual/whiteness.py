@@ -22,6 +22,8 @@ __all__ = [
     'whiteness',
 ]
 
+Array = NDArray[np.float64]
+
 #: samples after averaging, at most; lags looked at; highest order of the noise model
 SAMPLES, LAGS, ORDER = 2**17, 200, 40
 #: confidence of bands and bounds
@@ -37,22 +39,14 @@ OVERLAP = 1.0 / 1.056
 @dataclass(frozen=True, eq=False)
 class Whiteness:
     """
-    Autocorrelation of a residual.
+    Autocorrelation of a residual over lags [s], shape (m,), from one sample on.
 
-    Attributes
-    ----------
-    lag : ndarray, shape (m,)
-        [s], from one sample on.
-    correlation : ndarray, shape (m,)
-    band : float
-        Within it 99 % of the values of white noise.
-    statistic : float
-        Of Ljung and Box: chi square of m degrees of freedom for white noise.
-    p_value : float
+    99 % of the values of white noise lie within `band`; the statistic of Ljung and Box is chi
+    square of m degrees of freedom for white noise.
     """
 
-    lag: NDArray[np.float64]
-    correlation: NDArray[np.float64]
+    lag: Array
+    correlation: Array
     band: float
     statistic: float
     p_value: float
@@ -66,25 +60,16 @@ class Whiteness:
 @dataclass(frozen=True, eq=False)
 class CrossCorrelation:
     """
-    Cross-correlation of an input with a residual.
+    Cross-correlation of an input ('v' or 'dv/dt') with a residual that follows it by lags [s].
 
-    Attributes
-    ----------
-    input : {'v', 'dv/dt'}
-    lag : ndarray, shape (m,)
-        By which the residual follows the input [s].
-    correlation : ndarray, shape (m,)
-    band : ndarray, shape (m,)
-        Within it all lags together in 99 % of the cases in which the two have nothing to do with
-        each other.
-    p_value : float
-        Chance of the largest value at any lag.
+    Unrelated signals stay within `band`, shape (m,), at all lags together in 99 % of cases;
+    `p_value` is the chance of the largest value at any lag.
     """
 
     input: str
-    lag: NDArray[np.float64]
-    correlation: NDArray[np.float64]
-    band: NDArray[np.float64]
+    lag: Array
+    correlation: Array
+    band: Array
     p_value: float
 
     @property
@@ -114,13 +99,13 @@ class Coherence:
         Power spectral density of the residual [m^2/Hz].
     """
 
-    frequency: NDArray[np.float64]
-    coherence: NDArray[np.float64]
+    frequency: Array
+    coherence: Array
     tested: NDArray[np.bool_]
     bound: float
     averages: float
     share: float
-    density: NDArray[np.float64]
+    density: Array
 
 
 def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
@@ -138,23 +123,11 @@ def _blocks(parts: Sequence[ResidualPart]) -> int:
     return max(1, -(-sum(part.piece.n for part in parts) // SAMPLES))
 
 
-def whiteness(
-    parts: Sequence[ResidualPart], lags: int = 50, seconds: float | None = None
-) -> Whiteness | None:
+def whiteness(parts: Sequence[ResidualPart], lags: int = 50) -> Whiteness | None:
     """
     Return the autocorrelation of single samples and the Ljung-Box statistic.
 
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-    lags : int, optional
-    seconds : float, optional
-        Look at means over blocks of this length instead.
-
-    Returns
-    -------
-    Whiteness or None
-        None when no run of sound samples is long enough.
+    None when no run of sound samples is long enough.
 
     Notes
     -----
@@ -162,11 +135,10 @@ def whiteness(
     something is left, never what.
     """
     chosen, rate = _chosen(parts)
-    m = 1 if seconds is None else max(1, round(seconds * rate))
     sums, n = np.zeros(lags + 1), 0
     for part in chosen:
         for start, stop in part.runs():
-            x = block_means(part.e[start:stop], m)
+            x = part.e[start:stop]
             if x.size <= 4 * lags:
                 continue
             sums += _products(x - x.mean(), x - x.mean(), lags)[lags:]
@@ -174,12 +146,12 @@ def whiteness(
     if n == 0:
         return None
     if sums[0] <= 0.0:
-        return Whiteness(np.arange(1, lags + 1) * m / rate, np.zeros(lags), 0.0, 0.0, 1.0)
+        return Whiteness(np.arange(1, lags + 1) / rate, np.zeros(lags), 0.0, 0.0, 1.0)
     r = sums[1:] / sums[0]
     k = np.arange(1, lags + 1)
     statistic = float(n * (n + 2.0) * np.sum(r * r / (n - k)))
     return Whiteness(
-        lag=k * m / rate,
+        lag=k / rate,
         correlation=r,
         band=float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE) / np.sqrt(n)),
         statistic=statistic,
@@ -187,7 +159,7 @@ def whiteness(
     )
 
 
-def _products(x: NDArray[np.float64], y: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
+def _products(x: Array, y: Array, lags: int) -> Array:
     """Return ``sum_t x(t) y(t + k)`` for k = -lags .. lags, shape (2 lags + 1,)."""
     size = fft.next_fast_len(x.size + lags + 1, real=True)
     c = fft.irfft(np.conj(fft.rfft(x, size)) * fft.rfft(y, size), size)
@@ -205,17 +177,8 @@ def cross_correlation(
     for white residuals, 2.58 / sqrt(N), would be too narrow by far.  g comes from an
     autoregression, so that slow residuals do not need lags without end.
 
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-    which : {'v', 'dv/dt'}
-    lags : int, optional
-        To either side, in samples after averaging to about 1e5.
-
-    Returns
-    -------
-    CrossCorrelation or None
-        None when there is too little to correlate.
+    `which` is 'v' or 'dv/dt'; lags go to either side, in samples after averaging to about 1e5.
+    None when there is too little to correlate.
 
     Notes
     -----
@@ -254,7 +217,7 @@ def cross_correlation(
     )
 
 
-def _unrelated(u: NDArray[np.float64], e: NDArray[np.float64]) -> float:
+def _unrelated(u: Array, e: Array) -> float:
     """Return the variance of ``sum u e`` if e had nothing to do with u."""
     a, innovation = _autoregression(e)
     size = fft.next_fast_len(2 * u.size, real=True)
@@ -265,7 +228,7 @@ def _unrelated(u: NDArray[np.float64], e: NDArray[np.float64]) -> float:
     return float(innovation * whole / size)
 
 
-def _autoregression(e: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def _autoregression(e: Array) -> tuple[Array, float]:
     """Return the coefficients and innovation variance of e by Levinson's recursion and BIC."""
     order = min(ORDER, e.size // 20)
     c = _products(e, e, order)[order:] / e.size
@@ -275,7 +238,9 @@ def _autoregression(e: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]
     for p in sorted({0, 1, 2, 4, 8, 16, order}):
         if p > order:
             continue
-        a = -linalg.solve_toeplitz(c[:p] * _ridge(p), c[1 : p + 1]) if p else np.zeros(0)
+        # a trace of white noise keeps the recursion stable
+        column = np.concatenate([c[:1] * (1.0 + 1e-9), c[1:p]])
+        a = -linalg.solve_toeplitz(column, c[1 : p + 1]) if p else np.zeros(0)
         left = float(c[0] + a @ c[1 : p + 1])
         if left <= 0.0:
             break
@@ -285,24 +250,9 @@ def _autoregression(e: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]
     return chosen
 
 
-def _ridge(p: int) -> NDArray[np.float64]:
-    ridge = np.ones(p)
-    ridge[0] += 1e-9
-    return ridge
-
-
 def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
     """
-    Return the coherence of the voltage with the residual, by Welch's method.
-
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-
-    Returns
-    -------
-    Coherence or None
-        None when there are fewer than four segments to average.
+    Return the coherence of voltage and residual by Welch's method; None when too short.
 
     Notes
     -----

@@ -13,9 +13,11 @@ import importlib
 from pathlib import Path
 import sys
 
+from diagnosis_examples import base_model
+from diagnosis_examples import measured as example_record
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
-from piezo_ident.diagnosis import diagnose, DiagnosisSettings
+from piezo_ident.diagnosis import diagnose, DiagnosisSettings, search
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
 from piezo_ident.diagnosis.joint_fit import base_at, base_thresholds, fit_base, fit_jointly
@@ -84,7 +86,7 @@ def measured(effect, size, seed):
 
 
 def unseen_errors(result, record) -> tuple[float, float]:
-    before, after = (free_run(m, record).whole.percent for m in (result.given, result.model))
+    before, after = (free_run(m, record).errors.percent for m in (result.given, result.model))
     return before, after
 
 
@@ -291,6 +293,30 @@ def test_another_rate_and_too_little_are_refused(truths):
         diagnose(model, Record((piece.cut(0, 500),), 'short'))
 
 
+@pytest.mark.filterwarnings('ignore::RuntimeWarning')
+@pytest.mark.parametrize('scale', [1e158, 1e170])
+def test_a_singular_fit_is_an_error_of_ours(scale):
+    (piece,) = example_record()
+    huge = Record((replace(piece, y=scale * piece.y),), 'huge')
+    with pytest.raises(IdentificationError, match='singular'):
+        diagnose(base_model(), huge, DiagnosisSettings(effects=('creep',)))
+
+
+def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatch):
+    fit = search.fit_jointly
+
+    def fails_for_drift(simulator, state, *args, **kwargs):
+        if state.effects and state.effects[-1].name == 'thermal_drift':
+            raise IdentificationError('singular')
+        return fit(simulator, state, *args, **kwargs)
+
+    monkeypatch.setattr(search, 'fit_jointly', fails_for_drift)
+    few = DiagnosisSettings(effects=('creep', 'thermal_drift', 'gain_drift'))
+    result = diagnose(base_model(), example_record(), few)
+    assert [e.name for e in result.effects] == ['creep'], result.sentence
+    assert 'thermal_drift was not judged: singular' in result.warnings
+
+
 def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
@@ -338,9 +364,8 @@ def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
     glitch = piece.y.copy()
     glitch[1000] += 1e-3
     faulty = Record((replace(piece, y=glitch),), 'faulty')
-    bad = np.arange(piece.n) == 1000
-    assert make_rows(model, [faulty]).stroke > 5 * stroke
-    assert make_rows(model, [faulty], [bad]).stroke == stroke
+    for bad in (None, [np.arange(piece.n) == 1000]):
+        assert make_rows(model, [faulty], bad).stroke == pytest.approx(stroke, rel=1e-3)
 
 
 def test_time_begins_with_the_record_whatever_its_clock_says(truths):
@@ -349,7 +374,7 @@ def test_time_begins_with_the_record_whatever_its_clock_says(truths):
     epoch = Record((replace(piece, start_time=600.0),), 'epoch')
     here, there = make_rows(model, [record]), make_rows(model, [epoch])
     np.testing.assert_allclose(there.time(0), piece.t, atol=1e-9)
-    np.testing.assert_allclose(there.time(0, 5, 9), piece.t[5:9], atol=1e-9)
+
     assert there.duration == here.duration == piece.duration
     # so does what a diagnosis left switched off, while what follows the clock goes on with it
     hum = {'frequency': 50.0, 'harmonic': [1.0], 'phase': [0.0]}
