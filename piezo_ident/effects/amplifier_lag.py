@@ -52,15 +52,7 @@ class AmplifierLag(Effect):
     needs: ClassVar[str] = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            'time_constant',
-            's',
-            'time constant tau',
-            0.0,
-            0.0,
-            1.0,
-            default=0.0,
-            step=1e-4,
-            scale='linear',
+            'time_constant', 's', 'time constant tau', 0.0, 0.0, 1.0, step=1e-4, scale='linear'
         ),
     )
 

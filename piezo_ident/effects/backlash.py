@@ -52,9 +52,7 @@ class Backlash(Effect):
     needs: ClassVar[str] = 'sweeps with turns, both slow and near the first resonance'
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter('width', '1', 'half-width rho of the play', NAN, 0.0, 2.0, scale='log'),
-        Parameter(
-            'gain', '1', 'share g that hangs in it', 0.0, -100.0, 100.0, default=0.0, step=0.1
-        ),
+        Parameter('gain', '1', 'share g that hangs in it', 0.0, -100.0, 100.0, step=0.1),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:

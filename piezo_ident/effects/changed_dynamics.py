@@ -46,18 +46,8 @@ class ChangedDynamics(Effect):
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter('frequency', 'Hz', 'frequency of mode m', NAN, 1e-3, 1e6, True, scale='log'),
         Parameter('damping', '1', 'damping ratio zeta_m', NAN, 1e-4, 10.0, True, scale='log'),
-        Parameter('gain', '1', 'share g_m', 0.0, -100.0, 100.0, True, default=0.0, step=1e-3),
-        Parameter(
-            'rate_gain',
-            '1',
-            'share k_m of the rate',
-            0.0,
-            -100.0,
-            100.0,
-            True,
-            default=0.0,
-            step=1e-3,
-        ),
+        Parameter('gain', '1', 'share g_m', 0.0, -100.0, 100.0, True, step=1e-3),
+        Parameter('rate_gain', '1', 'share k_m of the rate', 0.0, -100.0, 100.0, True, step=1e-3),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:
@@ -74,13 +64,13 @@ class ChangedDynamics(Effect):
         tried = [(min(c * f, top), z) for f, z in lowest for c in (0.9, 1.0, 1.1)]
         new = ladder(min(band / 4, top / 2), min(20.0 * band, top), 5)
         tried += [(f, z) for f in new for z in (0.02, 0.1)]
-        found = []
+        trials = []
         for f, z in tried:
             # far below a mode M - 1 goes with the square of the frequency, and R with itself
             far = max(1.0, f / band)
             steps = {'gain': min(1.0, 1e-3 * far**2), 'rate_gain': min(1.0, 1e-3 * far)}
-            found.append(cls.trial({'frequency': [f], 'damping': [z]}, steps=steps))
-        return tuple(found)
+            trials.append(cls.trial({'frequency': [f], 'damping': [z]}, steps=steps))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: no mode moves, and the static gain is one."""

@@ -63,15 +63,7 @@ class Creep(Effect):
     needs: ClassVar[str] = 'a hold of at least 2 s after a step'
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            'gain',
-            '1',
-            'share c_i of each element',
-            0.0,
-            -1.0,
-            1.0,
-            vector=True,
-            default=0.0,
-            step=1e-3,
+            'gain', '1', 'share c_i of each element', 0.0, -1.0, 1.0, vector=True, step=1e-3
         ),
         Parameter(
             'time_constant', 's', 'time constant tau_i', NAN, 1e-4, 1e6, vector=True, scale='fixed'

@@ -48,10 +48,8 @@ class CrossCoupling(Effect):
             kind='text',
             scale='fixed',
         ),
-        Parameter('gain', '1/unit', 'static gain g', 0.0, -1e9, 1e9, default=0.0, step=1e-3),
-        Parameter(
-            'rate_gain', 's/unit', "gain g' of its rate", 0.0, -1e9, 1e9, default=0.0, step=1e-5
-        ),
+        Parameter('gain', '1/unit', 'static gain g', 0.0, -1e9, 1e9, step=1e-3),
+        Parameter('rate_gain', 's/unit', "gain g' of its rate", 0.0, -1e9, 1e9, step=1e-5),
         Parameter('frequency', 'Hz', 'corner of the low-pass', NAN, 1e-3, 1e6, scale='log'),
         Parameter('damping', '1', 'its damping', NAN, 1e-3, 100.0, default=0.7, scale='log'),
         Parameter(
@@ -73,7 +71,7 @@ class CrossCoupling(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return every channel that moves, with three corners."""
-        found = []
+        trials = []
         for name, (mean, std) in view.channels.items():
             if not (np.isfinite(std) and std > 0):
                 continue
@@ -82,8 +80,8 @@ class CrossCoupling(Effect):
                     continue
                 shape = {'channel': name, 'frequency': f, 'damping': 0.7, 'offset': mean}
                 steps = {'gain': 1e-3 / std, 'rate_gain': 1e-3 / (2 * np.pi * f * std)}
-                found.append(cls.trial(shape, steps=steps))
-        return tuple(found)
+                trials.append(cls.trial(shape, steps=steps))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest; the channel's rest value is known with its first sample only."""

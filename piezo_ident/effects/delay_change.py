@@ -40,9 +40,7 @@ class DelayChange(Effect):
     needs: ClassVar[str] = 'fast sines, a multisine or steps'
     in_delay_line: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'samples', 'samples', 'added delay delta', 0.0, -1e5, 1e5, default=0.0, step=0.1
-        ),
+        Parameter('samples', 'samples', 'added delay delta', 0.0, -1e5, 1e5, step=0.1),
     )
 
     @classmethod

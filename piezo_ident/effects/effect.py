@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an effect is: an operator with a name, a slot, and parameters that can make it vanish."""
+"""The base of effects: operators with a name, a slot and parameters that can switch them off."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 
 __all__ = ['NAN', 'Effect', 'Parameter', 'Trial', 'Value', 'View']
 
-#: the neutral value of a parameter that has none
+#: neutral value of a parameter without one
 NAN = float('nan')
 
 Value = float | str | NDArray[np.float64]
@@ -31,7 +31,7 @@ class Parameter:
     """
     One parameter of an effect.
 
-    A parameter is an amplitude, which makes the effect grow from nothing, or it shapes the effect.
+    An amplitude scales the effect from nothing; other parameters shape it.
 
     Attributes
     ----------
@@ -44,17 +44,16 @@ class Parameter:
     vector : bool
         Whether the value is a list of numbers.
     default : float or str, optional
-        What a parameter that is left out takes; for a list, each of its numbers.  Without a
-        default the parameter is required.
+        Value when the parameter is left out; for a list, of each of its numbers.  The neutral
+        value for an amplitude; another parameter without a default is required.
     kind : str
         ``number`` or ``text``.
     step : float
-        Of an amplitude: a small value, at which the effect makes about 1e-3 of the span.  0 for a
-        parameter that shapes.
+        Of an amplitude: a value at which the effect is about 1e-3 of the span; else 0.
     scale : str
-        How a fit may move the parameter: ``linear``, ``log`` (by its logarithm) or ``fixed``.
+        How a fit moves the parameter: ``linear``, ``log`` (its logarithm) or ``fixed``.
     tries : tuple
-        Of a parameter that shapes: values worth trying on any data; for a list, lists.
+        Of a parameter that is no amplitude: values worth trying on any data; for a list, lists.
     """
 
     name: str
@@ -70,9 +69,13 @@ class Parameter:
     scale: Literal['linear', 'log', 'fixed'] = 'linear'
     tries: tuple[Any, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.default is None and self.is_amplitude:
+            object.__setattr__(self, 'default', self.neutral)
+
     @property
     def is_amplitude(self) -> bool:
-        """Whether the effect grows in proportion to it, near its neutral value."""
+        """Whether the effect is proportional to it near its neutral value."""
         return self.step > 0.0
 
     def clip(self, value: Any) -> Any:
@@ -118,20 +121,20 @@ class Effect:
     Attributes
     ----------
     name : str
-        As verdicts and files call it.
+        In verdicts and files.
     slot : str
         Its place in the chain.
     parameters : tuple of Parameter
-        What it takes.
+        Its parameters.
     description : str
         One line for the catalogue, with the typical size.
     needs : str
         The excitation that would show it.
     time_driven : bool
-        Whether it follows from time alone and not from the command: then its amplitudes are
-        others in each record, and nothing is known of them beyond the record.
+        Whether it depends on time alone and not on the command: then its amplitudes differ from
+        record to record.
     in_delay_line : bool
-        Whether it is no link of its own but a change of the model's delay line, by `added_delay`.
+        Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
     Parameters
     ----------
@@ -147,8 +150,8 @@ class Effect:
     Raises
     ------
     ModelError
-        When a parameter is missing, unknown, out of bounds or of the wrong shape, or when they
-        contradict each other.
+        When a parameter is missing, unknown, out of bounds or of the wrong shape, or when
+        parameters contradict each other.
     """
 
     name: ClassVar[str]
@@ -182,10 +185,10 @@ class Effect:
             As the class says.
         """
         where, known = f'effect {cls.name}', {p.name: p for p in cls.parameters}
-        strange = sorted(set(values) - set(known))
+        unknown = sorted(set(values) - set(known))
         missing = sorted(k for k, p in known.items() if k not in values and p.default is None)
-        if strange or missing:
-            what = f'unknown {strange}' if strange else f'missing {missing}'
+        if unknown or missing:
+            what = f'unknown {unknown}' if unknown else f'missing {missing}'
             raise ModelError(f'{where}: {what}; its parameters are {sorted(known)}')
         checked = {k: p.read(values[k], where) for k, p in known.items() if k in values}
         lengths = [x.size for x in checked.values() if isinstance(x, np.ndarray)]
@@ -208,12 +211,12 @@ class Effect:
         """
         lengths = {k: x.size for k, x in values.items() if isinstance(x, np.ndarray)}
         if len(set(lengths.values())) > 1:
-            said = ', '.join(f'{name} has {n}' for name, n in lengths.items())
-            raise ModelError(f'effect {cls.name}: the lists differ in length ({said})')
+            each = ', '.join(f'{name} has {n}' for name, n in lengths.items())
+            raise ModelError(f'effect {cls.name}: the lists differ in length ({each})')
 
     @classmethod
     def neutral(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Return the values with every parameter that has a neutral value there."""
+        """Return the values with all neutral ones, at which the effect does nothing."""
         checked = cls.check(values)
         for p in cls.parameters:
             if not np.isnan(p.neutral):
@@ -224,7 +227,7 @@ class Effect:
 
     @classmethod
     def is_neutral(cls, values: Mapping[str, Any]) -> bool:
-        """Return whether every parameter that has a neutral value is there: nothing is done."""
+        """Return whether the effect does nothing at these values."""
         return cls.same(values, cls.neutral(values))
 
     @classmethod
@@ -236,15 +239,15 @@ class Effect:
     @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
         """
-        Return what to expect of an effect that is driven by time in a record that nobody knows.
+        Return the values of a time-driven effect to expect in another record.
 
-        Here: its neutral values, for what is known of one record says nothing of another.
+        By default the neutral ones, since one record says nothing about another.
         """
         return cls.neutral(values)
 
     @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
-        """Return by how many samples an effect `in_delay_line` lengthens it."""
+        """Return the delay [samples] that an effect `in_delay_line` adds."""
         return 0.0
 
     @classmethod
@@ -252,21 +255,18 @@ class Effect:
         """
         Return the settings at which the effect is tried on given data.
 
-        Here: each combination of the `tries` of the parameters that shape, all amplitudes moved.
-        None when such a parameter has neither `tries` nor a default.
+        By default each combination of the `tries` of the parameters that are no amplitudes, with
+        all amplitudes moved; no trials when such a parameter has neither `tries` nor a default.
 
         Parameters
         ----------
         view : View
-            What is known of the data.
+            Properties of the data.
         """
         shapes = [p for p in cls.parameters if not p.is_amplitude]
         choices = [p.tries or (() if p.default is None else (p.default,)) for p in shapes]
-        found = []
-        for combination in product(*choices):
-            chosen = {p.name: x for p, x in zip(shapes, combination, strict=True)}
-            found.append(cls.trial(chosen))
-        return tuple(found)
+        names = [p.name for p in shapes]
+        return tuple(cls.trial(dict(zip(names, x, strict=True))) for x in product(*choices))
 
     @classmethod
     def trial(
@@ -281,11 +281,11 @@ class Effect:
         Parameters
         ----------
         shape : mapping
-            Values of the parameters that shape; they are moved into their bounds.
+            Values of parameters that are no amplitudes; they are clipped to their bounds.
         moved : sequence of str, optional
-            Amplitudes that are moved; all when absent.  A list moves in each of its places.
+            Amplitudes that are moved; all when absent.  Each element of a list moves by itself.
         steps : mapping of str to float, optional
-            Steps that suit these data better than those of the parameters.
+            Steps that replace those of the parameters.
         """
         known = {p.name: p for p in cls.parameters}
         values = cls.check({name: known[name].clip(x) for name, x in shape.items()})
@@ -330,11 +330,11 @@ class Effect:
 
     @property
     def core(self) -> Operator:
-        """The operator at the heart of a stack in the slot ``hysteresis``: H, as a rule."""
-        found: Operator = self.inner
-        while isinstance(found, Effect):
-            found = found.inner
-        return found
+        """The innermost operator of the slot ``hysteresis``: H, as a rule."""
+        operator: Operator = self.inner
+        while isinstance(operator, Effect):
+            operator = operator.inner
+        return operator
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest; see `piezo_ident.operators.chain.Operator`."""

@@ -38,13 +38,9 @@ class EvenNonlinearity(Effect):
     )
     needs: ClassVar[str] = 'slow sweeps over the full range with minor loops at several biases'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'square', '1', 'coefficient p0 of v^2', 0.0, -10.0, 10.0, default=0.0, step=1e-3
-        ),
-        Parameter(
-            'fourth', '1', 'coefficient p4 of v^4', 0.0, -10.0, 10.0, default=0.0, step=1e-3
-        ),
-        Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -10.0, 10.0, default=0.0, step=1e-3),
+        Parameter('square', '1', 'coefficient p0 of v^2', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('fourth', '1', 'coefficient p4 of v^4', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -10.0, 10.0, step=1e-3),
     )
 
     @classmethod

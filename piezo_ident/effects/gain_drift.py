@@ -41,17 +41,7 @@ class GainDrift(Effect):
         Parameter(
             'time', 's', 'time of each knot, ascending', NAN, -1e9, 1e9, True, scale='fixed'
         ),
-        Parameter(
-            'gain',
-            '1',
-            'change a of the gain there',
-            0.0,
-            -1.0,
-            10.0,
-            True,
-            default=0.0,
-            step=1e-3,
-        ),
+        Parameter('gain', '1', 'change a of the gain there', 0.0, -1.0, 10.0, True, step=1e-3),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:
@@ -69,12 +59,12 @@ class GainDrift(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return one, three and six stretches; the first knot stays, as a constant gain is H's."""
-        found = []
+        trials = []
         for stretches in (1, 3, 6):
             knots = np.linspace(0.0, max(view.duration, 1e-6), stretches + 1)
             full = cls.trial({'time': knots})
-            found.append(Trial(full.values, full.moves[1:], full.steps[1:]))
-        return tuple(found)
+            trials.append(Trial(full.values, full.moves[1:], full.steps[1:]))
+        return tuple(trials)
 
     @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:

@@ -35,12 +35,8 @@ class InputFeedthrough(Effect):
     )
     needs: ClassVar[str] = 'steps, or wide-band noise, sampled faster than the delay'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'gain', '1', 'share k0 of the command', 0.0, -10.0, 10.0, default=0.0, step=1e-3
-        ),
-        Parameter(
-            'rate_gain', 's', 'share k1 of its rate', 0.0, -1.0, 1.0, default=0.0, step=1e-6
-        ),
+        Parameter('gain', '1', 'share k0 of the command', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('rate_gain', 's', 'share k1 of its rate', 0.0, -1.0, 1.0, step=1e-6),
     )
 
     def __init__(self, *args: object, **kwargs: object) -> None:

@@ -75,12 +75,8 @@ class NoncongruentMinorLoops(Effect):
         Parameter(
             'threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='fixed'
         ),
-        Parameter(
-            'slope', '1', 'growth kappa_j', 0.0, -10.0, 10.0, vector=True, default=0.0, step=2e-3
-        ),
-        Parameter(
-            'bend', '1', 'growth lambda_j', 0.0, -10.0, 10.0, vector=True, default=0.0, step=2e-3
-        ),
+        Parameter('slope', '1', 'growth kappa_j', 0.0, -10.0, 10.0, True, step=2e-3),
+        Parameter('bend', '1', 'growth lambda_j', 0.0, -10.0, 10.0, True, step=2e-3),
         Parameter(
             'bias', '1', 'voltage c without a change', NAN, -10.0, 10.0, default=0.5, scale='fixed'
         ),

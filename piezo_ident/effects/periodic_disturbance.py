@@ -39,19 +39,9 @@ class PeriodicDisturbance(Effect):
         # found as a line, far more sharply than a fit of neighbouring columns could move it
         Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='fixed'),
         Parameter('harmonic', '1', 'multiple m_i of f', NAN, 1.0, 1e3, True, scale='fixed'),
+        Parameter('amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, True, step=1e-3),
         Parameter(
-            'amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, True, default=0.0, step=1e-3
-        ),
-        Parameter(
-            'phase',
-            'rad',
-            'phase phi_i of each',
-            NAN,
-            -1e3,
-            1e3,
-            True,
-            default=0.0,
-            scale='fixed',
+            'phase', 'rad', 'phase phi_i of each', NAN, -1e3, 1e3, True, default=0.0, scale='fixed'
         ),
     )
 
@@ -62,7 +52,7 @@ class PeriodicDisturbance(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return one trial a line, with up to three harmonics as sine and cosine."""
-        found = []
+        trials = []
         for f in view.lines:
             harmonics = [m for m in (1.0, 2.0, 3.0) if m * f < view.nyquist]
             if f > 0 and harmonics:
@@ -71,8 +61,8 @@ class PeriodicDisturbance(Effect):
                     'harmonic': np.repeat(harmonics, 2),
                     'phase': np.tile([0.0, np.pi / 2], len(harmonics)),
                 }
-                found.append(cls.trial(shape))
-        return tuple(found)
+                trials.append(cls.trial(shape))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the mean of the disturbance is zero."""

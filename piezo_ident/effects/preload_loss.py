@@ -38,9 +38,7 @@ class PreloadLoss(Effect):
         'slow sweeps over the full range and minor loops on both sides of the kink'
     )
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'gain', '1', 'loss k of slope below theta', 0.0, -10.0, 10.0, default=0.0, step=3e-3
-        ),
+        Parameter('gain', '1', 'loss k of slope below theta', 0.0, -10.0, 10.0, step=3e-3),
         Parameter('threshold', '1', 'voltage theta of the kink', NAN, -10.0, 10.0),
     )
 

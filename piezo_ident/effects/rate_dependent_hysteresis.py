@@ -97,55 +97,21 @@ class RateDependentHysteresis(Effect):
     )
     needs: ClassVar[str] = 'two amplitudes at one fast frequency, and a slow sweep'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'gain',
-            's^eps',
-            'growth beta of the thresholds with speed',
-            0.0,
-            -1.0,
-            1.0,
-            default=0.0,
-            step=1e-5,
-        ),
+        Parameter('gain', 's^eps', 'growth beta of all thresholds', 0.0, -1.0, 1.0, step=1e-5),
         Parameter('exponent', '1', 'power eps of the speed', NAN, 0.05, 2.0, scale='log'),
         Parameter(
-            'levelling',
-            's',
-            'c: growth levels off above a speed of 1/c',
-            NAN,
-            0.0,
-            1e3,
-            default=0.0,
+            'levelling', 's', 'growth levels off above a speed of 1/c', NAN, 0.0, 1e3, default=0.0
         ),
         Parameter('cutoff', 'Hz', 'low-pass of the speed', NAN, 1e-3, 1e5, scale='log'),
-        Parameter(
-            'stretch',
-            's^eps',
-            'relative growth sigma of the thresholds',
-            0.0,
-            -1.0,
-            10.0,
-            default=0.0,
-            step=1e-4,
-        ),
-        Parameter(
-            'lead',
-            's^eps',
-            'growth lambda_0 of the upper edge with speed',
-            0.0,
-            -1.0,
-            1.0,
-            default=0.0,
-            step=1e-5,
-        ),
+        Parameter('stretch', 's^eps', 'relative growth sigma', 0.0, -1.0, 10.0, step=1e-4),
+        Parameter('lead', 's^eps', 'growth lambda_0 of the upper edge', 0.0, -1.0, 1.0, step=1e-5),
         Parameter(
             'lead_stretch',
             's^eps',
-            'growth lambda_1 of the upper edge, in proportion to the threshold',
+            'relative growth lambda_1 of the upper edge',
             0.0,
             -1.0,
             10.0,
-            default=0.0,
             step=1e-4,
         ),
     )
@@ -162,7 +128,7 @@ class RateDependentHysteresis(Effect):
         """Return several laws of the speed, growth below alone and on both sides."""
         if not np.any(view.thresholds > 0):
             return ()
-        found = []
+        trials = []
         fast = max(view.speed, *view.speeds)
         laws = [(0.3, 0.0), (0.6, 0.0), (1.0, 0.0), (1.5, 0.0)]
         laws += [(1.0, 5.0 / fast), (1.0, 50.0 / fast)]
@@ -176,9 +142,9 @@ class RateDependentHysteresis(Effect):
                     'levelling': levelling,
                     'cutoff': min(view.sample_rate / 10, cutoff),
                 }
-                found.append(cls.trial(shape, ['gain', 'stretch'], steps))
-            found.append(cls.trial(shape, steps=steps))
-        return tuple(found)
+                trials.append(cls.trial(shape, ['gain', 'stretch'], steps))
+            trials.append(cls.trial(shape, steps=steps))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: no speed, and the plays where H has them."""

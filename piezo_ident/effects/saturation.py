@@ -82,13 +82,13 @@ class Saturation(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return one end at a time, at several places near it, sharp and round."""
-        found = []
+        trials = []
         for inside in (0.02, 0.05, 0.1, 0.2, 0.3):
             for knee in (0.02, 0.2):
                 round_off = {'knee': knee * view.span}
-                found.append(cls.trial({'high': view.high - inside * view.span, **round_off}))
-                found.append(cls.trial({'low': view.low + inside * view.span, **round_off}))
-        return tuple(found)
+                trials.append(cls.trial({'high': view.high - inside * view.span, **round_off}))
+                trials.append(cls.trial({'low': view.low + inside * view.span, **round_off}))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest; the effect has no memory."""

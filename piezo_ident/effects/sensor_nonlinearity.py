@@ -38,13 +38,9 @@ class SensorNonlinearity(Effect):
     )
     needs: ClassVar[str] = 'the full range both slowly and near the first resonance'
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            'square', '1', 'coefficient c2 of x^2', 0.0, -10.0, 10.0, default=0.0, step=1e-3
-        ),
-        Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -10.0, 10.0, default=0.0, step=1e-3),
-        Parameter(
-            'fourth', '1', 'coefficient c4 of x^4', 0.0, -10.0, 10.0, default=0.0, step=1e-3
-        ),
+        Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('fourth', '1', 'coefficient c4 of x^4', 0.0, -10.0, 10.0, step=1e-3),
     )
 
     @classmethod

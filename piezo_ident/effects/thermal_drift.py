@@ -38,26 +38,10 @@ class ThermalDrift(Effect):
     needs: ClassVar[str] = 'idle stretches at one voltage at the start and at the end'
     time_driven: ClassVar[bool] = True
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0, default=0.0, step=1e-4),
+        Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0, step=1e-4),
+        Parameter('amplitude', '1', 'final size c of the approach', 0.0, -1.0, 1.0, step=1e-3),
         Parameter(
-            'amplitude',
-            '1',
-            'final size c of the approach',
-            0.0,
-            -1.0,
-            1.0,
-            default=0.0,
-            step=1e-3,
-        ),
-        Parameter(
-            'time_constant',
-            's',
-            'tau of the approach',
-            NAN,
-            1e-3,
-            1e7,
-            default=60.0,
-            scale='log',
+            'time_constant', 's', 'tau of the approach', NAN, 1e-3, 1e7, default=60.0, scale='log'
         ),
     )
 
@@ -66,11 +50,11 @@ class ThermalDrift(Effect):
         """Return the steady drift, approaches to a new temperature, and both."""
         long = max(view.duration, 1e-2)
         steps = {'rate': min(0.1, 1e-3 / long)}
-        found = [cls.trial({'time_constant': long}, ['rate'], steps)]
+        trials = [cls.trial({'time_constant': long}, ['rate'], steps)]
         for moved in (['amplitude'], ['rate', 'amplitude']):
             for share in (0.1, 1 / 3, 1.0):
-                found.append(cls.trial({'time_constant': share * long}, moved, steps))
-        return tuple(found)
+                trials.append(cls.trial({'time_constant': share * long}, moved, steps))
+        return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: nothing has drifted yet."""

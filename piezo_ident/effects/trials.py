@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The settings at which an effect is tried on given data, and what it may know of these data."""
+"""The settings at which an effect is tried, and the properties of the data they depend on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ['Trial', 'View', 'ladder']
 @dataclass(frozen=True, eq=False)
 class View:
     """
-    What an effect may know of the data before it is tried on them.
+    Properties of the data on which an effect is tried.
 
     Attributes
     ----------
@@ -28,14 +28,14 @@ class View:
     low, high : float
         Range of the normalised command u.
     speeds : ndarray, shape (n,)
-        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 over the part that moves.  One more
-        entry, the largest of all, may follow.
+        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 of the moving part, then perhaps the
+        maximum.
     duration : float
         Length of the longest record [s].
     channels : mapping of str to (float, float)
         Mean and standard deviation of each further channel, in its own unit.
     lines : tuple of float
-        Frequencies [Hz] of the lines that were found in the residual.
+        Frequencies [Hz] of the lines in the residual.
     modes : tuple of (float, float)
         Natural frequency [Hz] and damping ratio of each mode of G.
     max_frequency : float
@@ -75,18 +75,18 @@ class View:
 @dataclass(frozen=True, eq=False)
 class Trial:
     """
-    One way to try an effect: where it starts, and which amplitudes move.
+    One way to try an effect: its values, and the amplitudes that move.
 
     Attributes
     ----------
     values : mapping
         One value for each parameter; amplitudes are neutral.
     moves : tuple of (str, int or None)
-        The amplitudes that are moved, one column each: a name, and the place in it where it is a
-        list.  Empty for an effect without an amplitude: then it is switched on in `values`, and
-        the column is the whole difference between on and off.
+        The amplitudes that are moved, one column each: name and, in a list, index.  Empty for an
+        effect without amplitudes: it is switched on in `values`, and its column is the difference
+        between on and off.
     steps : tuple of float
-        How far each is moved.
+        Step of each.
     """
 
     values: Mapping[str, Any]
@@ -100,7 +100,7 @@ class Trial:
         """Return one complete set of parameters for each column."""
         if not self.moves:
             return [dict(self.values)]
-        found = []
+        settings = []
         for (name, index), step in zip(self.moves, self.steps, strict=True):
             values = dict(self.values)
             if index is None:
@@ -108,8 +108,8 @@ class Trial:
             else:
                 values[name] = np.array(values[name], dtype=np.float64)
                 values[name][index] += step
-            found.append(values)
-        return found
+            settings.append(values)
+        return settings
 
 
 def ladder(low: float, high: float, count: int) -> list[float]:

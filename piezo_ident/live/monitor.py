@@ -1,8 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
-"""Measured beside predicted as they come: joined on time, binned for people, judged by rms."""
+"""Measured and predicted blocks: joined on time, binned for display, compared by their rms."""
 
 from __future__ import annotations
 
@@ -12,18 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.restart import has_restarted
 
 __all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
-#: time that jumps back by more than this is that of another run [s]
-BACK = 0.05
-#: after this time without any match, two streams are taken to be in the same run [s]
+#: after this time without a match, two streams are taken to be in the same run [s]
 CATCH_UP = 1.0
-#: most blocks that wait
+#: largest number of waiting blocks
 MOST = 500
-#: bins that a quantity may lag behind before it is no longer waited for
+#: number of bins after which a late quantity is no longer waited for
 LAG = 25
 
 
@@ -43,18 +41,20 @@ class Matched:
 
 
 class _Side:
-    """One of two streams: what waits, how far it is, and how often its clock began anew."""
+    """One of two streams: its waiting blocks, newest time, and number of clock restarts."""
 
     def __init__(self) -> None:
         self.waiting: list[Samples] = []
         self.run = 0
         self.begin = self.last = float('nan')
+        self.period = 0.0
 
     def restarts_with(self, t: NDArray[np.float64]) -> bool:
-        """Take note of a block, and return whether its clock began anew."""
+        """Note the times of a block, and return whether the clock restarted before it."""
         first, last = float(t[0]), float(t[-1])
-        from_start = first <= self.begin and last < self.last
-        again = from_start or first < self.last - BACK
+        if t.size > 1:
+            self.period = (last - first) / (t.size - 1)
+        again = last < self.last and has_restarted(first, self.last, self.begin, self.period)
         if again or np.isnan(self.begin):
             self.begin = first
         self.last = last if again else max(last, float(np.nan_to_num(self.last, nan=last)))
@@ -62,11 +62,11 @@ class _Side:
 
     @property
     def span(self) -> float:
-        """Time between the oldest and the newest block that waits [s]."""
+        """Time between the oldest and the newest waiting block [s]."""
         return float(self.waiting[-1].t[-1] - self.waiting[0].t[0]) if self.waiting else 0.0
 
     def forget(self) -> int:
-        """Drop what has waited for too long, and return how many samples that were."""
+        """Drop blocks that have waited too long, and return their number of samples."""
         kept = [s for s in self.waiting if self.last - s.t[-1] <= WAIT][-MOST:]
         n = sum(s.t.size for s in self.waiting) - sum(s.t.size for s in kept)
         self.waiting = kept
@@ -75,15 +75,15 @@ class _Side:
 
 class Matcher:
     """
-    Joins two streams of blocks on time, whichever comes first and however they are cut.
+    Joins two streams of blocks on time, in any order and with blocks of any size.
 
-    Where a clock begins anew, the old run's times come again; a block waits until the other
-    stream is in its run.
+    After a restart of the clock the times of the old run repeat, so a block waits until the other
+    stream has restarted too.
 
     Attributes
     ----------
     unmatched : int
-        Measured samples for which no prediction came in time.
+        Measured samples without a prediction in time.
     """
 
     def __init__(self) -> None:
@@ -91,12 +91,12 @@ class Matcher:
         self._predicted, self._measured = _Side(), _Side()
 
     def predicted(self, samples: Samples) -> list[Matched]:
-        """Take a prediction; return what is complete now."""
+        """Take a predicted block; return the pairs that it completes."""
         pairs = self._match(samples, self._predicted, self._measured)
         return [Matched(a.t, b.values, a.values, a.segment) for a, b in pairs]
 
     def measured(self, samples: Samples) -> list[Matched]:
-        """Take a measured block; return what is complete now."""
+        """Take a measured block; return the pairs that it completes."""
         pairs = self._match(samples, self._measured, self._predicted)
         return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
 
@@ -105,11 +105,11 @@ class Matcher:
             own.run = other.run
         if own.restarts_with(new.t):
             own.waiting.clear()
-            # who begins anew second has only caught up
+            # the second of the two to restart has only caught up
             own.run = other.run if other.run > own.run else own.run + 1
         pairs, rest = [], new
         if own.run != other.run and own.span > CATCH_UP:
-            # one of them was silent when the clock began anew
+            # one of them was silent when the clock restarted
             own.run = other.run = max(own.run, other.run)
         for one in list(other.waiting) if own.run == other.run else ():
             if not rest.t.size:
@@ -164,7 +164,7 @@ class Preview:
     """
     Bins on the grid of sample time.
 
-    A bin is complete when every quantity that is coming has gone past it.
+    A bin is complete when every quantity has samples after it.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ class Preview:
             t, x = t[finite], x[finite]
         if not t.size:
             return []
-        # a tick that division put a hair before its bin belongs into it
+        # rounding may put a sample just before its bin
         k = np.floor(t * self.rate + 1e-6).astype(np.int64)
         done: list[PreviewBin] = []
         if k[0] < self._newest.get(name, k[0]):
@@ -237,12 +237,12 @@ class LiveError:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Forget all samples."""
         # begin, end, samples and sum of squares of each stretch
         self._parts: deque[tuple[float, float, int, float]] = deque()
 
     def add(self, t: NDArray[np.float64], residual: NDArray[np.float64]) -> None:
-        """Take a stretch of the residual [m]."""
+        """Take the residual [m] of the next samples."""
         e = residual[np.isfinite(residual)]
         if not e.size:
             return
@@ -254,7 +254,7 @@ class LiveError:
 
     @property
     def seconds(self) -> float:
-        """How much of the window is filled [s]."""
+        """Length of the filled part of the window [s]."""
         return self._parts[-1][1] - self._parts[0][0] if self._parts else 0.0
 
     @property

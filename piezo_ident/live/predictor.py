@@ -1,14 +1,13 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
-A model beside a running stage: block by block, through gaps, restarts and changes of the model.
+The prediction beside a running stage: block by block, through gaps, restarts and new models.
 
-The plays remember extremes of the voltage as far back as the start of the run.  They need only
-few of them, though: a loop that lies inside a later stroke leaves no trace, so it is taken out
-(the wiping-out property).  What is left, the turning points, puts any model into the state that
-it would have if it had run all along; G and the delay catch up over the last seconds.
+The plays remember extremes of the voltage as far back as the start of the run, but only few of
+them: a loop inside a later stroke leaves no trace (the wiping-out property).  The remaining
+turning points, with the samples just before each, and the last seconds in full bring any new model
+into the state that it would have if it had run from the start.
 """
 
 from __future__ import annotations
@@ -24,22 +23,20 @@ from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.restart import has_restarted
 
 __all__ = ['Predictor', 'TurningPoints', 'expected_error', 'warm_up']
 
-#: voltage that is kept sample by sample, for G and delay of a new model to catch up with [s]
+#: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
-#: longest gap that is bridged by a straight line; behind a longer one a new run begins [s]
+#: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
 BRIDGE = 0.5
 #: time before each turning point of which the samples are kept [s]
 APPROACH = 0.05
-#: time that jumps back by more samples than this is a restart, not a late block
-JUMP_BACK = 1000
-#: fastest sample clock [s], and most blocks that are kept, whatever the times say
+#: shortest sampling period that is accepted [s], and most blocks that are kept
 SHORTEST, MOST_BLOCKS = 1e-7, 100_000
-#: share of the voltage range within which the stage is at its lowest, where memory is known
+#: share of the voltage range that counts as its lower end, where the memory is known
 REST = 0.01
-
 
 #: what may be wrong with a block
 FINE, NOT_FINITE, NOT_UNIFORM = range(3)
@@ -61,7 +58,7 @@ def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
 
 @kernel
 def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
-    # first and last sample, and every one at which the direction changes
+    # indices of the first and last sample, and of those at which the direction changes
     n, before = 0, 0.0
     for k in range(v.size):
         after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
@@ -74,10 +71,10 @@ def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
 
 class TurningPoints:
     """
-    The least of a voltage's history that any play operator needs.
+    The part of a voltage's history that determines the memory of any play operator.
 
-    Of four points in a row the inner two go when they lie between the outer two, whatever the
-    memory was before.  The first point always stays.
+    Of four turning points in a row, the inner two are dropped when they lie between the outer
+    two.  The first point always stays.
 
     Examples
     --------
@@ -125,10 +122,10 @@ class TurningPoints:
 
     def path(self, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """
-        Return time [s] and voltage [V] of a way through the turning points, sampled.
+        Return time [s] and voltage [V] of a path through the turning points.
 
-        For operators that depend on the speed: before each point stand the last samples that led
-        to it, and between them short straight lines.
+        For operators that depend on the speed.  The samples before each point are those that were
+        measured; short straight lines connect them.
 
         Parameters
         ----------
@@ -153,7 +150,7 @@ class TurningPoints:
 
 
 def expected_error(model: StageModel) -> float | None:
-    """Return the error at identification [% of stroke], on the best data the model names."""
+    """Return the error at identification [% of stroke], on held-out data where there are any."""
     errors = model.identification.get('errors')
     if isinstance(errors, dict):
         for data in ('held_out', 'selection', 'fitted'):
@@ -170,13 +167,13 @@ class Predictor:
     Attributes
     ----------
     lost : int
-        Samples that never came, or could not be used.
+        Samples that are missing or not usable.
     late : int
-        Samples that came again or out of turn, and were left out.
+        Samples that arrived again or out of order, and were left out.
     restarts : int
-        How often the sample clock began anew.
+        Number of restarts of the sample clock.
     problem : str
-        What was last wrong with the stream; empty when all is well.
+        The last problem of the stream; empty without one.
     """
 
     def __init__(self) -> None:
@@ -202,26 +199,25 @@ class Predictor:
     @property
     def memory_known(self) -> bool:
         """
-        Whether the plays are where they must be.
+        Whether the memory of the plays is known.
 
-        That is so when the voltage has been at its lowest since the run began, or since the last
-        gap.
+        It is when the voltage has been at its lowest since the start of the run or the last gap.
         """
         return self.model is not None and bool(self.model.scaling.u(self._lowest) < REST)
 
     @property
     def memory_lost(self) -> bool:
-        """Whether blocks come and the plays are not where they must be."""
+        """Whether blocks arrive and the memory of the plays is not known."""
         return bool(np.isfinite(self._last)) and not self.memory_known
 
     def set_model(self, model: StageModel) -> None:
         """
-        Take a model, in the state that it would have if it had run all along.
+        Take a model, in the state that it would have if it had run from the start.
 
         Raises
         ------
         ModelError
-            When it holds for another sampling rate than that of the stream.
+            When its sampling rate differs from that of the stream.
         """
         if np.isfinite(self._period):
             self._check_rate(model)
@@ -240,7 +236,7 @@ class Predictor:
 
     def _caught_up(self, model: StageModel) -> Stream:
         stream = model.stream()
-        # without older samples the run is here in full, start and all
+        # without older samples the recent ones are the whole run
         if len(self._old):
             if model.effects_in('input') or model.effects_in('hysteresis'):
                 t, v = self._old.path(self._period)
@@ -255,18 +251,18 @@ class Predictor:
 
     def process(self, samples: Samples) -> Samples | None:
         """
-        Return the prediction for a block, None where there is none.
+        Return the prediction for a block, or None.
 
-        A gap of up to half a second is bridged by a straight line; behind a longer one, as
-        behind a restart, the stage is taken to be at rest.  Blocks that came before, and blocks
-        with a number that is none, are left out.
+        A gap of up to half a second is bridged by a straight line; after a longer one, and after
+        a restart, the stage is taken to be at rest.  Repeated and late blocks, and blocks with
+        NaN or infinite numbers, are left out.
 
         Parameters
         ----------
         samples : Samples
             Of voltage.
         """
-        # copies: what is remembered does not change with the message, and is whole to the kernels
+        # copies, since the message may change
         t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
         if not self._usable(t, v):
             return None
@@ -275,10 +271,11 @@ class Predictor:
         if np.isnan(step):
             self._start(t, period)
         elif step <= 0.5 * period:
-            if (t[0] <= self._begin and self._blocks > 1) or -step > JUMP_BACK * period:
+            is_repeated = self._blocks == 1 and float(t[-1]) == self._last
+            if not is_repeated and has_restarted(float(t[0]), self._last, self._begin, period):
                 self.restarts += 1
                 if t[0] > 0.5 * period:
-                    # a programme that begins anew begins at zero
+                    # a program that starts again starts at zero
                     self.problem = f'time jumps back from {self._last:.6g} to {t[0]:.6g} s'
                 self._start(t, period)
             else:
@@ -362,7 +359,7 @@ class Predictor:
 
 
 def warm_up() -> None:
-    """Compile or load what a prediction needs, so that the first block is in time."""
+    """Compile the kernels of a prediction, or load them, before the first block arrives."""
     model = StageModel(
         sample_rate=1000.0,
         scaling=Scaling(0.0, 1.0, 0.0, 1.0, (0.0, 1.0)),

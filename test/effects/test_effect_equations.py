@@ -41,6 +41,7 @@ def test_slew_limit_is_a_ramp_and_then_nothing():
     assert np.any(alone('slew_limit', {'limit': 0.9 * np.pi * 40}, slow) != slow)
 
 
+@settings(deadline=None)
 @given(
     u=st.lists(st.floats(-3.0, 3.0), min_size=1, max_size=30),
     ends=st.tuples(st.floats(-1.0, 0.4), st.floats(0.5, 2.0)),
