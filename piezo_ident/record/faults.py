@@ -1,18 +1,24 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What looks wrong with measured data though every number in them is in order."""
+"""What is wrong with measured data though every number in them is in order."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 import difflib
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.record.record import KINDS, Piece, Record
+from piezo_ident.record.ordering import at_times
+from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
-__all__ = ['line_error', 'misspelt', 'suspicions']
+__all__ = ['line_error', 'misspelt', 'suspicions', 'without_faults']
+
+Vector = NDArray[np.float64]
+Runs = list[tuple[int, int]]
 
 #: samples in a row with one and the same displacement that are no chance
 STUCK = 50
@@ -20,6 +26,169 @@ STUCK = 50
 _CHUNK = 1 << 20
 #: share of its range by which the voltage moves meanwhile
 MOVED = 0.01
+#: a wild reading is off by this share of the stroke at least, and by so many of the steps that
+#: the readings around it take; so many of them are looked at on either side
+LEAST, FAR, AROUND = 2e-3, 8.0, 8
+#: readings of one value in a row that may be a sensor that hangs
+HELD = 10
+#: where more of a record than this looks wrong, it is the way of the data
+MAX_FAULTY = 0.05
+
+
+def without_faults(record: Record) -> Record:
+    """
+    Return a record without readings that cannot be the stage's.
+
+    Up to three wild or lost readings in a row, among quiet neighbours, are bridged by a straight
+    line.  Longer ones, where the sensor hangs or drops out, are cut out as samples without a
+    number are.  What is found is counted in the faults of the record.
+
+    Parameters
+    ----------
+    record : Record
+
+    Returns
+    -------
+    Record
+        The same record where there is nothing to leave out.
+    """
+    stroke, span = record.stroke, float(np.ptp(record.voltage_range))
+    if stroke == 0.0:
+        return record
+    pieces: list[Piece] = []
+    met: dict[str, list[float]] = {}
+    counts: Counter[str] = Counter()
+    for piece in record:
+        wild = _wild(piece, stroke, span)
+        held = [run for run in _held(piece, stroke, span) if not _overlaps(run, wild)]
+        for runs, is_lost in ((wild, True), (held, False)):
+            for a, b in runs:
+                name = 'stuck' if not is_lost else 'lost' if piece.y[a] == 0.0 else 'outliers'
+                counts[name] += b - a
+                met.setdefault(name, []).append(float(piece.time(a, a + 1)[0]))
+        pieces += _cut_out(_bridged_over(piece, wild, span), held)
+    if not counts or sum(counts.values()) > MAX_FAULTY * record.n or not pieces:
+        return record
+    faults = [
+        Fault(
+            name,
+            at_times(np.array(times)),
+            counts[name],
+            'left out, record split there' if name == 'stuck' else 'left out, bridged',
+        )
+        for name, times in met.items()
+    ]
+    return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
+
+
+def _overlaps(run: tuple[int, int], others: Runs) -> bool:
+    return any(run[0] < b and a < run[1] for a, b in others)
+
+
+def _wild(piece: Piece, stroke: float, span: float) -> Runs:
+    """Return up to three readings in a row that stand alone while the voltage says nothing."""
+    floor = max(LEAST * stroke, FAR * _usual_step(piece.y))
+    found: Runs = []
+    for at in range(0, piece.n, _CHUNK):
+        start = max(0, at - AROUND - 4)
+        y = piece.y[start : at + _CHUNK + AROUND + 4]
+        for a, b in _alone(y, floor):
+            if start + a < at or start + a >= at + _CHUNK:
+                continue
+            near = slice(max(0, start + a - AROUND), start + b + AROUND)
+            v = np.delete(piece.v[near], np.s_[start + a - near.start : start + b - near.start])
+            height = abs(y[a] - y[a - 1])
+            # a pulse of the voltage may be answered by one of the stage
+            if span == 0.0 or np.ptp(v) / span < 0.5 * height / stroke:
+                found.append((start + a, start + b))
+    return found
+
+
+def _alone(y: Vector, floor: float) -> Runs:
+    """Return runs of up to three numbers that are far from their neighbours on both sides."""
+    found: Runs = []
+    taken = np.zeros(y.size, dtype=bool)
+    steps = np.abs(np.diff(y))
+    for length in (1, 2, 3):
+        n = y.size - length - 1
+        if n < 2:
+            break
+        before, after = y[:n], y[length + 1 :]
+        heights = [
+            np.abs(y[1 + j : 1 + j + n] - before - (after - before) * ((j + 1) / (length + 1)))
+            for j in range(length)
+        ]
+        height = np.minimum.reduce(heights)
+        likely = (height > floor) & (height > FAR * np.abs(after - before))
+        for k in np.flatnonzero(likely) + 1:  # first of the run
+            beside = [steps[max(0, k - 1 - AROUND) : k - 1], steps[k + length :][:AROUND]]
+            # one more wild reading nearby makes two large steps
+            usual = max((float(np.sort(x)[-3:][0]) for x in beside if x.size >= 3), default=np.inf)
+            run = slice(k, k + length)
+            if height[k - 1] > FAR * usual and not taken[run].any():
+                taken[run] = True
+                found.append((int(k), int(k) + length))
+    return sorted(found)
+
+
+def _held(piece: Piece, stroke: float, span: float) -> Runs:
+    """
+    Return where the reading stays at one value, and jumps at the end to make up for it.
+
+    A stage at rest, at the end of its range, or behind a saturated amplifier has no such jump.
+    """
+    y, v = piece.y, piece.v
+    found: Runs = []
+    for a, b in _constant(y, HELD):
+        if a == 0 or b == piece.n:
+            continue
+        steps = np.abs(np.diff(y[max(0, a - AROUND) : a]))
+        behind = np.abs(np.diff(y[b : b + AROUND]))
+        usual = max(float(x.max(initial=0.0)) for x in (steps, behind))
+        entry, leave = float(y[a] - y[a - 1]), float(y[b] - y[b - 1])
+        least = max(LEAST * stroke, FAR * usual)
+        # a delay lets the end of a rest look as if v had moved
+        late = b - min((b - a) // 4, round(0.002 * piece.sample_rate))
+        drive = float(np.ptp(v[a:late])) / span if span else 0.0
+        around = np.concatenate([v[max(0, a - AROUND) : a], v[b : b + AROUND]])
+        outside = abs(float(np.median(v[a:b])) - float(np.median(around))) / span if span else 0.0
+        hangs = drive > MOVED and abs(leave) > max(least, 0.3 * drive * stroke)
+        drops = (
+            min(abs(entry), abs(leave)) > least
+            and entry * leave < 0.0
+            and max(drive, outside) < 0.3 * min(abs(entry), abs(leave)) / stroke
+        )
+        if hangs or drops:
+            # what hangs repeats the last good reading
+            found.append((a if drops else a + 1, b))
+    return found
+
+
+def _usual_step(y: Vector) -> float:
+    """Return the median step between readings that differ [m]."""
+    steps = np.abs(np.diff(y[:_CHUNK]))
+    moved = steps[steps > 0.0]
+    return float(np.median(moved)) if moved.size else 0.0
+
+
+def _bridged_over(piece: Piece, runs: Runs, span: float) -> Piece:
+    if not runs:
+        return piece
+    y, v = piece.y.copy(), piece.v.copy()
+    for a, b in runs:
+        for x, is_wild in ((y, True), (v, False)):
+            line = np.linspace(x[a - 1], x[b], b - a + 2)[1:-1]
+            steps = np.abs(np.diff(x[max(0, a - AROUND) : a])).max(initial=0.0)
+            # a row that was lost as a whole has no voltage either
+            if is_wild or np.abs(x[a:b] - line).min() > max(FAR * steps, 0.05 * span):
+                x[a:b] = line
+    return replace(piece, v=v, y=y)
+
+
+def _cut_out(piece: Piece, runs: Runs) -> list[Piece]:
+    marks = [0, *(mark for run in runs for mark in run), piece.n]
+    kept = [(a, b) for a, b in zip(marks[::2], marks[1::2], strict=True) if b - a > 1]
+    return [piece] if not runs else [piece.cut(a, b) for a, b in kept]
 
 
 def line_error(pieces: Iterable[Piece]) -> float:
@@ -92,8 +261,8 @@ def suspicions(record: Record) -> list[str]:
     ]
 
 
-def _constant(x: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return the stretches of at least `STUCK` equal samples."""
+def _constant(x: Vector, least: int = STUCK) -> Runs:
+    """Return the stretches of at least so many equal samples."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0.0) + 1, [x.size]])
-    long = np.flatnonzero(np.diff(edges) >= STUCK)
+    long = np.flatnonzero(np.diff(edges) >= least)
     return [(int(edges[i]), int(edges[i + 1])) for i in long]
