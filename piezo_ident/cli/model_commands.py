@@ -159,6 +159,7 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
     record = read(args.record, args)
     with naming(str(args.model)):
         run = free_run(model, record)
+    record = run.record
     if args.out is not None:
         with (
             interrupts.waiting(),

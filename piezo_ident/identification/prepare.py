@@ -15,7 +15,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.play import initial_memory
-from piezo_ident.record.faults import suspicions
+from piezo_ident.record.faults import suspicions, without_faults
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.record import Piece, Record
 from scipy import signal
@@ -44,6 +44,8 @@ END_HELD = 0.2
 REST = 0.01
 #: how far the voltage may move within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
+#: samples of all records that are used, at some 60 bytes each; of longer ones the first
+MOST_SAMPLES = 40_000_000
 #: chance below which the displacement answers the voltage, and samples that it takes to tell
 CHANCE, MIN_COHERENCE = 1e-7, 256
 #: means into which a ramp is divided
@@ -215,6 +217,7 @@ def prepare(records: Sequence[Record]) -> Prepared:
     """
     if not records:
         raise IdentificationError('no record was given')
+    records = [without_faults(record.first(MOST_SAMPLES // len(records))) for record in records]
     rate, left = common_rate(records)
     refuse_undriven(records)
     for record in records:

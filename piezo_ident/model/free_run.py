@@ -21,6 +21,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
 from piezo_ident.model.metrics import nrmse_fit, percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
 
 if TYPE_CHECKING:
@@ -91,6 +92,7 @@ class FreeRun:
     Attributes
     ----------
     record : Record
+        Without its faulty readings; its faults count them.
     pieces : tuple of ndarray
         Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
@@ -161,6 +163,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     >>> run.errors.percent < 0.01
     True
     """
+    record = without_faults(record)
     for piece in record:
         try:
             model.check_rate(piece)

@@ -87,7 +87,7 @@ def _overlaps(run: tuple[int, int], others: Runs) -> bool:
 
 def _wild(piece: Piece, stroke: float, span: float) -> Runs:
     """Return up to three readings in a row that stand alone while the voltage says nothing."""
-    floor = max(LEAST * stroke, FAR * _usual_step(piece.y))
+    floor = _floor(piece, stroke)
     found: Runs = []
     for at in range(0, piece.n, _CHUNK):
         start = max(0, at - AROUND - 4)
@@ -138,6 +138,7 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
     A stage at rest, at the end of its range, or behind a saturated amplifier has no such jump.
     """
     y, v = piece.y, piece.v
+    floor = _floor(piece, stroke)
     found: Runs = []
     for a, b in _constant(y, HELD):
         if a == 0 or b == piece.n:
@@ -146,7 +147,7 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
         behind = np.abs(np.diff(y[b : b + AROUND]))
         usual = max(float(x.max(initial=0.0)) for x in (steps, behind))
         entry, leave = float(y[a] - y[a - 1]), float(y[b] - y[b - 1])
-        least = max(LEAST * stroke, FAR * usual)
+        least = max(floor, FAR * usual)
         # a delay lets the end of a rest look as if v had moved
         late = b - min((b - a) // 4, round(0.002 * piece.sample_rate))
         drive = float(np.ptp(v[a:late])) / span if span else 0.0
@@ -164,11 +165,11 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
     return found
 
 
-def _usual_step(y: Vector) -> float:
-    """Return the median step between readings that differ [m]."""
-    steps = np.abs(np.diff(y[:_CHUNK]))
+def _floor(piece: Piece, stroke: float) -> float:
+    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
+    steps = np.abs(np.diff(piece.y[:_CHUNK]))
     moved = steps[steps > 0.0]
-    return float(np.median(moved)) if moved.size else 0.0
+    return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
 
 
 def _bridged_over(piece: Piece, runs: Runs, span: float) -> Piece:
@@ -263,6 +264,6 @@ def suspicions(record: Record) -> list[str]:
 
 def _constant(x: Vector, least: int = STUCK) -> Runs:
     """Return the stretches of at least so many equal samples."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0.0) + 1, [x.size]])
-    long = np.flatnonzero(np.diff(edges) >= least)
-    return [(int(edges[i]), int(edges[i + 1])) for i in long]
+    same = np.concatenate([[False], x[1:] == x[:-1], [False]])
+    edges = np.flatnonzero(same[1:] != same[:-1]).reshape(-1, 2)
+    return [(int(a), int(b) + 1) for a, b in edges if b + 1 - a >= least]

@@ -307,6 +307,21 @@ class Record:
         """Return every segment of a kind, or of a full label, as a piece of its own."""
         return [p.cut(s.start, s.stop) for p in self for s in p.find(kind)]
 
+    def first(self, n: int) -> Record:
+        """Return the first n samples, and say so in the faults; the same record if it is short."""
+        if self.n <= n:
+            return self
+        pieces: list[Piece] = []
+        left = n
+        for piece in self.pieces:
+            if left > 0:
+                pieces.append(piece.cut(0, min(left, piece.n)))
+                left -= pieces[-1].n
+        part = replace(self, pieces=tuple(pieces))
+        where = f'{part.duration:.6g} of {self.duration:.6g} s are used'
+        fault = Fault('part', where, self.n - n, 'what comes later is left out')
+        return replace(part, faults=(*self.faults, fault))
+
     def _repr_html_(self) -> str:
         rates = ', '.join(f'{rate:g}' for rate in dict.fromkeys(p.sample_rate for p in self))
         low, high = self.voltage_range
