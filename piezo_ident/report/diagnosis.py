@@ -18,8 +18,8 @@ from piezo_ident.model import metrics
 from piezo_ident.model.free_run import free_run, sine_errors
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
-from piezo_ident.report.html import Box, Page, Section, Shown
-from piezo_ident.report.table import columns, length, number, Table, wrapped
+from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
+from piezo_ident.report.table import columns, FAULTS, length, number, Table, table, wrapped
 from piezo_ident.residual.reversals import Way, ways
 
 __all__ = [
@@ -126,14 +126,7 @@ def percent_of_explainable(share: float) -> str:
 
 
 def error_rows(result: Diagnosis) -> tuple[list[tuple[str, ...]], ...]:
-    """
-    Return the errors overall, by segment and by frequency.
-
-    Returns
-    -------
-    tuple of three lists of tuple of str
-        Name, then as given, with H refitted, refined, and how many times smaller it became.
-    """
+    """Return the errors overall, by segment and by frequency, in `STATES` and their ratio."""
     states = (result.before, result.refit, result.after)
 
     def row(name: str, values: list[float]) -> tuple[str, ...]:
@@ -164,13 +157,7 @@ def error_tables(result: Diagnosis) -> list[Table]:
         'data were predicted in turn from the others.'
     )
     tables = [Table('By segment', head, [*overall, *segments], note)]
-    return [*tables, *_table('By frequency of a sine', head, frequencies)]
-
-
-def _table(
-    title: str, head: tuple[str, ...], rows: Sequence[tuple[str, ...]], note: str = ''
-) -> list[Table]:
-    return [Table(title, head, rows, note)] if rows else []
+    return [*tables, *table('By frequency of a sine', head, frequencies)]
 
 
 def unseen_tables(result: Diagnosis) -> list[Table]:
@@ -183,7 +170,7 @@ def unseen_tables(result: Diagnosis) -> list[Table]:
             (f'{x.record}, {f:g} Hz', number(before), number(after), '', '', '')
             for f, before, after in x.sines
         ]
-    return _table(
+    return table(
         'Records that took no part',
         ('', STATES[0], STATES[2], f'{STATES[0]}, no mean', f'{STATES[2]}, no mean', 'samples'),
         rows,
@@ -232,22 +219,33 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
             'refined model carries what can be expected of it in another one.'
         )
     head = ('effect', 'parameter', 'value', 'unit', '')
-    return _table('Parameters', head, parameter_rows(result), note)
+    return table('Parameters', head, parameter_rows(result), note)
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
     """Return the few numbers that stand beside the verdict."""
-    left, floor, smallest = result.unexplained, result.noise_floor, result.smallest_detectable
+    errors = zip(STATES, (result.before, result.refit, result.after), strict=True)
     return [
         ('verdict', result.verdict.replace('_', ' ')),
-        ('error as given', f'{number(result.before.overall)} % of stroke'),
-        ('with H refitted', f'{number(result.refit.overall)} % of stroke'),
-        ('refined', f'{number(result.after.overall)} % of stroke'),
+        *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
         ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
-        ('unexplained', _left(left.share, left.rms_percent)),
-        ('noise floor', 'unknown' if floor is None else f'{number(floor)} % of stroke'),
-        *([('detectable', f'effects from {number(smallest)} % of stroke')] if smallest else []),
+        ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
+
+
+def remains(result: Diagnosis) -> list[tuple[str, str]]:
+    """Return what is left, the noise and the smallest effect that would have been added."""
+    left, smallest, floor = result.unexplained, result.smallest_detectable, result.noise_floor
+    source = result.noise_source.removeprefix(UNKNOWN)
+    rest = f': {left.description}' if left.description else ''
+    noise = 'unknown' if floor is None else f'{number(floor)} % of stroke, rms of single samples'
+    rows = [
+        ('unexplained', _left(left.share, left.rms_percent) + rest),
+        ('noise floor', f'{noise} ({source})'),
+    ]
+    if smallest is not None:
+        rows.append(('detectable', f'effects from {number(smallest)} % of stroke rms'))
+    return rows
 
 
 def _left(share: float, rms_percent: float) -> str:
@@ -259,19 +257,16 @@ def _left(share: float, rms_percent: float) -> str:
 
 def _setting_tables(result: Diagnosis) -> list[Table]:
     settings = asdict(result.settings)
-    chosen = settings.pop('effects')
-    rows = [('candidates', 'the whole catalogue' if chosen is None else ', '.join(chosen))]
-    rows += [
+    if settings['effects'] is None:
+        settings['effects'] = 'the whole catalogue'
+    rows = [
         (name.replace('_', ' '), ', '.join(x) if isinstance(x, (tuple, list)) else str(x))
         for name, x in settings.items()
     ]
-    versions = (
-        ('piezo_ident', __version__),
-        ('python', '.'.join(map(str, sys.version_info[:3]))),
-        ('numpy', np.__version__),
-    )
+    python = '.'.join(map(str, sys.version_info[:3]))
+    versions = (('piezo_ident', __version__), ('python', python), ('numpy', np.__version__))
     return [
-        Table('Settings', ('setting', 'value'), [(a, b or 'none') for a, b in rows]),
+        Table('Settings', ('setting', 'value'), [(name, x or 'none') for name, x in rows]),
         Table('Versions', ('software', 'version'), versions),
     ]
 
@@ -286,7 +281,7 @@ def ways_of(result: Diagnosis) -> tuple[Way, ...]:
 
 
 def _reversal_tables(found: Sequence[Way]) -> list[Table]:
-    return _table(
+    return table(
         'By the way since the voltage last turned',
         ('share of the range', *STATES, 'means'),
         [
@@ -334,41 +329,12 @@ def _added(result: Diagnosis) -> list[str]:
     ]
 
 
-def _remains(result: Diagnosis) -> list[str]:
-    left, smallest = result.unexplained, result.smallest_detectable
-    rest = left.description.rstrip('.')
-    source = result.noise_source.removeprefix(UNKNOWN)
-    texts = [
-        f'Unexplained: {_left(left.share, left.rms_percent)}{f"; {rest}" if rest else ""}.',
-        f'Noise floor: unknown ({source}), so it is not known which part of the residual a model '
-        'could explain.'
-        if result.noise_floor is None
-        else f'Noise floor: {number(result.noise_floor)} % of stroke, rms of single samples '
-        f'({source}).',
-    ]
-    if smallest is not None:
-        texts.append(
-            f'An effect of {number(smallest)} % of stroke rms or larger that these data can show '
-            'would have been added; smaller ones may be there.'
-        )
-    return texts
-
-
 def diagnosis_page(
     result: Diagnosis,
     pictures: Sequence[Shown],
     left_out: Sequence[tuple[str, str]],
 ) -> Page:
-    """
-    Return the page of a diagnosis.
-
-    Parameters
-    ----------
-    result : Diagnosis
-    pictures : sequence of Shown
-    left_out : sequence of (title, reason)
-        Pictures that the data do not allow.
-    """
+    """Return the page; `left_out` holds titles of pictures that cannot be drawn, with reasons."""
     warnings = list(result.warnings)
     if result.faults:
         warnings.append('the data had faults, see the table near the end')
@@ -376,9 +342,12 @@ def diagnosis_page(
     alike = [] if group is None else [*group.names, f'what would: {group.separating_experiment}']
     changed = ', '.join(changes(result.given, result.model))
 
-    def named(*names: str) -> list[Shown]:
-        return [picture for picture in pictures if picture.name.startswith(names)]
-
+    candidates = [(c.name, percent_of_explainable(c.share), c.why_not) for c in result.candidates]
+    note = (
+        'Share of the explainable part of the residual that each explains when it is added alone.'
+    )
+    untestable = [(x.name, x.needs) for x in result.untestable]
+    faults = [(x.name, str(x.count), x.where, x.action) for x in result.faults]
     return Page(
         title='Diagnosis of a piezo stage',
         source=', '.join(result.records),
@@ -391,13 +360,13 @@ def diagnosis_page(
         sections=(
             Section(
                 'Error before and after',
-                [*named('error'), *error_tables(result), *unseen_tables(result)],
+                [*named(pictures, 'error'), *error_tables(result), *unseen_tables(result)],
             ),
             Section(
                 'The residual before and after',
                 [
                     reversal_text(result, found),
-                    *named('residual', 'signature', 'spectrum', 'coherence'),
+                    *named(pictures, 'residual', 'signature', 'spectrum', 'coherence'),
                     *_reversal_tables(found),
                 ],
             ),
@@ -412,49 +381,28 @@ def diagnosis_page(
             Section(
                 'What was not, and why',
                 [
-                    *named('ranking'),
-                    *_table(
+                    *named(pictures, 'ranking'),
+                    *table(
                         'Candidates that were not added',
                         ('effect', 'share', 'why not'),
-                        [
-                            (c.name, percent_of_explainable(c.share), c.why_not)
-                            for c in result.candidates
-                        ],
-                        'Share of the explainable part of the residual that each explains when it '
-                        'is added alone.',
+                        candidates,
+                        note,
                     ),
                 ],
             ),
             Section(
                 'What remains',
                 [
-                    *_remains(result),
-                    *_table(
-                        'What these data cannot test',
-                        ('effect', 'needs'),
-                        [(x.name, x.needs) for x in result.untestable],
-                    ),
+                    Table('What the model leaves', ('', ''), remains(result)),
+                    *table('What these data cannot test', ('effect', 'needs'), untestable),
                 ],
             ),
             Section(
                 'Origin',
-                [
-                    *_table(
-                        'Faults in the data',
-                        ('fault', 'count', 'where', 'action'),
-                        [(x.name, str(x.count), x.where, x.action) for x in result.faults],
-                    ),
-                    *_setting_tables(result),
-                ],
+                [*table('Faults in the data', FAULTS, faults), *_setting_tables(result)],
             ),
         ),
-        after=(
-            Box(
-                'missing',
-                'Pictures that these data do not allow',
-                [f'{title}: {reason}' for title, reason in left_out],
-            ),
-        ),
+        after=(Box('missing', 'Pictures that these data do not allow', pairs(left_out)),),
         footer=FOOTER,
     )
 
@@ -464,19 +412,13 @@ def diagnosis_text(result: Diagnosis) -> str:
     rows = [row for rows in error_rows(result) for row in rows]
     lines = [*wrapped(headline(result)), '']
     lines += columns(('error / % of stroke', *STATES, 'times smaller'), rows)
-    for table in unseen_tables(result):
-        lines += ['', *columns((table.title.lower(), *table.head[1:]), table.rows)]
+    for each in unseen_tables(result):
+        lines += ['', *columns((each.title.lower(), *each.head[1:]), each.rows)]
     near = reversal_text(result, ways_of(result))
     lines += ['', *wrapped(near)] if near else []
     lines.append('')
-    shown = ('verdict', 'unexplained', 'noise floor', 'detectable')
-    for what, text in facts(result):
-        if what in shown:
-            more = {
-                'unexplained': f': {result.unexplained.description}',
-                'noise floor': f' ({result.noise_source.removeprefix(UNKNOWN)})',
-            }
-            lines += wrapped(f'{what:<14}{text}{more.get(what, "")}', ' ' * 14)
+    for what, text in (facts(result)[0], *remains(result)):
+        lines += wrapped(f'{what:<14}{text}', ' ' * 14)
     for effect, text in zip(result.effects, _added(result), strict=True):
         lines += ['', *wrapped(f'added: {text}', '  ')]
         for name, parameter, value, unit, _ in parameter_rows(result):
@@ -509,4 +451,4 @@ def _listed(title: str, items: Sequence[str]) -> list[str]:
 
 def brief_table(result: Diagnosis) -> Table:
     """Return the facts for a notebook."""
-    return Table('Diagnosis', ('', ''), facts(result))
+    return Table('Diagnosis', ('', ''), [*facts(result), *remains(result)[1:]])

@@ -133,12 +133,7 @@ def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     """
     Refuse a folder in which `write_report` would replace a file that is of no earlier report.
 
-    Parameters
-    ----------
-    folder : path
-        Need not exist.
-    kind : {Identification, Diagnosis}
-        Of the result.
+    `kind` is the class of the result.
 
     Raises
     ------
@@ -164,7 +159,7 @@ def put_in_place(
     names: Sequence[str],
 ) -> Path:
     """
-    Write the files of a report, all of them or none.
+    Write the files of a report, all of them or none, and return the page.
 
     Parameters
     ----------
@@ -175,11 +170,6 @@ def put_in_place(
     pictures : sequence of Shown
     names : sequence of str
         Of all pictures that a report of this kind may have; those of an earlier one are deleted.
-
-    Returns
-    -------
-    Path
-        The page.
 
     Raises
     ------

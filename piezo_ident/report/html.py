@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ from piezo_ident.report.table import Table
 if TYPE_CHECKING:
     import jinja2
 
-__all__ = ['Box', 'Page', 'Section', 'Shown', 'page_html', 'summary_html']
+__all__ = ['Box', 'Page', 'Section', 'Shown', 'named', 'page_html', 'pairs', 'summary_html']
 
 #: size on the screen of a pixel of a picture: the letters of both then have one size
 SHOWN = 0.72
@@ -61,20 +61,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """
-    A whole page, all plain text.
-
-    Attributes
-    ----------
-    title, source, headline : str
-        The top.
-    facts : sequence of (str, str)
-        A few numbers side by side, each below its name.
-    before, after : sequence of Box
-        Above the facts, and after the sections.
-    sections : sequence of Section
-    footer : str
-    """
+    """A whole page, all plain text; the boxes stand above the facts and after the sections."""
 
     title: str
     source: str
@@ -84,6 +71,16 @@ class Page:
     sections: Sequence[Section]
     after: Sequence[Box]
     footer: str
+
+
+def named(pictures: Sequence[Shown], *names: str) -> list[Shown]:
+    """Return the pictures whose names begin with one of those given."""
+    return [picture for picture in pictures if picture.name.startswith(names)]
+
+
+def pairs(items: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the items of a box from names and reasons."""
+    return [f'{name}: {reason}' for name, reason in items]
 
 
 @cache

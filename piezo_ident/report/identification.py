@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 import math
 
@@ -14,9 +14,18 @@ from piezo_ident import __version__
 from piezo_ident.identification.results import ErrorRow, Identification
 from piezo_ident.model.free_run import SineError
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.report.html import Box, Page, Section, Shown
+from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.modes import modes
-from piezo_ident.report.table import columns, length, number, printable, Table, wrapped
+from piezo_ident.report.table import (
+    columns,
+    FAULTS,
+    length,
+    number,
+    printable,
+    Table,
+    table,
+    wrapped,
+)
 
 __all__ = [
     'KINDS',
@@ -39,6 +48,8 @@ ABOUT = {
 }
 #: static gain that the paper leaves in G: its printed coefficients give G(1) = 0.6411
 PAPER_GAIN = 0.6411
+#: columns of the errors
+ERRORS = ('model / %', 'hysteresis alone / %', 'NRMSE fit / %', 'samples')
 FOOTER = (
     'Method: Gu, Li, Zhu and Su, IEEE/ASME Trans. Mechatronics 21(3), 2016, '
     'doi:10.1109/TMECH.2015.2465868. Every error is of a free run, never of one-step '
@@ -87,39 +98,24 @@ def facts(result: Identification) -> list[tuple[str, str]]:
 
 def error_table(result: Identification) -> Table:
     """Return the errors by segment."""
-    order = {kind: i for i, kind in enumerate(KINDS)}
-    rows = sorted(result.errors, key=lambda row: (order.get(row.data, len(order)), not row.driven))
-    source = result.noise_source
-    if result.noise_floor is not None:
-        source = f'from {source}'
+    rows = sorted(result.errors, key=lambda row: (KINDS.index(row.data), not row.driven))
+    cells = [
+        (
+            *(row.record, row.segment or 'whole', row.data),
+            *(number(row.percent), number(row.static_percent), _fit(row), str(row.n)),
+        )
+        for row in rows
+    ]
+    source = '' if result.noise_floor is None else 'from '
     return Table(
         'Errors',
-        (
-            'record',
-            'segment',
-            'data',
-            'model / %',
-            'hysteresis alone / %',
-            'NRMSE fit / %',
-            'samples',
-        ),
-        [
-            (
-                row.record,
-                row.segment or 'whole',
-                row.data,
-                number(row.percent),
-                number(row.static_percent),
-                _fit(row),
-                str(row.n),
-            )
-            for row in rows
-        ],
+        ('record', 'segment', 'data', *ERRORS),
+        cells,
         f'Errors in % of stroke: {FORMULA}, with the stroke of the whole record. NRMSE fit: '
         '100 (1 - |y - y_hat| / |y - mean y|) over the samples of the row; it says nothing '
         'where the stage rests. "validation": of a record that took no part; "held out": neither '
         'fitted nor looked at before; "selection": not fitted, but chose between models. '
-        f'Sensor noise: {source}.',
+        f'Sensor noise: {source}{result.noise_source}.',
     )
 
 
@@ -131,17 +127,16 @@ def _fit(row: ErrorRow) -> str:
     return f'{round(row.fit, 2) + 0.0:.2f}'
 
 
-def sine_table(rows: Sequence[SineError]) -> Table | None:
-    """Return the steady-state errors in the layout of the paper's Table I; None without any."""
-    if not rows:
-        return None
-    return Table(
+def sine_tables(rows: Sequence[SineError]) -> list[Table]:
+    """Return the steady-state errors in the layout of the paper's Table I, if there are any."""
+    errors = [
+        ('model with dynamics', *(number(row.percent) for row in rows)),
+        ('hysteresis alone', *(number(row.static_percent) for row in rows)),
+    ]
+    return table(
         'Errors of sines in steady state',
         ('frequency / Hz', *(f'{row.frequency:g}' for row in rows)),
-        (
-            ('model with dynamics', *(number(row.percent) for row in rows)),
-            ('hysteresis alone', *(number(row.static_percent) for row in rows)),
-        ),
+        errors if rows else [],
         'In % of stroke: 100 rms(y - y_hat) / (max y - min y), free run; the first second '
         'and at least one period are dropped, and the stroke is that of what is left. '
         'Layout of Table I of the paper.',
@@ -183,42 +178,33 @@ def dynamics_tables(result: Identification) -> list[Table]:
             f'leaves a static gain of {PAPER_GAIN} in G; the last column is b in its split.',
         )
     )
-    poles = modes(G, model.sample_rate, dynamics.covariance)
-    if poles:
-        tables.append(
-            Table(
-                'Poles of G as modes',
-                ('', 'frequency / Hz', '± / Hz', 'damping ratio', '±'),
-                [
-                    (
-                        'resonance' if mode.oscillates else 'real pole',
-                        number(mode.frequency, 4),
-                        number(mode.frequency_std, 2),
-                        number(mode.damping if mode.oscillates else None),
-                        number(mode.damping_std if mode.oscillates else None, 2),
-                    )
-                    for mode in poles
-                ],
-                'Real: corner frequency. A mode whose uncertainty is as large as itself only '
-                f'helps the others to fit. The input has power up to {number(dynamics.band, 4)} '
-                'Hz; what lies above is an extrapolation.',
-            )
+    poles = [
+        (
+            'resonance' if mode.oscillates else 'real pole',
+            *(number(mode.frequency, 4), number(mode.frequency_std, 2)),
+            number(mode.damping if mode.oscillates else None),
+            number(mode.damping_std if mode.oscillates else None, 2),
         )
-    if dynamics.methods:
-        tables.append(
-            Table(
-                'Methods compared on held-out noise',
-                ('method', 'free-run error / % of rms'),
-                [
-                    (name, number(error) if math.isfinite(error) else 'unstable')
-                    for name, error in dynamics.methods.items()
-                ],
-                f'At the order ({dynamics.order[0]}, {dynamics.order[1]}). Small-signal gain of '
-                f'the noise {number(dynamics.slope_measured)}, of H at its bias '
-                f'{number(dynamics.slope_model)} (normalised).',
-            )
-        )
-    return tables
+        for mode in modes(G, model.sample_rate, dynamics.covariance)
+    ]
+    note = (
+        'Real: corner frequency. A mode whose uncertainty is as large as itself only '
+        f'helps the others to fit. The input has power up to {number(dynamics.band, 4)} '
+        'Hz; what lies above is an extrapolation.'
+    )
+    columns_of_modes = ('', 'frequency / Hz', '± / Hz', 'damping ratio', '±')
+    tables += table('Poles of G as modes', columns_of_modes, poles, note)
+    methods = [
+        (name, number(error) if math.isfinite(error) else 'unstable')
+        for name, error in dynamics.methods.items()
+    ]
+    note = (
+        f'At the order ({dynamics.order[0]}, {dynamics.order[1]}). Small-signal gain of '
+        f'the noise {number(dynamics.slope_measured)}, of H at its bias '
+        f'{number(dynamics.slope_model)} (normalised).'
+    )
+    head = ('method', 'free-run error / % of rms')
+    return [*tables, *table('Methods compared on held-out noise', head, methods, note)]
 
 
 def hysteresis_tables(result: Identification) -> list[Table]:
@@ -228,10 +214,7 @@ def hysteresis_tables(result: Identification) -> list[Table]:
     std = fit.std if fit.std.size == m + 2 else np.full(m + 2, math.nan)
     rows = [
         (
-            f'q_{i}',
-            number(s.V * r, 4),
-            number(r, 4),
-            number(q, 4),
+            *(f'q_{i}', number(s.V * r, 4), number(r, 4), number(q, 4)),
             'on its bound' if q == 0.0 else number(e, 2),
             number(q / PAPER_GAIN, 4),
         )
@@ -242,16 +225,10 @@ def hysteresis_tables(result: Identification) -> list[Table]:
     solvers = [('bounded least squares (optimum)', number(fit.optimum_loss, 5), '', '')]
     if fit.swarm_loss is not None and fit.swarm is not None:
         excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0.0 else 0.0
+        name = 'particle swarm, then polished' if fit.polished else 'particle swarm'
         effort = f'{fit.swarm.nit} iterations, {fit.swarm.nfev} evaluations'
-        solvers.insert(
-            0,
-            (
-                'particle swarm, then polished' if fit.polished else 'particle swarm',
-                number(fit.swarm_loss, 5),
-                f'{number(100.0 * excess, 2)} %',
-                effort,
-            ),
-        )
+        above = f'{number(100.0 * excess, 2)} %'
+        solvers.insert(0, (name, number(fit.swarm_loss, 5), above, effort))
     return [
         Table(
             'Weights of H',
@@ -288,15 +265,11 @@ def origin_tables(result: Identification) -> list[Table]:
         (name, words[value] if value is None or isinstance(value, bool) else str(value))
         for name, value in asdict(result.settings).items()
     ]
+    rows = [('method', str(origin.get('method', '–'))), *settings]
+    software = [(str(name), str(version)) for name, version in versions.items()]
     return [
-        Table(
-            'Settings',
-            ('setting', 'value'),
-            [('method', str(origin.get('method', '–'))), *settings],
-        ),
-        Table(
-            'Versions', ('software', 'version'), [(str(x), str(y)) for x, y in versions.items()]
-        ),
+        Table('Settings', ('setting', 'value'), rows),
+        Table('Versions', ('software', 'version'), software),
     ]
 
 
@@ -306,17 +279,7 @@ def identification_page(
     pictures: Sequence[Shown],
     left_out: Sequence[tuple[str, str]],
 ) -> Page:
-    """
-    Return the page of an identification.
-
-    Parameters
-    ----------
-    result : Identification
-    sines : sequence of SineError
-    pictures : sequence of Shown
-    left_out : sequence of (title, reason)
-        Pictures that the data do not allow.
-    """
+    """Return the page; `left_out` holds titles of pictures that cannot be drawn, with reasons."""
     faults = [
         (record.name, fault.name, str(fault.count), fault.where, fault.action)
         for record in result.records
@@ -328,9 +291,6 @@ def identification_page(
     if faults:
         warnings.append(f'the data had {len(faults)} kinds of faults, see below')
 
-    def named(*names: str) -> list[Shown]:
-        return [picture for picture in pictures if picture.name.startswith(names)]
-
     return Page(
         title='Identification of a piezo stage',
         source=', '.join(f'{r.name} ({r.duration:.4g} s)' for r in result.records),
@@ -338,53 +298,43 @@ def identification_page(
         facts=facts(result),
         before=(
             Box('warnings', 'Warnings', warnings),
-            Box('missing', 'Not identified', _pairs(result.not_identified)),
+            Box('missing', 'Not identified', pairs(result.not_identified)),
         ),
         sections=(
             Section(
                 'How well the model predicts',
                 [
                     error_table(result),
-                    sine_table(sines),
-                    *named('sines', 'loops', 'segments', 'overview'),
+                    *sine_tables(sines),
+                    *named(pictures, 'sines', 'loops', 'segments', 'overview'),
                 ],
             ),
             Section(
                 'Delay and dynamics',
-                [*named('delay', 'response', 'orders'), *dynamics_tables(result)],
+                [*named(pictures, 'delay', 'response', 'orders'), *dynamics_tables(result)],
             ),
-            Section('Hysteresis', [*named('weights'), *hysteresis_tables(result)]),
+            Section('Hysteresis', [*named(pictures, 'weights'), *hysteresis_tables(result)]),
             Section(
                 'Origin',
                 [
-                    Table(
-                        'Faults in the data',
-                        ('record', 'fault', 'count', 'where', 'action'),
-                        faults,
-                    )
-                    if faults
-                    else None,
+                    *table('Faults in the data', ('record', *FAULTS), faults),
                     *origin_tables(result),
                 ],
             ),
         ),
-        after=(Box('missing', 'Pictures that these data do not allow', _pairs(left_out)),),
+        after=(Box('missing', 'Pictures that these data do not allow', pairs(left_out)),),
         footer=FOOTER,
     )
-
-
-def _pairs(items: Iterable[tuple[str, str]]) -> list[str]:
-    return [f'{first}: {second}' for first, second in items]
 
 
 def identification_text(result: Identification) -> str:
     """Return headline, facts, errors and warnings for a terminal."""
     lines = [*wrapped(headline(result)), '']
     lines += [printable(f'{what:<14}{text}') for what, text in facts(result)]
-    head = ('error / % of stroke', 'model', 'hysteresis alone', 'NRMSE fit / %', 'samples')
+    head = ('error / % of stroke', *ERRORS)
     rows = [(f'{row[0]} {row[1]}, {row[2]}', *row[3:]) for row in error_table(result).rows]
     lines += ['', *columns(head, rows)]
-    for item in _pairs(result.not_identified):
+    for item in pairs(result.not_identified):
         lines += ['', *wrapped(f'not identified: {item}', '  ')]
     for item in result.warnings:
         lines += ['', *wrapped(f'warning: {item}', '  ')]
@@ -400,8 +350,7 @@ def brief_table(result: Identification) -> Table:
 
 def table_one(rows: Sequence[SineError]) -> str:
     """Return the errors of sines as a table for a terminal, one column a frequency."""
-    table = sine_table(rows)
-    if table is None:
-        return 'no sine segment is long enough for its steady state'
     note = '% of stroke: 100 rms(y - y_hat) / (max y - min y), free run, steady state'
-    return '\n'.join([*columns(table.head, table.rows), note])
+    for each in sine_tables(rows):
+        return '\n'.join([*columns(each.head, each.rows), note])
+    return 'no sine segment is long enough for its steady state'

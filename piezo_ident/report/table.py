@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import math
 import textwrap
 
-__all__ = ['Table', 'columns', 'length', 'number', 'printable', 'wrapped']
+__all__ = ['FAULTS', 'Table', 'columns', 'length', 'number', 'printable', 'table', 'wrapped']
 
 #: of a terminal [characters]
 WIDTH = 99
+#: columns of a table of faults in the data
+FAULTS = ('fault', 'count', 'where', 'action')
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,13 @@ class Table:
         """Whether each column, but for the first, holds text rather than numbers."""
         cells = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
         return tuple(i > 0 and not all(map(_is_number, column)) for i, column in enumerate(cells))
+
+
+def table(
+    title: str, head: tuple[str, ...], rows: Sequence[tuple[str, ...]], note: str = ''
+) -> list[Table]:
+    """Return a table, or nothing without rows."""
+    return [Table(title, head, rows, note)] if rows else []
 
 
 def _is_number(cell: str) -> bool:

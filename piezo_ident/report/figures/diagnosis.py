@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.diagnosis.results import Diagnosis, Errors, Residual
+from piezo_ident.report.figures import style
 from piezo_ident.report.figures.free_run import finish_frequencies
 from piezo_ident.report.figures.residual import (
     differ,
@@ -24,19 +25,7 @@ from piezo_ident.report.figures.residual import (
     residual_spectrum_figure,
     STATES,
 )
-from piezo_ident.report.figures.style import (
-    COLOURS,
-    draw_each,
-    Drawn,
-    figure,
-    GREY,
-    legend_above,
-    NothingToDraw,
-    safe,
-    SMALL,
-    tidy,
-    Wanted,
-)
+from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
 
 __all__ = ['DIAGNOSIS_NAMES', 'draw_diagnosis', 'errors_figure', 'ranking_figure', 'worst_pieces']
@@ -60,17 +49,9 @@ SAME = 'Before: H refitted, nothing added; after: the refined model.'
 
 def draw_diagnosis(
     diagnosis: Diagnosis, tick: Callable[[float], None] = lambda share: None
-) -> Drawn:
-    """
-    Draw everything that the data of a diagnosis allow.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
-    """
-    wanted: list[Wanted] = [
+) -> style.Drawn:
+    """Draw everything that the data allow; `tick` takes the share that is done, and may raise."""
+    wanted: list[style.Wanted] = [
         (
             'errors',
             'Error before and after',
@@ -127,7 +108,7 @@ def draw_diagnosis(
             lambda: ranking_figure(diagnosis),
         ),
     ]
-    return draw_each(wanted, tick)
+    return style.draw_each(wanted, tick)
 
 
 def worst_pieces(diagnosis: Diagnosis, most: int = TRACES) -> list[Residual]:
@@ -170,7 +151,7 @@ def errors_figure(diagnosis: Diagnosis) -> Figure:
     worst = sorted(by_segment, key=lambda label: -by_segment[label])[:SEGMENTS]
     # in the order in which they were measured
     labels = [label for label in by_segment if label in worst]
-    fig = figure(0.9 + 0.36 * (1 + len(labels)))
+    fig = style.figure(0.9 + 0.36 * (1 + len(labels)))
     axes = fig.subplots()
     place = np.arange(1 + len(labels), dtype=np.float64)
     place[1:] += 0.4
@@ -181,16 +162,16 @@ def errors_figure(diagnosis: Diagnosis) -> Figure:
         axes.barh(at, values, 0.92 * height, color=colour, label=name)
         for y, value in zip(at, values, strict=True):
             if np.isfinite(value):
-                _number(axes, f'{value:.2g}', value, y, SMALL - 1.5)
-    axes.set_yticks(place, ['overall', *map(safe, labels)])
+                _number(axes, f'{value:.2g}', value, y, style.SMALL - 1.5)
+    axes.set_yticks(place, ['overall', *map(style.safe, labels)])
     axes.invert_yaxis()
     if diagnosis.noise_floor is not None:
         floor = diagnosis.noise_floor
-        axes.axvline(floor, color=GREY, linestyle=':', linewidth=1.4, label='noise')
+        axes.axvline(floor, color=style.GREY, linestyle=':', linewidth=1.4, label='noise')
     tidy(axes, 'rms error / % of stroke')
     axes.grid(False, axis='y')
     axes.margins(x=0.08, y=0.02)
-    legend_above(axes)
+    style.legend_above(axes)
     return fig
 
 
@@ -205,7 +186,7 @@ def _frequencies_figure(diagnosis: Diagnosis) -> Figure:
     keys = sorted(diagnosis.before.by_frequency, key=float)
     if len(keys) < 2:
         raise NothingToDraw('the records hold sines of less than two frequencies')
-    fig = figure(3.0, 5.2)
+    fig = style.figure(3.0, 5.2)
     axes = fig.subplots()
     f = np.array([float(key) for key in keys])
     for (errors, name, colour), shape in zip(
@@ -237,18 +218,18 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure:
     if not rows:
         raise NothingToDraw('there was nothing to be explained, so no candidate was tried')
     rows = rows[:CANDIDATES]
-    reasons = [textwrap.wrap(safe(why, 1000), REASON) or [''] for _, _, why, _ in rows]
+    reasons = [textwrap.wrap(style.safe(why, 1000), REASON) or [''] for _, _, why, _ in rows]
     size = np.array([max(1.5, len(lines)) for lines in reasons])
     place = np.cumsum(size) - 0.5 * size
-    fig = figure(0.75 + 0.145 * float(size.sum()))
+    fig = style.figure(0.75 + 0.145 * float(size.sum()))
     axes, side = fig.subplots(1, 2, sharey=True, gridspec_kw={'width_ratios': [1.0, 1.55]})
     shares = [100.0 * min(1.0, max(0.0, share)) for _, share, _, _ in rows]
     axes.barh(place, shares, 0.95, color=[colour for *_, colour in rows])
     for y, value, lines in zip(place, shares, reasons, strict=True):
-        _number(axes, f'{value:.0f}', value, y, SMALL - 1.0)
-        text = side.text(0.0, y, '\n'.join(lines), va='center', fontsize=SMALL - 1)
+        _number(axes, f'{value:.0f}', value, y, style.SMALL - 1.0)
+        text = side.text(0.0, y, '\n'.join(lines), va='center', fontsize=style.SMALL - 1)
         text.set_in_layout(False)
-    axes.set_yticks(place, [safe(name) for name, *_ in rows])
+    axes.set_yticks(place, [style.safe(name) for name, *_ in rows])
     axes.set_xlim(0.0, 108.0)
     axes.set_xticks([0, 25, 50, 75, 100])
     tidy(axes, 'share of the explainable part / %')

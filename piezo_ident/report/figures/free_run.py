@@ -13,25 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.free_run import PieceRun, sine_frequency, SineError
 from piezo_ident.record.record import Segment
-from piezo_ident.report.figures.style import (
-    axis_limit,
-    COLOURS,
-    envelope,
-    figure,
-    GREY,
-    legend,
-    legend_above,
-    length_unit,
-    line,
-    name_above,
-    note,
-    NothingToDraw,
-    percent_axis,
-    plain_log,
-    safe,
-    symmetric,
-    tidy,
-)
+from piezo_ident.report.figures import style
+from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
 __all__ = ['loops_figure', 'overview_figure', 'segments_figure', 'sines_figure']
 
@@ -54,11 +37,7 @@ def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> 
 
     The triangle that covers the widest range is drawn, or the whole piece without one.
 
-    Parameters
-    ----------
-    runs : sequence of PieceRun
-    edges : sequence of (int or None), optional
-        For each run the first sample that was not fitted, where its end was held out.
+    `edges` holds for each run the first sample of its end that was held out, or None.
 
     Raises
     ------
@@ -68,11 +47,11 @@ def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> 
     number, s = _widest_loop(runs)
     run, part = runs[number], slice(s.start, s.stop)
     v, y, y_hat = run.piece.v[part], 1e6 * run.piece.y[part], 1e6 * run.y_hat[part]
-    fig = figure(5.2, 5.2)
+    fig = style.figure(5.2, 5.2)
     loops, errors = fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [2.4, 1]})
     _loop(loops, v, y, COLOURS['under'], 'measured', 3.0)
-    limit, largest = axis_limit(1e-6 * (y - y_hat))
-    unit, scale = length_unit(largest)
+    limit, largest = style.axis_limit(1e-6 * (y - y_hat))
+    unit, scale = style.length_unit(largest)
     error = 1e-6 * scale * (y - y_hat)
     kept = edges[number] if edges else None
     edge = y.size if kept is None else min(max(kept - s.start, 0), y.size)
@@ -80,14 +59,14 @@ def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> 
         if y_hat[cut].size:
             _loop(loops, v[cut], y_hat[cut], COLOURS[name], name.replace('model h', 'model, h'))
             _loop(errors, v[cut], error[cut], COLOURS[name], width=0.6)
-    symmetric(errors, scale * limit)
+    style.symmetric(errors, scale * limit)
     if largest > limit:
-        note(errors, f'axis cut; largest {scale * largest:.3g} {unit}')
-    name = ', '.join(filter(None, (safe(run.record), safe(s.label))))
+        style.note(errors, f'axis cut; largest {scale * largest:.3g} {unit}')
+    name = ', '.join(filter(None, (style.safe(run.record), style.safe(s.label))))
     tidy(loops, '', 'displacement / µm', name)
     tidy(errors, 'voltage / V', f'error / {unit}')
-    percent_axis(errors, scale * float(np.ptp(run.piece.y)))
-    legend(loops, loc='best')
+    style.percent_axis(errors, scale * float(np.ptp(run.piece.y)))
+    style.legend(loops, loc='best')
     fig.align_ylabels([loops, errors])
     return fig
 
@@ -109,7 +88,7 @@ def _loop(
     label: str = '',
     width: float = 1.0,
 ) -> None:
-    k = envelope(y, LOOP_POINTS)
+    k = style.envelope(y, LOOP_POINTS)
     v, y = v[k], y[k]
     # no chords across the loop where the voltage jumps
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.1 * np.ptp(v)) + 1
@@ -125,41 +104,35 @@ def _draw_error(
     width: float,
 ) -> tuple[str, float]:
     """Draw errors [m], that of the hysteresis alone where both are readable; return the unit."""
-    limit, largest = axis_limit(e)
-    unit, scale = length_unit(largest)
+    limit, largest = style.axis_limit(e)
+    unit, scale = style.length_unit(largest)
     remarks = [f'axis cut; largest {scale * largest:.3g} {unit}'] if largest > limit else []
     if not np.array_equal(e, e_static):
-        static_limit, static_largest = axis_limit(e_static)
+        static_limit, static_largest = style.axis_limit(e_static)
         if static_limit <= READABLE * limit:
-            line(axes, x, scale * e_static, COLOURS['static'], 'hysteresis alone', linewidth=width)
+            style.line(
+                axes, x, scale * e_static, COLOURS['static'], 'hysteresis alone', linewidth=width
+            )
             limit = max(limit, static_limit)
         else:
-            other, factor = length_unit(static_largest)
+            other, factor = style.length_unit(static_largest)
             remarks.append(
                 f'hysteresis alone (not drawn): up to {factor * static_largest:.3g} {other}'
             )
-    line(axes, x, scale * e, COLOURS['model'], 'model', linewidth=width)
-    symmetric(axes, scale * limit)
-    note(axes, '; '.join(remarks))
+    style.line(axes, x, scale * e, COLOURS['model'], 'model', linewidth=width)
+    style.symmetric(axes, scale * limit)
+    style.note(axes, '; '.join(remarks))
     return unit, scale
 
 
 def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
-    """
-    Draw a whole piece: voltage, displacement measured and modelled, and the error.
-
-    Parameters
-    ----------
-    run : PieceRun
-    held_out_from : int, optional
-        First sample that was not fitted, where the end of a record was held out.
-    """
+    """Draw voltage, displacement and error of a piece, its end from a sample on as held out."""
     piece, t = run.piece, run.piece.t
-    fig = figure(5.0)
+    fig = style.figure(5.0)
     axes = fig.subplots(3, 1, sharex=True, gridspec_kw={'height_ratios': [1, 1.7, 1.4]})
-    line(axes[0], t, piece.v, COLOURS['measured'])
-    line(axes[1], t, 1e6 * piece.y, COLOURS['under'], 'measured', linewidth=3.0)
-    line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
+    style.line(axes[0], t, piece.v, COLOURS['measured'])
+    style.line(axes[1], t, 1e6 * piece.y, COLOURS['under'], 'measured', linewidth=3.0)
+    style.line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
     unit, scale = _draw_error(axes[2], t, piece.y - run.y_hat, piece.y - run.y_static, 0.8)
     if held_out_from is not None:
         for each in axes:
@@ -170,11 +143,11 @@ def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
     tidy(axes[1], '', 'displacement / µm')
     tidy(axes[2], 'time / s', f'error / {unit}')
     _name_segments(axes[0], run)
-    percent_axis(axes[2], scale * float(np.ptp(piece.y)))
+    style.percent_axis(axes[2], scale * float(np.ptp(piece.y)))
     axes[0].margins(x=0.01)
-    legend_above(axes[1])
+    style.legend_above(axes[1])
     if len(axes[2].lines) > 2:
-        legend_above(axes[2])
+        style.legend_above(axes[2])
     fig.align_ylabels(list(axes))
     return fig
 
@@ -187,7 +160,7 @@ def _name_segments(axes: Axes, run: PieceRun) -> None:
     for s in named:
         first, last = run.piece.t[s.start], run.piece.t[s.stop - 1]
         axes.axvline(first, color=COLOURS['band'], linewidth=0.8, zorder=1)
-        name_above(axes, s.label, 0.5 * (first + last), 30.0 if rotated else 0.0)
+        style.name_above(axes, s.label, 0.5 * (first + last), 30.0 if rotated else 0.0)
 
 
 def segments_figure(
@@ -196,11 +169,7 @@ def segments_figure(
     """
     Draw a readable stretch of every segment with its error below.
 
-    Parameters
-    ----------
-    runs : sequence of PieceRun
-    errors : mapping, optional
-        Text on the error of each (record, segment label).
+    `errors` holds a text on the error of each (record, segment label).
 
     Raises
     ------
@@ -217,7 +186,7 @@ def segments_figure(
         raise NothingToDraw('no segment is labelled with a kind of the programmes')
     cells = sorted(cells, key=lambda cell: ORDER.index(cell[1].kind))[:CELLS]
     rows = -(-len(cells) // 2)
-    fig = figure(2.05 * rows + 0.3)
+    fig = style.figure(2.05 * rows + 0.3)
     heights = [0.12] + [1.6, 1.0] * rows
     grid = fig.add_gridspec(2 * rows + 1, min(2, len(cells)), height_ratios=heights)
     for i, (run, s) in enumerate(cells):
@@ -232,7 +201,7 @@ def segments_figure(
         ('hysteresis alone', COLOURS['static'], 1.2),
     ):
         head.plot([], [], color=colour, linewidth=width, label=name)
-    legend(head, loc='center', ncols=3)
+    style.legend(head, loc='center', ncols=3)
     return fig
 
 
@@ -253,10 +222,10 @@ def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, remark: s
     t, y, y_hat = run.piece.t[part], run.piece.y[part], run.y_hat[part]
     long = t[-1] - t[0] > 1.0
     x = t if long else 1e3 * (t - t[0])
-    line(trace, x, 1e6 * y, COLOURS['under'], linewidth=3.0)
-    line(trace, x, 1e6 * y_hat, COLOURS['model'])
+    style.line(trace, x, 1e6 * y, COLOURS['under'], linewidth=3.0)
+    style.line(trace, x, 1e6 * y_hat, COLOURS['model'])
     unit, _ = _draw_error(error, x, y - y_hat, y - run.y_static[part], 0.7)
-    tidy(trace, '', 'y / µm', safe(s.label) + (f': {remark}' if remark else ''))
+    tidy(trace, '', 'y / µm', style.safe(s.label) + (f': {remark}' if remark else ''))
     tidy(error, f'time / {"s" if long else "ms"}{what}', f'error / {unit}')
     trace.tick_params(labelbottom=False)
     trace.margins(x=0.01)
@@ -266,11 +235,7 @@ def sines_figure(errors: Sequence[SineError], floor: float | None = None) -> Fig
     """
     Draw the steady-state error over the frequency of the sines.
 
-    Parameters
-    ----------
-    errors : sequence of SineError
-    floor : float, optional
-        Rms of the sensor noise [% of stroke].
+    `floor` is the rms of the sensor noise [% of stroke].
 
     Raises
     ------
@@ -283,7 +248,7 @@ def sines_figure(errors: Sequence[SineError], floor: float | None = None) -> Fig
             'and period'
         )
     f = np.array([e.frequency for e in errors])
-    fig = figure(3.2, 5.2)
+    fig = style.figure(3.2, 5.2)
     axes = fig.subplots()
     for values, colour, shape, name in (
         ([e.static_percent for e in errors], COLOURS['static'], 's--', 'hysteresis alone'),
@@ -300,10 +265,10 @@ def finish_frequencies(
     """Finish an axes of errors [% of stroke] over frequencies [Hz], with the noise floor."""
     tidy(axes, 'frequency of the sine / Hz', 'rms error / % of stroke')
     if floor is not None and floor > 0.0:
-        axes.axhline(floor, color=GREY, linestyle=':', linewidth=1.3, label=noise)
+        axes.axhline(floor, color=style.GREY, linestyle=':', linewidth=1.3, label=noise)
     axes.margins(0.06)
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.6, high)
-    plain_log(axes.yaxis, low, high)
-    plain_log(axes.xaxis, f.min(), f.max() * 1.5)
-    legend(axes, loc='best')
+    style.plain_log(axes.yaxis, low, high)
+    style.plain_log(axes.xaxis, f.min(), f.max() * 1.5)
+    style.legend(axes, loc='best')

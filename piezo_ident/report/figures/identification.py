@@ -49,17 +49,7 @@ def draw_identification(
     runs: Sequence[PieceRun],
     tick: Callable[[float], None] = lambda share: None,
 ) -> Drawn:
-    """
-    Draw everything that the data of an identification allow.
-
-    Parameters
-    ----------
-    identification : Identification
-    runs : sequence of PieceRun
-        From `piezo_ident.model.free_run.piece_runs`.
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
-    """
+    """Draw everything that the data allow; `tick` takes the share that is done, and may raise."""
     texts: dict[tuple[str, str], list[str]] = {}
     for row in identification.errors:
         text = f'{row.data} {row.percent:.2g} %'

@@ -16,27 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.results import Residual
 from piezo_ident.record.record import Piece
-from piezo_ident.report.figures.style import (
-    axis_limit,
-    BLUE,
-    COLOURS,
-    envelope,
-    figure,
-    GREEN,
-    legend,
-    legend_above,
-    length_unit,
-    name_above,
-    note,
-    NothingToDraw,
-    percent_axis,
-    plain_log,
-    SMALL,
-    symmetric,
-    tidy,
-    VERMILION,
-    ZERO,
-)
+from piezo_ident.report.figures import style
+from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
 from scipy import fft, signal
 
@@ -93,32 +74,32 @@ def residual_figure(residual: Residual) -> Figure:
         raise NothingToDraw(f'{residual.record}: no sample counts')
     piece, stroke = residual.piece, float(np.ptp(residual.piece.y))
     e = {name: getattr(residual, name)[residual.sound] for name, _, _ in STATES}
-    limit, largest = axis_limit(np.concatenate(list(e.values())))
+    limit, largest = style.axis_limit(np.concatenate(list(e.values())))
     rows: list[tuple[tuple[str, ...], float, str]] = [(('given', 'before'), limit, '')]
     if differ([residual]):
         rows.append((('after',), limit, 'on the same scale'))
-        small, _ = axis_limit(e['after'])
+        small, _ = style.axis_limit(e['after'])
         if 0.0 < small < limit / ENLARGED:
             rows.append((('after',), small, f'{limit / small:.2g} times enlarged'))
-    fig = figure(1.2 + 1.6 * len(rows))
+    fig = style.figure(1.2 + 1.6 * len(rows))
     ratios = {'height_ratios': [0.8, *[1.5] * len(rows)]}
     axes = fig.subplots(1 + len(rows), 1, sharex=True, gridspec_kw=ratios)
-    k = envelope(piece.v)
+    k = style.envelope(piece.v)
     axes[0].plot(piece.t[k], piece.v[k], color=COLOURS['measured'], linewidth=1.0)
     tidy(axes[0], '', 'voltage / V')
     _shade(list(axes), piece)
     for ax, (names, end, remark) in zip(axes[1:], rows, strict=True):
-        unit, scale = length_unit(end)
+        unit, scale = style.length_unit(end)
         for name, label, colour in STATES:
             if name in names:
                 _trace(ax, residual, name, scale, colour, label)
-        symmetric(ax, scale * end)
+        style.symmetric(ax, scale * end)
         tidy(ax, 'time / s' if ax is axes[-1] else '', f'residual / {unit}')
-        percent_axis(ax, scale * stroke)
-        legend_above(ax)
-        note(ax, remark)
+        style.percent_axis(ax, scale * stroke)
+        style.legend_above(ax)
+        style.note(ax, remark)
     if largest > limit:
-        note(axes[1], f'axis cut; largest {1e6 * largest:.3g} µm')
+        style.note(axes[1], f'axis cut; largest {1e6 * largest:.3g} µm')
     axes[0].margins(x=0.005)
     fig.align_ylabels(list(axes))
     return fig
@@ -129,7 +110,7 @@ def _trace(
 ) -> None:
     # samples that do not count leave a gap
     e, good = scale * getattr(residual, name), np.flatnonzero(residual.sound)
-    k = envelope(np.interp(np.arange(e.size), good, e[good]))
+    k = style.envelope(np.interp(np.arange(e.size), good, e[good]))
     y = np.where(residual.sound, e, np.nan)[k]
     width = 2.2 if name == 'given' else 0.8
     axes.plot(residual.piece.t[k], y, color=colour, linewidth=width, label=label)
@@ -153,7 +134,7 @@ def _shade(axes: Sequence[Axes], piece: Piece) -> None:
             each.axvspan(first, last, color=TINTS[i % 2], linewidth=0.0, zorder=0)
         if (label, start, stop) in longest:
             short = label if len(label) <= SHORT else f'{label[: SHORT - 1]}…'
-            name_above(axes[0], short, 0.5 * (first + last))
+            style.name_above(axes[0], short, 0.5 * (first + last))
 
 
 def _both(
@@ -161,8 +142,8 @@ def _both(
 ) -> list[tuple[ResidualAnalysis, str, str]]:
     """Return what is compared, with colours and names."""
     if after is None:
-        return [(before, VERMILION, 'residual')]
-    return [(before, VERMILION, 'before'), (after, BLUE, 'after')]
+        return [(before, style.VERMILION, 'residual')]
+    return [(before, style.VERMILION, 'before'), (after, style.BLUE, 'after')]
 
 
 def _density(part: ResidualPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -199,7 +180,7 @@ def residual_spectrum_figure(
     shown = before.parts[i]
     if max((b - a for a, b in shown.runs()), default=0) < 64 or not np.any(shown.e):
         raise NothingToDraw('no stretch is long enough for a spectrum')
-    fig = figure(3.6)
+    fig = style.figure(3.6)
     axes = fig.subplots()
     top, bottom, first, last = 0.0, np.inf, np.inf, 0.0
     for analysis, colour, label in _both(before, after):
@@ -221,28 +202,20 @@ def residual_spectrum_figure(
     # room for the names of the lines
     reach = 3.0 if not before.lines.lines else 30.0
     axes.set_ylim(0.3e9 * bottom, reach * 1e9 * top)
-    plain_log(axes.xaxis, first, last)
+    style.plain_log(axes.xaxis, first, last)
     if np.log10(top / bottom) < 4.0:
-        plain_log(axes.yaxis, 0.3e9 * bottom, reach * 1e9 * top)
-    legend(axes, loc='lower left')
+        style.plain_log(axes.yaxis, 0.3e9 * bottom, reach * 1e9 * top)
+    style.legend(axes, loc='lower left')
     return fig
 
 
 def _mark_line(axes: Axes, frequency: float, amplitude: float, order: int) -> None:
-    axes.axvline(frequency, color=GREEN, linewidth=0.8, linestyle=':', zorder=1)
+    axes.axvline(frequency, color=style.GREEN, linewidth=0.8, linestyle=':', zorder=1)
     text = f'{frequency:.4g} Hz, {1e9 * amplitude:.2g} nm'
-    axes.annotate(
-        text if order == 1 else f'{text} (× {order})',
-        (frequency, 1.0),
-        xycoords=('data', 'axes fraction'),
-        xytext=(2, -2),
-        textcoords='offset points',
-        ha='left',
-        va='top',
-        rotation=90,
-        fontsize=SMALL - 1.0,
-        color=GREEN,
-    )
+    at: dict[str, Any] = {'xycoords': ('data', 'axes fraction'), 'textcoords': 'offset points'}
+    at |= {'xytext': (2, -2), 'ha': 'left', 'va': 'top', 'rotation': 90, 'color': style.GREEN}
+    text = text if order == 1 else f'{text} (× {order})'
+    axes.annotate(text, (frequency, 1.0), fontsize=style.SMALL - 1.0, **at)
 
 
 def residual_dependence_figure(
@@ -260,10 +233,10 @@ def residual_dependence_figure(
     if not names:
         raise NothingToDraw('the residual has no curve with two points or more')
     rows = -(-len(names) // 2)
-    fig = figure(2.7 * rows)
+    fig = style.figure(2.7 * rows)
     grid = fig.subplots(rows, min(2, len(names)), squeeze=False)
     sizes = [np.abs(c.mean).max(initial=0.0) for name in names for c in _curves(before, name)]
-    unit, scale = length_unit(float(max(sizes)))
+    unit, scale = style.length_unit(float(max(sizes)))
     for axes, name in zip(grid.ravel(), names, strict=False):
         shares = []
         for analysis, colour, label in _both(before, after):
@@ -272,17 +245,18 @@ def residual_dependence_figure(
                 _draw_curve(axes, curve, scale, colour, label if after is not None else '')
             if curves:
                 shares.append(f'{100.0 * curves[0].share:.0f} %')
-        axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
+        axes.axhline(0.0, color=style.ZERO, linewidth=0.6, zorder=1)
         tidy(axes, AXES[name], f'mean residual / {unit}')
         if name.startswith('time'):
             axes.set_xscale('log')
-            plain_log(axes.xaxis, *axes.get_xlim())
+            low, high = axes.get_xlim()
+            style.plain_log(axes.xaxis, low, high, 1.7)
         elif name == 'dv/dt':
             _signed_log(axes, _curves(before, name))
         # means over lg t, in which a decade counts as much as any other
         what = 'the means' if name == 'time since the step' else 'the variance'
-        note(axes, f'explains {" → ".join(shares)} of {what}')
-        legend(axes)
+        style.note(axes, f'explains {" → ".join(shares)} of {what}')
+        style.legend(axes)
     for axes in grid.ravel()[len(names) :]:
         axes.set_axis_off()
     fig.align_ylabels(list(grid.ravel()))
@@ -296,15 +270,15 @@ def _curves(analysis: ResidualAnalysis, against: str) -> list[Curve]:
 def _draw_curve(axes: Axes, curve: Curve, scale: float, colour: str, label: str) -> None:
     branch = {'up': 'rising', 'down': 'falling', 'both': ''}[curve.branch]
     name = ', '.join(filter(None, (label, branch))) or 'along the drive'
-    style: dict[str, Any] = {'color': colour, 'linewidth': 1.1, 'markersize': 3.0}
+    look: dict[str, Any] = {'color': colour, 'linewidth': 1.1, 'markersize': 3.0}
     if curve.branch == 'down':
-        style |= {'linestyle': '--', 'marker': 'v', 'markerfacecolor': 'white'}
+        look |= {'linestyle': '--', 'marker': 'v', 'markerfacecolor': 'white'}
     else:
-        style |= {'marker': '^' if curve.branch == 'up' else 'o'}
+        look |= {'marker': '^' if curve.branch == 'up' else 'o'}
     mean, std = scale * curve.mean, scale * curve.std
     band: dict[str, Any] = {'color': colour, 'alpha': 0.18, 'linewidth': 0}
     axes.fill_between(curve.x, mean - 2 * std, mean + 2 * std, **band)
-    axes.plot(curve.x, mean, label=name, **style)
+    axes.plot(curve.x, mean, label=name, **look)
 
 
 def _signed_log(axes: Axes, curves: Sequence[Curve]) -> None:
@@ -340,7 +314,7 @@ def residual_correlation_figure(
         raise NothingToDraw('too few samples for coherence and correlation')
     both = _both(before, after)
     rows = int(before.coherence is not None) + int(bool(before.correlations))
-    fig = figure(2.5 * rows)
+    fig = style.figure(2.5 * rows)
     grid = fig.add_gridspec(rows, 2)
     if before.coherence is not None:
         _draw_coherence(fig.add_subplot(grid[0, :]), both)
@@ -354,12 +328,12 @@ def residual_correlation_figure(
                     for band in (-c.band, c.band):
                         axes.plot(lag, band, color=colour, linewidth=0.8, linestyle='--', zorder=1)
         tidy(axes, 'lag / ms', f'correlation with {first.input}')
-        axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
+        axes.axhline(0.0, color=style.ZERO, linewidth=0.6, zorder=1)
         axes.margins(x=0.0)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        note(axes, 'dashed: 99 % band of all lags')
+        style.note(axes, 'dashed: 99 % band of all lags')
         if before.coherence is None:
-            legend(axes)
+            style.legend(axes)
     return fig
 
 
@@ -378,6 +352,6 @@ def _draw_coherence(axes: Axes, both: Sequence[tuple[ResidualAnalysis, str, str]
     low = float(first.frequency[1])
     high = 1.1 * float(first.frequency[first.tested].max(initial=2.0 * low))
     axes.set_xlim(low, high)
-    plain_log(axes.xaxis, low, high)
-    note(axes, f'coherent share of the residual: {" → ".join(shares)}')
-    legend_above(axes)
+    style.plain_log(axes.xaxis, low, high)
+    style.note(axes, f'coherent share of the residual: {" → ".join(shares)}')
+    style.legend_above(axes)

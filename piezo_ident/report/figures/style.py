@@ -81,16 +81,7 @@ class NothingToDraw(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """
-    A drawn picture.
-
-    Attributes
-    ----------
-    name : str
-        File name without its ending.
-    title, caption : str
-    figure : matplotlib.figure.Figure
-    """
+    """A drawn picture; the name is that of a file without its ending."""
 
     name: str
     title: str
@@ -104,15 +95,7 @@ Wanted = tuple[str, str, str, Callable[[], Figure]]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """
-    Pictures of a result.
-
-    Attributes
-    ----------
-    pictures : tuple of Picture
-    left_out : tuple of (str, str)
-        Title of each picture that the data do not allow, and why.
-    """
+    """Pictures of a result, and the title of each that the data do not allow, with the reason."""
 
     pictures: tuple[Picture, ...]
     left_out: tuple[tuple[str, str], ...]
@@ -226,10 +209,10 @@ def line(
     axes.plot(x[k], y[k], color=colour, label=label, **{'linewidth': 1.0, **options})
 
 
-def plain_log(axis: Axis, low: float, high: float) -> None:
-    """Write plain numbers on a logarithmic axis, as many as its range [low, high] has room for."""
+def plain_log(axis: Axis, low: float, high: float, most: float = 3.0) -> None:
+    """Write plain numbers on a logarithmic axis; of more than `most` decades the tens alone."""
     decades = float(np.log10(high / low))
-    subs: tuple[float, ...] = (1.0,) if decades > 3.0 else (1.0, 2.0, 5.0)
+    subs: tuple[float, ...] = (1.0,) if decades > most else (1.0, 2.0, 5.0)
     if decades < 0.5:
         subs = tuple(float(k) for k in range(1, 10))
     axis.set_major_locator(LogLocator(subs=subs, numticks=20))
@@ -243,13 +226,8 @@ def percent_axis(axes: Axes, stroke: float) -> None:
     if stroke <= 0.0:
         return
 
-    def percent(e: Any) -> Any:
-        return 100.0 * e / stroke
-
-    def error(p: Any) -> Any:
-        return p * stroke / 100.0
-
-    right = axes.secondary_yaxis('right', functions=(percent, error))
+    both = (lambda e: 100.0 * e / stroke, lambda p: p * stroke / 100.0)
+    right = axes.secondary_yaxis('right', functions=both)
     right.set_ylabel('% of stroke', fontsize=NORMAL)
     right.tick_params(labelsize=SMALL)
 
@@ -261,28 +239,13 @@ def note(axes: Axes, text: str) -> None:
 
 def legend_above(axes: Axes) -> None:
     """Add a legend in one line above the left end of an axes."""
-    legend(
-        axes,
-        loc='lower left',
-        bbox_to_anchor=(0.0, 0.98),
-        ncols=4,
-        borderaxespad=0.0,
-        handlelength=1.6,
-        columnspacing=1.4,
-    )
+    place: dict[str, Any] = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 0.98), 'ncols': 4}
+    legend(axes, borderaxespad=0.0, handlelength=1.6, columnspacing=1.4, **place)
 
 
 def name_above(axes: Axes, text: str, x: float, rotation: float = 30.0, **options: Any) -> None:
     """Write a name above an axes at `x` in its data, at an angle unless that is zero."""
-    options = {'ha': 'left' if rotation else 'center', 'fontsize': SMALL, **options}
-    axes.annotate(
-        safe(text),
-        (x, 1.0),
-        xycoords=('data', 'axes fraction'),
-        xytext=(0, 2),
-        textcoords='offset points',
-        va='bottom',
-        rotation=rotation,
-        rotation_mode='anchor',
-        **options,
-    )
+    at: dict[str, Any] = {'xycoords': ('data', 'axes fraction'), 'textcoords': 'offset points'}
+    at |= {'xytext': (0, 2), 'ha': 'left' if rotation else 'center', 'va': 'bottom'}
+    at |= {'rotation': rotation, 'rotation_mode': 'anchor', 'fontsize': SMALL}
+    axes.annotate(safe(text), (x, 1.0), **at, **options)

@@ -19,18 +19,8 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
 from piezo_ident.identification.step2_dynamics import FrequencyResponse
 from piezo_ident.model.free_run import PieceRun
-from piezo_ident.report.figures.style import (
-    COLOURS,
-    figure,
-    GREY,
-    legend,
-    name_above,
-    NORMAL,
-    NothingToDraw,
-    plain_log,
-    SMALL,
-    tidy,
-)
+from piezo_ident.report.figures import style
+from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
 __all__ = ['delay_figure', 'orders_figure', 'response_figure', 'weights_figure']
 
@@ -52,11 +42,7 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) 
     """
     Draw the averaged step response with the delay, and the scan of the ARX loss.
 
-    Parameters
-    ----------
-    identification : Identification
-    runs : sequence of PieceRun, optional
-        For what the model makes of the same steps.
+    `runs` hold the response of the model to the same steps.
 
     Raises
     ------
@@ -70,14 +56,16 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) 
             raise NothingToDraw('the delay was given, not measured')
         raise NothingToDraw('no steps and no noise segment to read a delay from')
     panels = 2 * (step is not None) + (result.loss is not None)
-    fig = figure(2.7)
+    fig = style.figure(2.7)
     axes = fig.subplots(1, panels, squeeze=False)[0]
     if step is not None:
         _draw_step(axes[:2], identification, step, _model_step(step, runs))
     if result.loss is not None:
         _draw_scan(axes[-1], result.loss, result.scan, result.samples)
     for letter, each in zip('abc', axes, strict=False):
-        each.set_title(f'({letter}) {each.get_title(loc="left")}', fontsize=NORMAL, loc='left')
+        each.set_title(
+            f'({letter}) {each.get_title(loc="left")}', fontsize=style.NORMAL, loc='left'
+        )
     return fig
 
 
@@ -128,22 +116,15 @@ def _draw_step(
     top = float(np.abs(y[near]).max(initial=0.0))
     if top > floor > 0.0:
         panels[1].set_ylim(floor, 2.0 * top)
-        plain_log(panels[1].yaxis, floor, 2.0 * top)
+        style.plain_log(panels[1].yaxis, floor, 2.0 * top)
     steps = 'one step' if step.repeats == 1 else f'average of {step.repeats} steps'
     tidy(panels[0], 'samples after the step', 'response / nm V$^{-1}$', steps)
     tidy(panels[1], 'samples after the step', '', f'its size; d = {_time(d / rate)}')
     panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    panels[1].annotate(
-        'noise threshold',
-        (1.0, level),
-        xycoords=('axes fraction', 'data'),
-        xytext=(-2, -3),
-        textcoords='offset points',
-        ha='right',
-        va='top',
-        fontsize=SMALL,
-    )
-    legend(panels[0], loc='best')
+    at: dict[str, Any] = {'xycoords': ('axes fraction', 'data'), 'textcoords': 'offset points'}
+    at |= {'xytext': (-2, -3), 'ha': 'right', 'va': 'top', 'fontsize': style.SMALL}
+    panels[1].annotate('noise threshold', (1.0, level), **at)
+    style.legend(panels[0], loc='best')
 
 
 def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: int) -> None:
@@ -151,12 +132,12 @@ def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: 
     axes.semilogy(d, loss / loss.min(), 'o-', color=COLOURS['measured'], markersize=3, linewidth=1)
     axes.axvline(chosen, color=COLOURS['mark'], linewidth=1.4, label=f'used: {chosen}')
     if scan is not None and scan != chosen:
-        style: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
-        axes.axvline(scan, label=f'scan: {scan}', **style)
+        dashed: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
+        axes.axvline(scan, label=f'scan: {scan}', **dashed)
     tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the ARX loss')
-    plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
+    style.plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend(axes, loc='best')
+    style.legend(axes, loc='best')
 
 
 def _time(seconds: float) -> str:
@@ -196,7 +177,7 @@ def response_figure(identification: Identification) -> Figure:
     G = modelled(f)
     phase = np.degrees(np.unwrap(np.angle(G)))
     heights = [2.0, 1.5] if measured is None else [2.0, 1.5, 0.9]
-    fig = figure(1.1 * sum(heights))
+    fig = style.figure(1.1 * sum(heights))
     ratios = {'height_ratios': heights}
     axes: list[Axes] = list(fig.subplots(len(heights), 1, sharex=True, gridspec_kw=ratios))
     axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model', zorder=3)
@@ -209,11 +190,11 @@ def response_figure(identification: Identification) -> Figure:
         # the turn that lies nearest to the model: noise cannot make it slip by a whole one
         turns = np.degrees(np.angle(R / modelled(x))) + np.interp(x, f, phase)
         _draw_measured(axes, measured, R, turns)
-    plain_log(axes[0].yaxis, *axes[0].get_ylim())
-    plain_log(axes[-1].xaxis, low, top)
-    axes[-1].set_xlabel('frequency / Hz', fontsize=NORMAL)
+    style.plain_log(axes[0].yaxis, *axes[0].get_ylim())
+    style.plain_log(axes[-1].xaxis, low, top)
+    axes[-1].set_xlabel('frequency / Hz', fontsize=style.NORMAL)
     axes[-1].set_xlim(0.9 * low, 1.05 * top)
-    legend(axes[0], loc='lower left')
+    style.legend(axes[0], loc='lower left')
     _mark_modes(axes, [m for m in model.dynamics.modes(rate) if low < m[0] < top])
     fig.align_ylabels(axes)
     return fig
@@ -245,7 +226,7 @@ def _mark_modes(axes: Sequence[Axes], modes: list[tuple[float, float]]) -> None:
             continue
         for each in axes:
             each.axvline(frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1)
-        name_above(axes[0], f'{frequency:.0f} Hz', frequency, color=COLOURS['mark'])
+        style.name_above(axes[0], f'{frequency:.0f} Hz', frequency, color=COLOURS['mark'])
 
 
 def orders_figure(identification: Identification) -> Figure:
@@ -266,7 +247,7 @@ def orders_figure(identification: Identification) -> Figure:
     if best <= 0.0:
         raise NothingToDraw('the held-out error is zero')
     ratio = np.where(np.isfinite(table.held_out), table.held_out / best, np.nan)
-    fig = figure(4.4, 5.0)
+    fig = style.figure(4.4, 5.0)
     axes = fig.subplots()
     axes.set_facecolor('#D9D9D9')
     image = axes.imshow(
@@ -292,32 +273,16 @@ def orders_figure(identification: Identification) -> Figure:
         'least BIC': (table.best('bic'), 'x', 6.0, COLOURS['measured'], 1.5),
     }
     for name, ((na, nb), shape, size, colour, edge) in marks.items():
-        axes.plot(
-            nb,
-            na,
-            shape,
-            markersize=size,
-            markerfacecolor='none',
-            markeredgecolor=colour,
-            markeredgewidth=edge,
-            linestyle='none',
-            label=name,
-            clip_on=False,
-        )
+        mark: dict[str, Any] = {'markersize': size, 'markeredgewidth': edge, 'linestyle': 'none'}
+        mark |= {'markerfacecolor': 'none', 'markeredgecolor': colour, 'clip_on': False}
+        axes.plot(nb, na, shape, label=name, **mark)
     bar = fig.colorbar(image, ax=axes, extend='max', shrink=0.9)
     bar.set_ticks([1, 2, 5, 10], labels=['1', '2', '5', '10'])
     bar.ax.minorticks_off()
-    bar.ax.tick_params(labelsize=SMALL)
-    bar.set_label('held-out free-run error / smallest', fontsize=NORMAL)
-    axes.legend(
-        fontsize=SMALL,
-        frameon=False,
-        loc='lower center',
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=2,
-        handletextpad=0.4,
-        columnspacing=1.2,
-    )
+    bar.ax.tick_params(labelsize=style.SMALL)
+    bar.set_label('held-out free-run error / smallest', fontsize=style.NORMAL)
+    place: dict[str, Any] = {'loc': 'lower center', 'bbox_to_anchor': (0.5, 1.0), 'ncols': 2}
+    style.legend(axes, frameon=False, handletextpad=0.4, columnspacing=1.2, **place)
     return fig
 
 
@@ -330,42 +295,28 @@ def weights_figure(identification: Identification) -> Figure:
     NothingToDraw
         When the model has no plays.
     """
-    model, std = identification.model, identification.hysteresis.std
+    model = identification.model
+    std: NDArray[np.float64] | None = identification.hysteresis.std
     h = model.hysteresis
     if h.thresholds.size == 0:
         raise NothingToDraw('the hysteresis has no plays')
     r = h.thresholds * model.scaling.V
-    fig = figure(2.8)
+    fig = style.figure(2.8)
     axes = fig.subplots()
     gaps = np.diff(np.concatenate([[0.0], r]))
-    axes.bar(
-        r,
-        h.weights,
-        width=0.7 * float(gaps.min()),
-        color=COLOURS['model'],
-        yerr=std[: r.size] if std.size >= r.size else None,
-        error_kw={'ecolor': COLOURS['measured'], 'elinewidth': 1.0, 'capsize': 2.5},
-    )
-    bound = h.weights == 0.0
-    if bound.any():
-        axes.plot(
-            r[bound],
-            np.zeros(int(bound.sum())),
-            'o',
-            markersize=4,
-            markerfacecolor='white',
-            markeredgecolor=GREY,
-            label='on the bound q = 0',
-            clip_on=False,
-            zorder=4,
-        )
-        legend(axes)
+    bars: dict[str, Any] = {'ecolor': COLOURS['measured'], 'elinewidth': 1.0, 'capsize': 2.5}
+    std = std[: r.size] if std is not None and std.size >= r.size else None
+    width, colour = 0.7 * float(gaps.min()), COLOURS['model']
+    axes.bar(r, h.weights, width=width, color=colour, yerr=std, error_kw=bars)
+    bound = r[h.weights == 0.0]
+    if bound.size:
+        mark: dict[str, Any] = {'markersize': 4, 'clip_on': False, 'zorder': 4}
+        mark |= {'markerfacecolor': 'white', 'markeredgecolor': style.GREY}
+        axes.plot(bound, np.zeros(bound.size), 'o', label='on the bound q = 0', **mark)
+        style.legend(axes)
     tidy(axes, 'threshold r / V', 'weight q (normalised)')
-    axes.set_title(
-        f'plus  $p_1 v^3 + p_2 v$  with  $p_1 = {h.p1:.4f}$,  $p_2 = {h.p2:.4f}$',
-        fontsize=NORMAL,
-        loc='left',
-    )
+    title = f'plus  $p_1 v^3 + p_2 v$  with  $p_1 = {h.p1:.4f}$,  $p_2 = {h.p2:.4f}$'
+    axes.set_title(title, fontsize=style.NORMAL, loc='left')
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     axes.set_xlim(left=0.0)
     axes.grid(False, axis='x')
