@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    'DIVERGES',
     'Errors',
     'FreeRun',
     'PieceRun',
@@ -39,14 +38,12 @@ __all__ = [
     'sine_errors',
     'sine_frequency',
     'sines_of',
-    'start_warning',
 ]
 
 Vector = NDArray[np.float64]
 
-#: samples that are judged together, so that temporaries stay small beside a long record
+#: samples per block, so that temporaries stay small beside a long record
 BLOCK = 1 << 20
-DIVERGES = 'the model diverges on this record; identify it again'
 #: what is dropped at the start of a sine: this time and at least one period [s]
 SETTLING = 1.0
 
@@ -67,9 +64,9 @@ class Errors:
     fit : float
         `piezo_ident.model.metrics.fit_percent`.
     offset : float
-        Mean of measured minus predicted [m]; a sensor that was set to zero anew shows here.
+        Mean of measured minus predicted [m], as from a sensor that was set to zero again.
     percent_without_offset : float
-        `percent` when `offset` is taken away.
+        `percent` after subtracting `offset`.
     """
 
     n: int
@@ -80,7 +77,7 @@ class Errors:
 
     @property
     def mostly_offset(self) -> bool:
-        """Whether taking the offset away at least halves the error."""
+        """Whether subtracting the offset at least halves the error."""
         return self.percent_without_offset <= 0.5 * self.percent and self.percent > 0.0
 
 
@@ -106,19 +103,19 @@ class FreeRun:
     """
 
     record: Record
-    pieces: tuple[NDArray[np.float64], ...]
+    pieces: tuple[Vector, ...]
     estimated: tuple[bool, ...]
     errors: Errors
     errors_after_start: Errors | None
     warnings: tuple[str, ...] = ()
 
     @property
-    def predicted(self) -> NDArray[np.float64]:
+    def predicted(self) -> Vector:
         """Predicted displacement of all pieces [m], shape (n,)."""
         return np.concatenate(self.pieces)
 
     @property
-    def measured(self) -> NDArray[np.float64]:
+    def measured(self) -> Vector:
         """Measured displacement of all pieces [m], shape (n,)."""
         return np.concatenate([piece.y for piece in self.record])
 
@@ -169,7 +166,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             model.check_rate(piece)
         except ModelError as error:
             raise ModelError(f'{record.name}: {error}') from None
-    predicted: list[NDArray[np.float64]] = []
+    predicted: list[Vector] = []
     estimated: list[bool] = []
     starts: list[int] = []  # the sample of each piece from which its start is forgotten
     for pieces in connected_pieces(record):
@@ -186,9 +183,15 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             starts.append(min(start, piece.n))
             start -= starts[-1]
     if not all(np.isfinite(y_hat).all() for y_hat in predicted):
-        raise ModelError(f'{record.name}: {DIVERGES}')
+        raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
     has_more = sum(starts) < record.n
-    warnings = [start_warning(model, record.name, estimated)] if any(estimated) else []
+    warnings = []
+    if any(estimated):
+        warnings.append(
+            f'{record.name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
+            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
+            'estimated from their early part'
+        )
     return FreeRun(
         record=record,
         pieces=tuple(predicted),
@@ -201,7 +204,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
 
 def run_pieces(
     model: StageModel, pieces: Sequence[Piece], memory: ArrayLike | None
-) -> list[NDArray[np.float64]]:
+) -> list[Vector]:
     """
     Return the predicted displacement [m] of pieces that follow each other over short gaps.
 
@@ -214,25 +217,15 @@ def run_pieces(
         Play outputs at the start of the first.
     """
     stream = model.stream(memory)
-    predicted: list[NDArray[np.float64]] = []
-    for i, piece in enumerate(pieces):
-        if i:
-            stream.bridge(pieces[i - 1], piece)
+    predicted = [stream.follow(pieces[0])]
+    for before, piece in pairwise(pieces):
+        stream.bridge(before, piece)
         predicted.append(stream.follow(piece))
     return predicted
 
 
-def start_warning(model: StageModel, name: str, estimated: Sequence[bool]) -> str:
-    """Return what to say of a record where the memory at the start of pieces was estimated."""
-    return (
-        f'{name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
-        f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start was '
-        'estimated from their early part'
-    )
-
-
 def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) -> Errors:
-    """Return the errors from a sample of each piece on, in blocks: a record may be long."""
+    """Return the errors of each piece from a sample on, in blocks for the sake of memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
     def total(f: Callable[[Vector, Vector], Vector]) -> float:
@@ -259,7 +252,7 @@ def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) 
 @dataclass(frozen=True, eq=False)
 class PieceRun:
     """
-    One piece with what the model makes of its voltage.
+    The free run of a model on one piece.
 
     Attributes
     ----------
@@ -272,8 +265,8 @@ class PieceRun:
 
     record: str
     piece: Piece
-    y_hat: NDArray[np.float64]
-    y_static: NDArray[np.float64]
+    y_hat: Vector
+    y_static: Vector
 
 
 @dataclass(frozen=True)
@@ -287,8 +280,7 @@ class SineError:
         [Hz]
     percent, static_percent : float
         `piezo_ident.model.metrics.percent_of_stroke` of the whole model and of the hysteresis
-        alone;
-        the stroke is that of the samples compared.
+        alone, by the stroke of the samples compared.
     n : int
         Samples compared.
     """
@@ -317,7 +309,7 @@ def piece_runs(
     Returns
     -------
     list of PieceRun
-        The unknown memory of a piece that does not start at rest is estimated from its beginning.
+        Unknown memories are estimated as in `free_run`.
     """
     static = model.without_dynamics()
     known = memories or {}
@@ -351,18 +343,16 @@ def sine_frequency(label: str) -> float | None:
 
 def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
     """
-    Return the steady-state error of every sine segment of some free runs, by frequency.
+    Return the steady-state error of every sine segment, by frequency.
+
+    The first second and at least one period of each segment do not count; a segment that is then
+    shorter than a period is left out.
 
     Parameters
     ----------
     runs : sequence of PieceRun
-
-    Returns
-    -------
-    tuple of SineError
-        Segments that hold less than one period after the first second and period are left out.
     """
-    found = []
+    rows = []
     for run in runs:
         rate = run.piece.sample_rate
         for s in run.piece.segments:
@@ -375,7 +365,7 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
                 continue
             steady = slice(start, s.stop)
             y = run.piece.y[steady]
-            found.append(
+            rows.append(
                 SineError(
                     frequency=frequency,
                     percent=percent_of_stroke(y, run.y_hat[steady]),
@@ -383,26 +373,18 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
                     n=y.size,
                 )
             )
-    return tuple(sorted(found, key=lambda row: row.frequency))
+    return tuple(sorted(rows, key=lambda row: row.frequency))
 
 
 def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
     """
-    Return the steady-state error of every sine segment of a record.
-
-    The first second and at least one period of each segment are dropped, and the stroke is
-    ``max y - min y`` of what is left.
+    Return the steady-state error of every sine segment of a record, as `sines_of` does.
 
     Parameters
     ----------
     model : StageModel
     record : Record
         With segments labelled by their frequency, as ``sine:50Hz``.
-
-    Returns
-    -------
-    tuple of SineError
-        By frequency.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class Converter:
 @dataclass(frozen=True)
 class Sensor:
     """
-    What stands between the computer and the stage.
+    The converters and the sensor between computer and stage.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class SimulatedStage:
     model : StageModel
     sensor : Sensor
     seed : int
-        For the generator that draws the noise.
+        Of the sensor noise.
     """
 
     model: StageModel
@@ -166,7 +166,7 @@ class SimulatedStage:
         name: str = 'simulated',
     ) -> Record:
         """
-        Return what is measured while the stage plays a programme.
+        Return what is measured while the stage plays a program.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class SimulatedStage:
         Raises
         ------
         ConfigError
-            When the programme cannot be built at the stage's sampling rate.
+            When the program cannot be built at the stage's sampling rate.
         ModelError
             When stage and sequence differ in sampling rate.
 
@@ -200,7 +200,7 @@ class SimulatedStage:
         model = self.model
         sequence = program.build(model.sample_rate) if isinstance(program, Program) else program
         run = self.run(np.random.default_rng(self.seed) if rng is None else rng)
-        # one piece without measurement yet, so that the model's own check and clock are used
+        # a piece without measurement checks the rate and gives the time
         piece = _piece(sequence, np.zeros(sequence.n))
         model.check_rate(piece)
         t, y = piece.t, np.empty(sequence.n)
@@ -220,8 +220,7 @@ class StageRun:
     """
     One run of a simulated stage, block by block, in volts and metres.
 
-    The first command is taken as the one under which the stage was at rest.  The result does not
-    depend on how the stream is cut.
+    The stage is at rest under the first command.
 
     Attributes
     ----------
@@ -237,7 +236,7 @@ class StageRun:
         self._stream = stage.model.stream()
 
     def applied(self, v: ArrayLike) -> NDArray[np.float64]:
-        """Return what the DAC makes of a command [V], shape (n,)."""
+        """Return the output of the DAC for a command [V], shape (n,)."""
         command, dac = np.asarray(v, dtype=np.float64), self.stage.sensor.dac
         return command if dac is None else dac.quantise(command)
 
@@ -248,7 +247,7 @@ class StageRun:
         channels: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> NDArray[np.float64]:
         """
-        Return the sensor's readings [m] for the next stretch of command [V].
+        Return the sensor's readings [m] for the next samples of command [V].
 
         Parameters
         ----------
@@ -257,7 +256,7 @@ class StageRun:
         t : array_like, shape (n,), optional
             Time [s]; counted from the first sample when absent.
         channels : mapping of str to ndarray, optional
-            Further signals that effects of the model look at.
+            Further signals that effects of the model depend on.
         """
         sensor = self.stage.sensor
         command = np.asarray(v, dtype=np.float64)

@@ -5,7 +5,7 @@
 StageModel: the chain of operators with its scaling, and what it predicts.
 
     v --> [input] --> [ H ] --> [hidden] --> [ G ] --> [z^-d] --> [output] --> [acquisition] --> y
-                  effects in their slots stand where their names say
+          [input], [hidden], [output] and [acquisition] hold effects; those of H wrap it
 
 A model is frozen.  `StageModel.stream` makes a `Stream`, which carries the state of one run;
 `StageModel.simulate` is a stream over a whole signal, so both give the same numbers.
@@ -150,7 +150,7 @@ class StageModel:
         return trivial and self.delay.total == 0.0 and not self.effects
 
     def without_dynamics(self) -> StageModel:
-        """Return the hysteresis alone: G replaced by its static gain, no delay, no effects."""
+        """Return the hysteresis alone, times the static gain of G; no delay, no effects."""
         gain = self.dynamics.gain
         static = Dynamics(a=np.empty(0), b=np.array([gain]))
         return replace(self, dynamics=static, delay=Delay(0), effects=())
@@ -181,7 +181,7 @@ class StageModel:
         )
 
     def effects_in(self, slot: Slot) -> list[EffectSetting]:
-        """Return the effects that are operators of a slot; a change of the delay is none."""
+        """Return the effects that are operators in a slot; a change of the delay is not."""
         return [
             s for s in self.effects if s.slot == slot and not find_effect(s.name).in_delay_line
         ]
@@ -199,12 +199,12 @@ class StageModel:
     @property
     def total_delay(self) -> Delay:
         """
-        The delay line of the chain: the identified delay, and what effects change of it.
+        The identified delay and its change by effects.
 
         Raises
         ------
         ModelError
-            When that is less than none.
+            When the sum is negative.
         """
         added = sum(find_effect(s.name).added_delay(s.parameters) for s in self.effects)
         if added == 0.0:
@@ -213,7 +213,7 @@ class StageModel:
         if total < 0.0:
             raise ModelError(
                 f'model: a delay of {self.delay.total:g} samples cannot change by {added:g}; '
-                'no stage answers before its command'
+                'the sum must not be negative'
             )
         whole = int(total)
         return Delay(whole, total - whole)
@@ -326,7 +326,7 @@ class StageModel:
 
     def check_rate(self, piece: Piece) -> None:
         """
-        Refuse a piece whose sampling rate is not the model's.
+        Refuse a piece with another sampling rate than the model.
 
         Raises
         ------

@@ -29,8 +29,7 @@ class Stream:
     """
     One run of a model, block by block, in volts and metres.
 
-    The first sample after `reset`, or after construction, is taken as the command under which the
-    stage was at rest.
+    The stage is at rest under the first sample after construction or `reset`.
     """
 
     def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
@@ -52,7 +51,7 @@ class Stream:
         return float(self.model.scaling.y(self._chain.reset(u0, u0)))
 
     def follow(self, piece: Piece) -> NDArray[np.float64]:
-        """Return the displacement [m] for the next samples, which are a piece or a part of one."""
+        """Return the displacement [m] for the next samples, a piece or a part of one."""
         y = np.empty(piece.n)
         for start in range(0, piece.n, CHUNK):
             cut = slice(start, start + CHUNK)
@@ -64,7 +63,7 @@ class Stream:
         return y
 
     def bridge(self, one: Piece, other: Piece) -> None:
-        """Pass the gap between two pieces of one clock along a straight line."""
+        """Cross the gap between two pieces of one clock on a straight line of voltage."""
         missing = round((other.start_time - one.start_time) * one.sample_rate) - one.n
         if missing <= 0:
             return
@@ -79,7 +78,7 @@ class Stream:
 
     def recall(self, v: NDArray[np.float64], t: NDArray[np.float64]) -> None:
         """
-        Bring amplifier and plays where a past voltage leaves them; what follows them is at rest.
+        Bring amplifier and plays into their state after a past voltage; the rest is at rest.
 
         Parameters
         ----------
@@ -107,7 +106,7 @@ class Stream:
         channels: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> NDArray[np.float64]:
         """
-        Return the displacement [m] for the next stretch of voltage [V].
+        Return the displacement [m] for the next samples of voltage [V].
 
         Parameters
         ----------

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The frozen block that travels along the chain, and what every operator promises.
+The block of samples that passes the chain, and the operators of the chain.
 
     v --> [input] --> [hysteresis] --> [hidden] --> [G, z^-d] --> [output] --> [acquisition] --> y
 
@@ -22,21 +22,21 @@ __all__ = ['SLOTS', 'Block', 'Chain', 'Operator', 'Slot']
 
 Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 
-#: the places of a chain into which an effect goes, in the order of the signal
+#: the slots of a chain for effects, in the order of the signal
 SLOTS: tuple[Slot, ...] = ('input', 'hysteresis', 'hidden', 'output', 'acquisition')
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
     """
-    A stretch of the stream.
+    The next samples of a stream.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
         Time [s].
     v : ndarray, shape (n,)
-        Command, normalised; every operator may look at it, wherever it sits.
+        Command, normalised; operators in any slot may use it.
     x : ndarray, shape (n,)
         The signal on its way through the chain, normalised.
     channels : mapping of str to ndarray, shape (n,)
@@ -51,13 +51,13 @@ class Block:
     def with_signal(self, x: NDArray[np.float64]) -> Block:
         """Return the block with another signal."""
         block = object.__new__(Block)
-        # as replace() has it, but without its way through the fields: short blocks feel that
+        # replace() is slow for short blocks
         block.__dict__.update(self.__dict__, x=x)
         return block
 
 
 class Operator(Protocol):
-    """One link of a chain; it keeps its own state between blocks."""
+    """One element of a chain; it keeps its state between blocks."""
 
     def reset(self, v0: float, x0: float) -> float:
         """
@@ -76,18 +76,18 @@ class Operator(Protocol):
         ...
 
     def process(self, block: Block) -> Block:
-        """Return the block with this operator applied; the result never depends on the cutting."""
+        """Return the block after this operator; how a stream is cut must not matter."""
         ...
 
 
 class Chain:
-    """Operators one after the other, themselves an operator."""
+    """Operators in series, as one operator."""
 
     def __init__(self, operators: tuple[Operator, ...]) -> None:
         self.operators = operators
 
     def reset(self, v0: float, x0: float) -> float:
-        """Bring every operator to rest, each under the rest value of the one before."""
+        """Bring every operator to rest, and return the last one's output."""
         for operator in self.operators:
             x0 = operator.reset(v0, x0)
         return x0

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-G and z^-d: the linear dynamics and the pure delay, each as parameters and as a streaming operator.
+G and z^-d: the linear dynamics and the pure delay, as parameters and as operators.
 
     y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j w(k-d-j+1)                    (eqs. 4-5)
 
@@ -25,7 +25,7 @@ __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx
 
 #: longest pure delay that a model may have [samples]
 MAX_DELAY = 1_000_000
-#: longest memory that is told of dynamics [samples]: more than any record has
+#: upper limit of `Dynamics.memory` [samples], longer than any record
 MAX_MEMORY = 2**40
 
 
@@ -85,7 +85,7 @@ class Dynamics:
         return _is_stable(self.a)
 
     def memory(self, share: float) -> int:
-        """Return after how many samples its slowest pole has fallen to a share of its start."""
+        """Return the samples in which the slowest pole decays to a share of its start."""
         radius = self.radius
         if radius >= 1.0:
             return MAX_MEMORY
@@ -109,7 +109,7 @@ class Dynamics:
 
     def without_slow_poles(self, slowest: float, sample_rate: float) -> Dynamics:
         """
-        Return the dynamics freed of real poles below a frequency, each with the zero next to it.
+        Return the dynamics without real poles below a frequency and their nearest zeros.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class Dynamics:
         Returns
         -------
         Dynamics
-            With the same gain at ten times that frequency; itself when no pole is that slow.
+            With the same gain at ten times that frequency; unchanged without such poles.
         """
         radius = np.exp(-2.0 * np.pi * slowest / sample_rate)
         poles, zeros = self.poles, np.roots(self.b)
@@ -161,12 +161,12 @@ class Dynamics:
 
     def modes(self, sample_rate: float) -> list[tuple[float, float]]:
         """Return (natural frequency [Hz], damping ratio) of each oscillating pole pair."""
-        found = []
+        modes = []
         for pole in self.poles:
             if pole.imag > 0.0 and abs(pole) > 0.0:
                 s = np.log(pole) * sample_rate
-                found.append((float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))))
-        return sorted(found)
+                modes.append((float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))))
+        return sorted(modes)
 
 
 def filter_arx(
@@ -201,8 +201,8 @@ def filter_arx(
 
 @kernel
 def _is_stable(a: NDArray[np.float64]) -> bool:
-    # Schur and Cohn: A has all roots within the circle if, and only if, its last coefficient is
-    # smaller than one and the same is true of the polynomial that is one shorter
+    # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the last
+    # coefficient is below one in magnitude and the polynomial of one order less passes too
     a = a.copy()
     for n in range(a.size, 0, -1):
         last = a[n - 1]
@@ -222,7 +222,7 @@ def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:
 
 class DynamicsOperator:
     """
-    G as a link of the chain.
+    G as an operator.
 
     Attributes
     ----------
@@ -294,7 +294,7 @@ class Delay:
 
 
 class DelayOperator:
-    """z^-d as a link of the chain, with its buffer."""
+    """z^-d as an operator."""
 
     def __init__(self, delay: Delay) -> None:
         self.delay = delay

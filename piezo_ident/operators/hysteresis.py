@@ -99,8 +99,8 @@ class Hysteresis:
         """
         Return the small-signal gain dw/dv around a settled bias.
 
-        Plays wider than the excursion stand still; those narrower are dragged along for the part
-        of the excursion that exceeds them.
+        Plays wider than the excursion stand still; narrower ones move by the part of the
+        excursion that exceeds their width.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Hysteresis:
 
 
 class HysteresisOperator:
-    """H as a link of the chain, with its memory."""
+    """H as an operator, with its memory."""
 
     def __init__(self, hysteresis: Hysteresis, memory: ArrayLike | None = None) -> None:
         self.hysteresis = hysteresis
