@@ -113,16 +113,17 @@ def _wanted(name: str) -> bool:
 
 
 def _check_names(names: Iterable[str], path: Path) -> None:
-    found = list(names)
-    twice = sorted(c for c, n in Counter(found).items() if c and n > 1)
+    # a mapping would be taken for counts
+    counts = Counter(iter(names))
+    twice = sorted(c for c, n in counts.items() if c and n > 1)
     if twice:
         raise DataError(
             f'{path}: column {", ".join(twice)[:200]} stands there twice; keep one of them'
         )
-    missing = [c for c in _REQUIRED if c not in found]
+    missing = [c for c in _REQUIRED if c not in counts]
     if missing:
         raise DataError(
-            f'{path}: {", ".join(missing)} missing (found: {", ".join(found)[:200] or "nothing"})'
+            f'{path}: {", ".join(missing)} missing (found: {", ".join(counts)[:200] or "nothing"})'
             '; name the columns t [s], v [V] and y'
         )
 
@@ -216,13 +217,9 @@ def _header(reader: Any, path: Path) -> list[str]:
         if len(header) == 1 and separator in header[0]:
             raise DataError(f'{path}: separated by {name}; save it with commas and decimal points')
     if not set(_REQUIRED).intersection(header) and _is_number(header[0]):
-        further = header[len(_REQUIRED) :]
-        # the only text that a row of ours has
-        names = ['segment'] if further and not _is_number(further[0]) else []
-        more = ', with a name for each further column,' if len(further) > len(names) else ''
         raise DataError(
-            f"{path}: no header line; put '{','.join([*_REQUIRED, *names])}'{more} on top of the "
-            'numbers'
+            f"{path}: no header line; put 't,v,y', and a name for each further column, on top of "
+            'the numbers'
         )
     _check_names(header, path)
     return header

@@ -20,7 +20,6 @@ from piezo_ident.common.files import parse_yaml
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load, model_from_dict
 from piezo_ident.model.simulated_stage import stage_from_dict
-from piezo_ident.record.blocks import decode, Dimension
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 import scipy.io
@@ -153,7 +152,7 @@ def test_other_variables_of_a_workspace_are_left_alone(tmp_path, packed):
     refused(lambda: pi.read(path), 'v holds', kind=DataError)
 
 
-# --- programs, models, blocks ---------------------------------------------------------------
+# --- programs and models --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -181,11 +180,6 @@ def test_models_that_ask_for_too_much():
     ):
         refused(lambda k=key, v=value: model_from_dict({**data, k: v}), kind=ModelError)
     refused(lambda: stage_from_dict({**data, 'sensor': {'noise_rms': 10**400}}))
-
-
-def test_a_block_with_negative_sizes():
-    dims = (Dimension('sample:', -1, -2), Dimension('t,voltage', 2, 2))
-    refused(lambda: decode(np.zeros(4), dims, 6), kind=DataError)
 
 
 def test_no_pickle_and_no_unsafe_yaml_in_what_reads_files():

@@ -28,6 +28,7 @@ def test_layout_of_a_block():
         ((Dimension('sample:', 3, 6), Dimension('t,voltage', 2, 2)), 'announces 3 x 2'),
         ((Dimension('sample:', 2, 4), Dimension('t,voltage', 3, 3)), 'layout 2 x 3'),
         ((Dimension('sample:', 2, 2), Dimension('t,voltage', 2, 2)), 'strides 2, 2'),
+        ((Dimension('sample:', -1, -2), Dimension('t,voltage', 2, 2)), 'layout|announces'),
         ((Dimension('row', 2, 4), Dimension('t,voltage', 2, 2)), "first dimension is 'row'"),
     ],
 )

@@ -95,13 +95,6 @@ class BagWriter:
     ------
     DataError
         When a bag cannot be made.
-
-    Examples
-    --------
-    >>> writer = BagWriter('recording')  # doctest: +SKIP
-    >>> writer.add_topic('/voltage', 'std_msgs/msg/Float64MultiArray')  # doctest: +SKIP
-    >>> writer.write('/voltage', time.time_ns(), raw)  # doctest: +SKIP
-    >>> writer.close()  # doctest: +SKIP
     """
 
     def __init__(
@@ -146,9 +139,8 @@ class BagWriter:
             self._connect(topic)
 
     def _opened(self) -> Writer:
-        path = self._path
-        # a week has more parts than names are tried
-        begin = self._number + 1 if self.parts else 0
+        path, begin = self._path, self._number + 1 if self.parts else 0
+        # from the last one on: a week has more parts than names are tried
         for number in range(begin, begin + NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
             try:
@@ -174,8 +166,7 @@ class BagWriter:
     @property
     def file(self) -> Path:
         """The file that is being written."""
-        file: Path = self._inside.path
-        return file
+        return Path(self._inside.path)
 
     @property
     def size(self) -> int:

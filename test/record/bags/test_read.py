@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from bag_data import blocks, write
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.capture import Capture
 from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
@@ -17,6 +18,7 @@ from piezo_ident.record.join import join
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.record.stream import Stream
 import pytest
+from rosbags.rosbag2 import storage_mcap
 import yaml
 
 pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
@@ -278,6 +280,23 @@ def test_corrupt_layout_names_topic_and_message(tmp_path):
         read_bag(
             write(tmp_path / 'bag2', interleave(blocks()), lambda i, data, dims: (data, dims[:1]))
         )
+
+
+def test_a_healthy_bag_is_unpacked_once(tmp_path, monkeypatch):
+    pi.write(record(100_000), tmp_path / 'bag')
+    with (tmp_path / 'bag' / 'bag.mcap').open('rb') as file:
+        chunks = make_reader(file).get_summary().statistics.chunk_count
+    unpacked = []
+    decompress = storage_mcap.decompress
+
+    def counted(*arguments):
+        unpacked.append(1)
+        return decompress(*arguments)
+
+    monkeypatch.setattr(storage_mcap, 'decompress', counted)
+    assert pi.read(tmp_path / 'bag').n == 100_000
+    # the first chunk once more for each topic, to learn what it carries
+    assert chunks > 3 and len(unpacked) <= chunks + 3
 
 
 def test_bag_without_samples(tmp_path):
