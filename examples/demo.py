@@ -338,6 +338,9 @@ def _residual(model: pi.StageModel, record: pi.Record) -> Residual:
     return Residual(t, run.measured - run.predicted, record.stroke)
 
 
+#: below the residual of the running graph
+NOTE = """The slow rest is creep that earlier motions have left, which the model cannot know: it
+starts anew with each stream."""
 PAGE = """\
 <!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>piezo_ident: the demo</title>
@@ -359,7 +362,8 @@ pre {{ background: #f5f5f5; padding: .7rem; overflow-x: auto; font-size: .85rem;
 <p class="verdict">{sentence}</p>
 <table><tr><th></th><th>before</th><th>after</th></tr>{rows}</table>
 <figure><img src="residual.png" alt="residual before and after">
-<figcaption>What the model misses of the same motions, before and after the diagnosis.</figcaption>
+<figcaption>What the model misses of the same motions, before and after the diagnosis.
+{note}</figcaption>
 </figure>
 <h2>Read on</h2>
 <ul>
@@ -379,7 +383,9 @@ effects that were added</li>
 """
 
 
-def write_page(out: Path, before: Residual, after: Residual, how: str, progress: Progress) -> Path:
+def write_page(
+    out: Path, before: Residual, after: Residual, live: bool, progress: Progress
+) -> Path:
     """Write the page that leads to the rest, and return its path."""
     reports = out / 'reports'
     diagnosis = json.loads((reports / 'diagnosis' / 'diagnosis.json').read_text('utf-8'))
@@ -395,11 +401,13 @@ def write_page(out: Path, before: Residual, after: Residual, how: str, progress:
     page = out / 'index.html'
     text = PAGE.format(
         intro=escape(
-            f'The simulated stage creeps, and its hysteresis depends on the rate. {how} The model '
+            f'The simulated stage creeps, and its hysteresis depends on the rate. '
+            f'It {"ran as four processes over DDS at 20 kHz" if live else "was simulated"}. The model '
             'that is identified from voltage and displacement knows neither effect; the diagnosis '
             'finds what it lacks.'
         ),
         sentence=escape(diagnosis['sentence']),
+        note=NOTE if live else '',
         rows=''.join(
             f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td>{escape(c)}</td></tr>'
             for a, b, c in rows
@@ -442,12 +450,10 @@ def main() -> int:
         if WITHOUT_NODES:
             progress.say(WITHOUT_NODES)
             before, after = offline(out, progress)
-            how = 'It was simulated offline.'
         else:
             before, after = live(out, progress)
-            how = 'It ran as a graph of four processes over DDS, sampled at 20 kHz.'
         draw(out / 'residual.png', before, after)
-        page = write_page(out, before, after, how, progress)
+        page = write_page(out, before, after, not WITHOUT_NODES, progress)
     except pi.PiezoIdentError as error:
         progress.close()
         sys.stderr.write(f'demo: {error}\n')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verbs, thin over the library."""
+"""``simulate`` and ``convert``, and where the other verbs are."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.cli.common import check_record_output, read, say_faults, story
-from piezo_ident.cli.console import Console
+from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.effects_command import effects_command
-from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.cli.model_commands import identify_command, predict_command
-from piezo_ident.cli.outputs import check_apart, check_link
+from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
+from piezo_ident.cli.records import data_of, print_faults, read_all, RECORD_FILES
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program
@@ -25,22 +24,22 @@ from piezo_ident.record import io as record_io
 __all__ = ['run']
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """
-    Do what the arguments ask, and return the exit code.
+    Do what the arguments ask for.
 
     Raises
     ------
     PiezoIdentError
         With a message that names the file and the cure.
     """
-    return COMMANDS[args.verb](args, Console(getattr(args, 'json', False))) or 0
+    COMMANDS[args.verb](args, Console(args.json))
 
 
 def simulate_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident simulate``."""
     out: Path = args.out
-    check_record_output(args)
+    _check_record_output(args)
     files = {}
     for kind, name in (('stage', args.config), ('program', args.program)):
         check_link(Path(name))
@@ -59,7 +58,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
     record = stage.play(sequence, np.random.default_rng(seed), name=out.name)
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
-    with interrupts.waiting():
+    with deferred_interrupts():
         losses = record_io.write(
             record,
             out,
@@ -68,30 +67,30 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
             custom_data=data if is_bag else None,
         )
     console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, seed {seed}')
-    if not console.as_json:
-        console.say(sequence.describe())
-    say_faults(record, losses, console)
+    console.say(sequence.describe())
+    print_faults(record, losses, console)
     warnings = stage.model.extrapolation(record)
     for warning in warnings:
         console.say(f'warning: {warning}')
     console.result(
-        {**data, 'seed': seed, 'out': str(out), **story(record, losses), 'warnings': warnings}
+        {**data, 'seed': seed, 'out': str(out), **data_of(record, losses), 'warnings': warnings}
     )
 
 
 def convert_command(args: argparse.Namespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_apart(args.out, args.record)
-    check_record_output(args)
-    record = read(args.record, args)
-    with interrupts.waiting():
+    _check_record_output(args)
+    # of an unfinished bag, what is whole
+    (record,) = read_all([args.record], args, recover=True)
+    with deferred_interrupts():
         losses = record_io.write(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
         f'{record.duration:.6g} s'
     )
-    say_faults(record, losses, console)
-    console.result({'in': str(args.record), 'out': str(args.out), **story(record, losses)})
+    print_faults(record, losses, console)
+    console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
 def diagnose_command(args: argparse.Namespace, console: Console) -> None:
@@ -101,7 +100,12 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     command(args, console)
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], int | None]] = {
+def _check_record_output(args: argparse.Namespace) -> None:
+    check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
+    check_file(args.out, overwrite=args.overwrite, folder_too=True)
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], None]] = {
     'convert': convert_command,
     'diagnose': diagnose_command,
     'effects': effects_command,

@@ -1,23 +1,53 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the commands say: text or JSON on standard output, progress on a terminal."""
+"""Text or JSON on standard output, progress on a terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
 import math
 import shutil
+import signal
 import sys
 from typing import Any
 
-from piezo_ident.cli.interrupts import interrupts
 from piezo_ident.identification.results import Progress
 from piezo_ident.model.files import plain
 
-__all__ = ['Console']
+__all__ = ['Console', 'deferred_interrupts']
+
+
+@contextmanager
+def deferred_interrupts() -> Iterator[Callable[..., None]]:
+    """
+    Have Ctrl-C wait until all outputs of a command are whole.
+
+    Yields
+    ------
+    callable
+        Takes whatever it is called with, and raises KeyboardInterrupt when one is waiting; for
+        long work before the first output is in its place.
+    """
+    waiting: list[int] = []
+
+    def check(*_: object) -> None:
+        if waiting:
+            raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
+    except ValueError:
+        # only the main thread is interrupted
+        yield check
+        return
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+    check()
 
 
 class Console:
@@ -37,8 +67,6 @@ class Console:
         """Write lines for people; nothing in JSON."""
         if not self.as_json:
             sys.stdout.write(f'{_harmless(text)}\n')
-            # whoever looks on through a pipe should see it when it is said
-            sys.stdout.flush()
 
     def note(self, text: str) -> None:
         """Write a line that belongs to no result."""
@@ -54,7 +82,7 @@ class Console:
     def progress(self) -> Iterator[Progress]:
         """Yield what shows the progress: one bar a step on a terminal, nothing elsewhere."""
         if not sys.stderr.isatty():
-            yield lambda step, share: interrupts.check()
+            yield lambda step, share: None
             return
         from tqdm import tqdm
 
@@ -62,7 +90,6 @@ class Console:
         bars: dict[str, Any] = {}
 
         def show(step: str, share: float) -> None:
-            interrupts.check()
             if step not in bars:
                 for bar in bars.values():
                     bar.close()

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.cli.common import check_bag_options, expand, options_of
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.records import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.diagnosis.results import DiagnosisSettings

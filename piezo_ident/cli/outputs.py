@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Places for results are tried before the long work begins, not after it."""
+"""Checks of output paths, which come before the long work."""
 
 from __future__ import annotations
 

@@ -35,6 +35,7 @@ __all__ = [
     'SineError',
     'free_run',
     'piece_runs',
+    'predict',
     'run_pieces',
     'sine_errors',
     'sine_frequency',
@@ -201,6 +202,34 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
         errors_after_start=_errors(record, predicted, starts) if has_more else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
+
+
+def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...]:
+    """
+    Return the displacement that the voltage of a record causes, whatever was measured.
+
+    Parameters
+    ----------
+    model : StageModel
+    record : Record
+        Its displacement is not used; the stage is at rest under the first sample.
+
+    Returns
+    -------
+    tuple of ndarray
+        One array a piece [m].
+
+    Raises
+    ------
+    ModelError
+        When a piece has another sampling rate than the model, or the prediction overflows.
+    """
+    for piece in record:
+        model.check_rate(piece)
+    pieces = [y for part in connected_pieces(record) for y in run_pieces(model, part, None)]
+    if not all(np.isfinite(y_hat).all() for y_hat in pieces):
+        raise ModelError(f'{record.name}: {DIVERGES}')
+    return tuple(pieces)
 
 
 def run_pieces(

