@@ -401,10 +401,10 @@ def write_page(
     page = out / 'index.html'
     text = PAGE.format(
         intro=escape(
-            f'The simulated stage creeps, and its hysteresis depends on the rate. '
-            f'It {"ran as four processes over DDS at 20 kHz" if live else "was simulated"}. The model '
-            'that is identified from voltage and displacement knows neither effect; the diagnosis '
-            'finds what it lacks.'
+            'The simulated stage creeps, and its hysteresis depends on the rate; the graph '
+            f'{"ran as four processes over DDS at 20 kHz" if live else "was not needed"}. The '
+            'model that is identified from voltage and displacement knows neither effect; the '
+            'diagnosis finds what it lacks.'
         ),
         sentence=escape(diagnosis['sentence']),
         note=NOTE if live else '',
