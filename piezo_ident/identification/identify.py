@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import noise_floor, prepare, Run
+from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     errors_of,
     Fitted,
     Identification,
+    key_of,
+    Memories,
     Progress,
     Settings,
     silent,
@@ -42,10 +44,13 @@ from piezo_ident.identification.three_steps import (
 )
 from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warnings_of
+from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.stage_model import Scaling
+from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record
+from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
+from piezo_ident.residual.stretches import ResidualPart, stretches_of
 import scipy
 
 __all__ = ['find_delay', 'find_dynamics', 'find_hysteresis', 'identify']
@@ -115,7 +120,7 @@ def _identify(
     else:
         fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
     model, stroke = fit.model, abs(scaling.Y)
-    floor, source = noise_floor(data.pieces)
+    floor = _noise_floor(model, runs, fit.memories)
     result = Identification(
         model=model,
         delay=fit.delay,
@@ -125,8 +130,8 @@ def _identify(
             *errors_of(model, runs, fit.masks, fit.memories),
             *validation_errors(model, validation),
         ),
-        noise_floor=None if floor is None else 100.0 * floor / stroke,
-        noise_source=source,
+        noise_floor=None if floor.rms is None else 100.0 * floor.rms / stroke,
+        noise_source=floor.source,
         stroke=stroke,
         warnings=(*data.warnings, *fit.warnings),
         not_identified=tuple(fit.not_identified),
@@ -138,6 +143,19 @@ def _identify(
     result = replace(result, warnings=warnings)
     provenance = _provenance(result, [record.name for record in records])
     return replace(result, model=replace(model, identification=provenance))
+
+
+def _noise_floor(model: StageModel, runs: Sequence[Run], memories: Memories) -> NoiseFloor:
+    parts = []
+    for run in runs:
+        memory = memories.get(key_of(run))
+        if memory is None:
+            memory = start_memory(model, run.piece)
+        e = run.piece.y - model.predict_piece(run.piece, memory)
+        parts.append(ResidualPart(run.record, run.piece, e, run.use))
+    return residual_noise_floor(
+        parts, [s for i, p in enumerate(parts) for s in stretches_of(p, i)]
+    )
 
 
 def _labelled(

@@ -26,7 +26,6 @@ __all__ = [
     'Run',
     'common_rate',
     'drive_creep',
-    'noise_floor',
     'prepare',
     'refuse_closed_loop',
     'refuse_undriven',
@@ -313,37 +312,6 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
                 Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)
             )
     return runs
-
-
-def noise_floor(pieces: Sequence[Piece]) -> tuple[float | None, str]:
-    """
-    Return the rms of the sensor noise [m] and where it was read.
-
-    Stretches of constant voltage of at least 50 ms and 200 samples count, after half of each has
-    passed; a line is taken out of each.  The quietest quarter of that time is taken: the rest may
-    still ring or creep.
-    """
-    found: list[tuple[float, int]] = []
-    for piece in pieces:
-        moves = np.concatenate([[True], piece.v[1:] != piece.v[:-1], [True]])
-        # a stretch begins with the last sample that moves, and ends before the next one that does
-        begins = np.flatnonzero(moves[:-1] & ~moves[1:])
-        ends = np.flatnonzero(~moves[:-1] & moves[1:]) + 1
-        for begin, end in zip(begins, ends, strict=True):
-            middle = (begin + end) // 2
-            if end - middle < max(100, 0.025 * piece.sample_rate):
-                continue
-            y = piece.y[middle:end]
-            k = np.arange(y.size)
-            rest = y - np.polynomial.Polynomial.fit(k, y, 1)(k)
-            found.append((float(rest @ rest) / (y.size - 2), y.size))
-    if not found:
-        return None, 'unknown: the voltage never rests'
-    found.sort()
-    variance, n = np.array([v for v, _ in found]), np.array([n for _, n in found])
-    quiet = np.cumsum(n) - n < 0.25 * n.sum()
-    floor = float(np.sqrt(np.average(variance[quiet], weights=n[quiet])))
-    return floor, 'the quietest stretches of constant voltage'
 
 
 def refuse_undriven(records: Sequence[Record]) -> None:

@@ -80,7 +80,7 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     if change > HARDLY:
         return []
     return [
-        f'the noise drives the stage up to {dynamics.band:.3g} Hz, where G is within '
+        f'the voltage drives the stage up to {dynamics.band:.3g} Hz, where G is within '
         f'{100 * change:.2g} % of its static gain: what it does beyond is not known; record noise '
         'up to higher frequencies'
     ]

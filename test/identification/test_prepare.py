@@ -13,7 +13,6 @@ from piezo_ident.identification.prepare import (
     common_rate,
     drive_creep,
     END_HELD,
-    noise_floor,
     refuse_closed_loop,
     runs_of,
     scaling_of,
@@ -132,26 +131,6 @@ def test_start_is_known_only_at_the_lowest_voltage():
     known = run_of(v).known
     assert not known[:1400].any()
     assert known[1500:].all()
-
-
-def test_floor_is_that_of_the_rests():
-    rng = np.random.default_rng(0)
-    v = np.concatenate([np.zeros(2000), RAMP, np.full(2000, 10.0)])
-    y = 7.5e-6 * v + 3e-9 * rng.standard_normal(v.size)
-    floor, source = noise_floor([piece(v, y)])
-    assert floor == pytest.approx(3e-9, rel=0.06)
-    assert 'constant voltage' in source
-    drifting = y + 1e-6 * np.arange(v.size) / v.size
-    assert noise_floor([piece(v, drifting)])[0] == pytest.approx(3e-9, rel=0.06)
-
-
-def test_no_rest_no_floor():
-    floor, source = noise_floor([piece(RAMP)])
-    assert floor is None
-    assert 'unknown' in source
-    # a measured voltage never rests exactly
-    noisy = 1e-4 * np.random.default_rng(0).standard_normal(5000)
-    assert noise_floor([piece(noisy)])[0] is None
 
 
 def hold(drift, follow):
