@@ -237,7 +237,14 @@ def prepare(records: Sequence[Record]) -> Prepared:
 
 
 def same_rate(one: float, other: float) -> bool:
-    """Return whether two sampling rates differ by no more than rounding (1e-6)."""
+    """
+    Return whether two sampling rates differ by no more than rounding (1e-6).
+
+    Examples
+    --------
+    >>> same_rate(1000.0, 1000.0001), same_rate(1000.0, 1000.1)
+    (True, False)
+    """
     return abs(one / other - 1.0) < 1e-6
 
 

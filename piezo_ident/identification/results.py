@@ -86,6 +86,12 @@ class Settings:
     ------
     ConfigError
         When a value is out of range.
+
+    Examples
+    --------
+    The paper's way:
+
+    >>> paper = Settings(thresholds=10, solver='swarm')
     """
 
     thresholds: int | None = None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.record import Piece
 
-__all__ = ['StepDelay', 'average_step', 'delay_from_loss', 'delay_from_steps', 'find_jumps']
+__all__ = ['StepDelay', 'delay_from_loss', 'delay_from_steps', 'find_jumps', 'step_responses']
 
 #: the average response counts as risen at this many standard deviations of its noise
 THRESHOLD = 5.0
@@ -73,6 +73,11 @@ def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.in
     -------
     ndarray of int
         Index of the first sample after each jump.
+
+    Examples
+    --------
+    >>> find_jumps(np.repeat([0.0, 1.0, 0.0], 50), before=20, after=20)
+    array([ 50, 100])
     """
     dv = np.abs(np.diff(v))
     if dv.size == 0 or dv.max() == 0.0:
@@ -87,22 +92,7 @@ def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.in
     return np.asarray(large[quiet], dtype=np.int64)
 
 
-def _responses(
-    pieces: Sequence[Piece], before: int, after: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rows, heights = [], []
-    for piece in pieces:
-        for k in find_jumps(piece.v, before, after):
-            height = piece.v[k] - piece.v[k - 1]
-            y = piece.y[k - before : k + after]
-            # the stage may still be settling; what it did before the step goes on under it
-            line = np.polynomial.Polynomial.fit(np.arange(before), y[:before], 1)
-            rows.append((y - line(np.arange(before + after))) / height)
-            heights.append(abs(height))
-    return np.array(rows).reshape(-1, before + after), np.array(heights)
-
-
-def average_step(
+def step_responses(
     pieces: Sequence[Piece], before: int = 100, after: int = 60
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """
@@ -119,7 +109,16 @@ def average_step(
     responses : ndarray, shape (repeats, before + after)
     heights : ndarray, shape (repeats,)
     """
-    return _responses(pieces, before, after)
+    rows, heights = [], []
+    for piece in pieces:
+        for k in find_jumps(piece.v, before, after):
+            height = piece.v[k] - piece.v[k - 1]
+            y = piece.y[k - before : k + after]
+            # the stage may still be settling; what it did before the step goes on under it
+            line = np.polynomial.Polynomial.fit(np.arange(before), y[:before], 1)
+            rows.append((y - line(np.arange(before + after))) / height)
+            heights.append(abs(height))
+    return np.array(rows).reshape(-1, before + after), np.array(heights)
 
 
 def _first_rise(
@@ -150,8 +149,14 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     -------
     StepDelay
         With ``samples=None`` when there is no step, or none that rises above the noise.
+
+    Examples
+    --------
+    >>> v = np.repeat([0.0, 1.0], 200)
+    >>> delay_from_steps([Piece(v, np.roll(v, 3), 1000.0)]).samples
+    3
     """
-    responses, heights = _responses(pieces, before, after)
+    responses, heights = step_responses(pieces, before, after)
     lag = np.arange(-before, after)
     n = heights.size
     if n == 0:
@@ -200,6 +205,11 @@ def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int |
     -------
     int or None
         None when the loss has not risen at the largest delay tried: then it tells nothing.
+
+    Examples
+    --------
+    >>> delay_from_loss(np.array([1.0, 1.0, 1.01, 3.0, 9.0]))
+    2
     """
     low = np.flatnonzero(loss <= (1.0 + tolerance) * loss.min())
     return int(low[-1]) if low[-1] < loss.size - 1 else None

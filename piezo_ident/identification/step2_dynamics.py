@@ -339,6 +339,12 @@ def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3
         [Hz]
     depth : float, optional
         Share of the largest spectral density that counts as power.
+
+    Examples
+    --------
+    >>> t = np.arange(4096) / 1000.0
+    >>> 95.0 < excited_band(np.sin(2.0 * np.pi * 100.0 * t), 1000.0) < 105.0
+    True
     """
     f, power = signal.welch(u, sample_rate, nperseg=min(u.size, 2048))
     return float(f[np.flatnonzero(power >= depth * power.max())[-1]])

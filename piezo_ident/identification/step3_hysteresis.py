@@ -68,6 +68,11 @@ def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
     ------
     IdentificationError
         When there is no swing.
+
+    Examples
+    --------
+    >>> even_thresholds(1.0, 4)
+    array([0.25, 0.5 , 0.75])
     """
     if not swing > 0.0:
         raise IdentificationError(
@@ -326,6 +331,11 @@ def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
 
     On a grid finer than the truth, least squares puts a weight on the two neighbours of each true
     threshold and zero elsewhere; each such group becomes one threshold at its centre of weight.
+
+    Examples
+    --------
+    >>> merged(Hysteresis([0.1, 0.2, 0.3, 0.4], [0.0, 0.5, 0.5, 0.0], 0.0, 1.0))
+    array([0.25])
     """
     r, q = hysteresis.thresholds, hysteresis.weights
     alive = q > 1e-6 * max(float(q.max(initial=0.0)), 1e-12)

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from paper_stage import A, B
 from piezo_ident.identification.step1_delay import (
-    average_step,
     delay_from_loss,
     delay_from_steps,
     find_jumps,
+    step_responses,
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.record.record import Piece
@@ -60,7 +60,7 @@ def test_response_is_that_of_the_stage_in_metres_a_volt():
     expected = 75e-7 * Delay(3).apply(filter_arx(G.a, G.b, (np.arange(-100, 60) >= 0) * 1.0))
     assert_array_equal(found.lag, np.arange(-100, 60))
     assert np.abs(found.response - expected).max() < 1e-3 * expected.max()
-    responses, heights = average_step([steps(3)])
+    responses, heights = step_responses([steps(3)])
     assert responses.shape == (15, 160)
     assert_array_equal(heights, np.ones(15))
 

@@ -78,6 +78,14 @@ def bounded_least_squares(
     x : ndarray, shape (n,)
     loss : float
         The sum of squares at x.
+
+    Examples
+    --------
+    >>> rows = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 2.0]])
+    >>> R = triangular_factor([rows], 3)
+    >>> x, loss = bounded_least_squares(R, np.zeros(2), np.full(2, np.inf))
+    >>> np.round(x, 6) + 0.0, round(loss, 6)
+    (array([0., 2.]), 1.0)
     """
     A, y = R[:, :-1], R[:, -1]
     scale = np.linalg.norm(A, axis=0)
