@@ -19,7 +19,7 @@ import functools
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import Cancelled, IdentificationError
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import END_HELD, Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
@@ -51,7 +51,6 @@ from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
-from scipy.optimize import OptimizeResult
 
 __all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_excerpts']
 
@@ -106,18 +105,12 @@ def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
     """
-    Find the delay.
+    Find the delay from the steps, or else from the scan of the ARX loss over the noise.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-    settings : Settings
-    progress : callable
-
-    Returns
-    -------
-    DelayResult
-        From the steps when there are any, else from the scan of the ARX loss over the noise.
+    Raises
+    ------
+    IdentificationError
+        When neither tells it.
     """
     progress('delay', 0.0)
     if settings.delay is not None:
@@ -253,21 +246,7 @@ def second_step(
     runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress
 ) -> tuple[DynamicsResult, Dynamics]:
     """
-    Find G, with the hysteresis undone.
-
-    Parameters
-    ----------
-    runs : sequence of Run
-        With noise and triangle segments.
-    delay : Delay
-    settings : Settings
-    progress : callable
-
-    Returns
-    -------
-    result : DynamicsResult
-    dynamics : Dynamics
-        With G(1) = 1, stable.
+    Find G, with the hysteresis undone; the dynamics returned are stable, with G(1) = 1.
 
     Raises
     ------
@@ -390,23 +369,6 @@ def _stretches(
     return fitted, held
 
 
-def _stop_on_request(
-    progress: Progress, total: int
-) -> tuple[Callable[[OptimizeResult], bool], list[Cancelled]]:
-    """Return a swarm callback that reports progress, and where it leaves a request to stop."""
-    request: list[Cancelled] = []
-
-    def callback(intermediate_result: OptimizeResult) -> bool:
-        try:
-            progress('hysteresis', 0.3 + 0.6 * intermediate_result.nit / total)
-        except Cancelled as stop:
-            request.append(stop)
-            return True
-        return False
-
-    return callback, request
-
-
 def third_step(
     fit: Sequence[Excerpt],
     held: Sequence[Excerpt],
@@ -423,17 +385,10 @@ def third_step(
     ----------
     fit, held : sequence of Excerpt
         The same runs in the same order with the fitted and the held-out samples.
-    G, delay
-        What the plays pass before they are seen.
-    settings : Settings
-    progress : callable
+    G, delay, settings, progress
+        As for `second_step`.
     whole : sequence of Excerpt, optional
         What the weights are fitted to in the end; `fit` when absent.
-
-    Raises
-    ------
-    Cancelled
-        When `progress` raises it, the swarm included.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit
@@ -449,7 +404,7 @@ def third_step(
         r = even_thresholds(swing, PAPER_COUNT)
     R = factorise(fitted, r, G, delay)
     progress('hysteresis', 0.3)
-    callback, request = _stop_on_request(progress, settings.swarm_iterations)
+    share = 0.6 / settings.swarm_iterations
     result = fit_hysteresis(
         R,
         r,
@@ -460,10 +415,8 @@ def third_step(
         rng=np.random.default_rng(settings.seed),
         swarm_size=settings.swarm_size,
         maxiter=settings.swarm_iterations,
-        callback=callback,
+        callback=lambda swarm: progress('hysteresis', 0.3 + share * swarm.nit),
     )
-    if request:
-        raise request[0]
     progress('hysteresis', 1.0)
     return result
 
