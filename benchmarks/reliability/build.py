@@ -58,7 +58,8 @@ process of its own, since some damage ends it. No pickle is loaded from a file. 
 safe loader, up to 500,000 characters and as many values; samples may unpack to 8 GiB
 (`piezo_ident/common/files.py`). [SECURITY.md](../SECURITY.md) says what is not kept off.
 
-An effect plug-in is code that somebody installed; it can do what any program can.
+An effect plug-in is code that somebody installed; it can do what any program can. One that cannot
+be imported is skipped with a warning.
 
 ## What a kill leaves behind
 
