@@ -324,12 +324,12 @@ class Capture:
     @property
     def problems(self) -> tuple[str, ...]:
         """What is wrong with the capture so far, one sentence a topic."""
-        said = []
+        problems = []
         for key, clock in self._clocks.items():
             if clock.lost:
-                said.append(f'{clock.lost} samples of {key} are missing')
+                problems.append(f'{clock.lost} samples of {key} are missing')
             if clock.late:
-                said.append(f'{clock.late} samples of {key} came twice or out of turn')
+                problems.append(f'{clock.late} samples of {key} came twice or out of turn')
         for key, (count, reason) in self._unreadable.items():
-            said.append(f'{count} messages on {key} are no blocks ({reason})')
-        return tuple(said)
+            problems.append(f'{count} messages on {key} are no blocks ({reason})')
+        return tuple(problems)

@@ -3,7 +3,7 @@
 
 
 """
-The safety contract of whoever drives the amplifier, judged on the voltage applied.
+The safety contract of the node that drives the amplifier, judged on the voltage applied.
 
 Whatever command comes in - out of range, jumping, not a number, stopping, starting over - the
 voltage that goes out stays within its limits and its slew:

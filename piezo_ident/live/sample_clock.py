@@ -224,7 +224,7 @@ class SampleClock:
     ) -> bool:
         """Return whether a block is another publisher's, or may be."""
         if self.head is None and not self._is_silent:
-            return False  # whoever comes is followed
+            return False  # any publisher is followed
         numbered = sequence is not None and self._sequence is not None
         goes_on = tick == self.head and (not numbered or sequence == (self._sequence or 0) + 1)
         if goes_on and self._is_alone:

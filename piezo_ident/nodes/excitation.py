@@ -50,7 +50,7 @@ LAST_RAMP = 0.7
 CATCH_UP = 50
 #: how long to listen whether somebody else is playing [s]
 LISTEN = 0.5
-#: how long it may take to meet everybody who could be [s]
+#: how long it may take to match all publishers [s]
 MEET = 2.0
 #: how long it takes a new node to know of most others [s]
 YOUTH = 1.0
@@ -90,7 +90,7 @@ class Playing:
 
 
 class _Stopped(Exception):
-    """Somebody asked for the end."""
+    """~/stop was called, or the node ends."""
 
 
 class ExcitationNode(LabNode):
@@ -190,7 +190,7 @@ class ExcitationNode(LabNode):
         return f'ramping to {self.values["rest"]:g} V'
 
     def _other_publishers(self) -> list[str]:
-        """Return who else publishes voltage; a namesake may be one that was killed."""
+        """Return the other publishers of voltage; a namesake may be one that was killed."""
         own = self.get_fully_qualified_name()
         infos = self.get_publishers_info_by_topic(self._voltage.topic_name)
         names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
@@ -242,12 +242,12 @@ class ExcitationNode(LabNode):
                     f'{self._voltage.topic_name}; end it first'
                 )
             # without our own listener
-            found = self._voltage.get_subscription_count() - 1
-            if found >= needed:
+            count = self._voltage.get_subscription_count() - 1
+            if count >= needed:
                 break
             if time.monotonic() - begin > limit + LISTEN:
                 raise ConfigError(
-                    f'{max(0, found)} of {needed} subscribers on {self._voltage.topic_name} after '
+                    f'{max(0, count)} of {needed} subscribers on {self._voltage.topic_name} after '
                     f'{limit:g} s; start the stage, or set subscribers or wait_limit'
                 )
             self._sleep(playing, time.monotonic() + 0.02)

@@ -213,7 +213,7 @@ class LabNode(Node):
                 response.message, response.success = handler(), True
             except PiezoIdentError as error:
                 response.message, response.success = str(error), False
-            # who asks gets an answer, whatever it was
+            # the client gets an answer, whatever failed
             except Exception as error:  # noqa: BLE001
                 _report(self, error)
                 response.message, response.success = f'failed: {error!r}', False

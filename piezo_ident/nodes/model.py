@@ -47,8 +47,8 @@ class ModelNode(LabNode):
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
-        self._source, self._turned_down, self._unreadable = '', '', 0
-        self._troubles: dict[str, float] = {}
+        self._source, self._refusal, self._unreadable = '', '', 0
+        self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
         self._models = 0
@@ -71,7 +71,7 @@ class ModelNode(LabNode):
         for topic, take in (('voltage', self._voltage), ('displacement', self._displacement)):
             on_message = functools.partial(self._on_block, topic, take)
             self.create_subscription(Float64MultiArray, topic, on_message, STREAM)
-        self._tell()
+        self._report_state()
 
     # models
 
@@ -122,7 +122,7 @@ class ModelNode(LabNode):
                 self._refuse_model(source)
             else:
                 self._use(model, source)
-        self._tell()
+        self._report_state()
 
     def _use(self, model: StageModel, source: str) -> None:
         try:
@@ -130,14 +130,14 @@ class ModelNode(LabNode):
         except PiezoIdentError as error:
             self._refuse_model(f'{source}: {error}')
             return
-        self._source, self._turned_down = source, ''
+        self._source, self._refusal = source, ''
         self._models += 1
         self._error.clear()
 
     def _refuse_model(self, reason: str) -> None:
         kept = 'the old model is kept' if self._predictor.model else 'there is no model'
-        self._turned_down = f'model refused, {kept}: {reason}'
-        self.get_logger().warning(self._turned_down)
+        self._refusal = f'model refused, {kept}: {reason}'
+        self.get_logger().warning(self._refusal)
 
     # blocks
 
@@ -149,7 +149,7 @@ class ModelNode(LabNode):
                 raise DataError(f"layout says 't,{samples.quantity}', not 't,{topic}'")
         except DataError as error:
             self._unreadable += 1
-            self._meet(f'a message on {topic} is no block: {error}')
+            self._note_problem(f'a message on {topic} is no block: {error}')
             return
         take(samples)
         self._work += time.perf_counter() - begin
@@ -168,9 +168,9 @@ class ModelNode(LabNode):
                 max(high, float(samples.values.max())),
             )
         if predictor.problem:
-            self._meet(predictor.problem)
+            self._note_problem(predictor.problem)
         if prediction is not None:
-            self._show(self._preview.add('prediction', prediction.t, prediction.values))
+            self._publish_preview(self._preview.add('prediction', prediction.t, prediction.values))
             self._compare(self._matcher.predicted(prediction))
 
     def _displacement(self, samples: Samples) -> None:
@@ -178,13 +178,15 @@ class ModelNode(LabNode):
             return
         usable = np.isfinite(samples.t) & np.isfinite(samples.values)
         if not usable.all():
-            self._meet('a block of displacement holds NaN or infinite numbers; they are left out')
+            self._note_problem(
+                'a block of displacement holds NaN or infinite numbers; they are left out'
+            )
             samples = Samples(
                 samples.t[usable], samples.values[usable], samples.segment, samples.quantity
             )
             if not samples.t.size:
                 return
-        self._show(self._preview.add('displacement', samples.t, samples.values))
+        self._publish_preview(self._preview.add('displacement', samples.t, samples.values))
         if self._predictor.model is not None:
             self._compare(self._matcher.measured(samples))
 
@@ -192,11 +194,11 @@ class ModelNode(LabNode):
         for pair in pairs:
             residual = pair.residual
             self._residual.publish(to_message(residual))
-            self._show(self._preview.add('residual', residual.t, residual.values))
+            self._publish_preview(self._preview.add('residual', residual.t, residual.values))
             if self._predictor.memory_known:
                 self._error.add(residual.t, residual.values)
 
-    def _show(self, bins: list[PreviewBin]) -> None:
+    def _publish_preview(self, bins: list[PreviewBin]) -> None:
         for b in bins:
             message = JointState()
             message.header.stamp = self.get_clock().now().to_msg()
@@ -209,11 +211,11 @@ class ModelNode(LabNode):
 
     # status and diagnostics
 
-    def _meet(self, problem: str) -> None:
+    def _note_problem(self, problem: str) -> None:
         # a status that comes too fast is overwritten on its way: each tells the last few problems
-        self._troubles.pop(problem, None)
-        self._troubles[problem] = time.monotonic()
-        self._tell()
+        self._problems.pop(problem, None)
+        self._problems[problem] = time.monotonic()
+        self._report_state()
 
     def _verdict(self) -> str:
         """Return why the stage should be identified again, empty when there is no reason."""
@@ -232,21 +234,21 @@ class ModelNode(LabNode):
     def _live_error(self, model: StageModel) -> float:
         return 100.0 * self._error.rms / abs(model.scaling.Y)
 
-    def _tell(self) -> None:
-        fresh = [p for p, at in self._troubles.items() if time.monotonic() - at < REMEMBER]
-        self._troubles = {p: self._troubles[p] for p in fresh[-MOST:]}
-        said = [self._turned_down, *self._troubles]
+    def _report_state(self) -> None:
+        fresh = [p for p, at in self._problems.items() if time.monotonic() - at < REMEMBER]
+        self._problems = {p: self._problems[p] for p in fresh[-MOST:]}
+        problems = [self._refusal, *self._problems]
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
         if self._predictor.model is not None and self._predictor.memory_lost:
             message += '; its memory is unknown until the voltage has been at its lowest'
-        text = '; '.join(filter(None, [message, *said]))
-        level = WARN if any(said) else OK
+        text = '; '.join(filter(None, [message, *problems]))
+        level = WARN if any(problems) else OK
         self.report_status(state, 0.0, text, level, models=self._models)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return how the prediction goes."""
-        self._tell()
+        self._report_state()
         now, p = time.monotonic(), self._predictor
         elapsed = max(now - self._count_at, 1e-3)
         values: dict[str, object] = {
@@ -266,13 +268,13 @@ class ModelNode(LabNode):
         values['memory_known'] = p.memory_known
         values['residual_rms'] = f'{self._error.rms:.6g}'
         values['residual_percent'] = f'{self._live_error(model):.4g}'
-        said = [self._verdict()]
+        problems = [self._verdict()]
         if low <= high:
             room = min(low - model.scaling.range[0], model.scaling.range[1] - high)
             values['head_room'] = f'{room:.6g}'
             if room < -1e-3 * (model.scaling.range[1] - model.scaling.range[0]):
-                said.append(f'the voltage leaves the identified range by {-room:.3g} V')
-        message = '; '.join(filter(None, said))
+                problems.append(f'the voltage leaves the identified range by {-room:.3g} V')
+        message = '; '.join(filter(None, problems))
         return (WARN, message, values) if message else (OK, 'predicting', values)
 
     def close(self) -> None:

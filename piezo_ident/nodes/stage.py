@@ -34,8 +34,8 @@ going on; what comes next is a new stream | WARN, unless it was at rest |
 | a second publisher | its blocks are refused until the stream of the first has ended: silent, \
 and its publisher gone or the stage at rest | WARN |
 
-`piezo_ident.live.sample_clock` says how publishers are told apart.  Beside a second publisher a
-loss of blocks ends the stream, since the block behind the loss could be anybody's.
+`piezo_ident.live.sample_clock` tells how publishers are distinguished.  Beside a second publisher
+a loss of blocks ends the stream, since the block behind the loss could be anybody's.
 
 SIGINT and SIGTERM ramp to rest within a second, steeper than `ramp_slew` where that would take
 longer.
@@ -172,11 +172,11 @@ class StageNode(LabNode):
                 raise DataError(f'a block of {samples.quantity!r}, expected is voltage')
         except DataError as error:
             self._sample_clock.skip(sequence)
-            self._blame('malformed', f'a block is refused: {error}')
+            self._note_fault('malformed', f'a block is refused: {error}')
         else:
             self._take(samples, sequence)
             self._busy += time.perf_counter() - begin
-        self._say()
+        self._report_state()
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
         verdict = self._sample_clock.judge(
@@ -184,12 +184,12 @@ class StageNode(LabNode):
         )
         kind = verdict.kind
         if not verdict.is_taken:
-            self._blame(kind.value, f'a block is refused: {verdict.reason}')
+            self._note_fault(kind.value, f'a block is refused: {verdict.reason}')
             return
         self._last = time.monotonic()
         if verdict.missing:
             self._counts['lost'] += verdict.missing
-            self._blame('gap', verdict.reason)
+            self._note_fault('gap', verdict.reason)
         if kind is Kind.START:
             self._ramp_timer.cancel()
             self._counts['streams'] += 1
@@ -197,7 +197,7 @@ class StageNode(LabNode):
             self._move(self._guard.hold(verdict.missing), 'hold:gap')
         applied = self._guard.process(samples.values, restarted=kind is Kind.START)
         for why, n in applied.altered.items():
-            self._blame(why, f'{n} {_WHY[why]}', n)
+            self._note_fault(why, f'{n} {_WHY[why]}', n)
         y = self._run.process(applied.voltage)
         self._displacement.publish(
             to_message(Samples(samples.t, y, samples.segment, 'displacement'))
@@ -227,9 +227,9 @@ class StageNode(LabNode):
                 self._sample_clock.end()
                 self._state = 'idle'
             else:
-                self._blame('silence', f'no voltage for {silent:.2f} s: ramping to rest')
+                self._note_fault('silence', f'no voltage for {silent:.2f} s: ramping to rest')
                 self._begin_ramp()
-        self._say()
+        self._report_state()
 
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', 'ramp:silence'
@@ -247,12 +247,12 @@ class StageNode(LabNode):
             self._ramp_timer.cancel()
             self._sample_clock.end()
             self._state = 'idle'
-            self._blame('silence', 'no voltage: ramped to rest', 0)
-        self._say()
+            self._note_fault('silence', 'no voltage: ramped to rest', 0)
+        self._report_state()
 
     # reports
 
-    def _blame(self, fault: str, message: str, count: int = 1) -> None:
+    def _note_fault(self, fault: str, message: str, count: int = 1) -> None:
         self._counts[fault] += count
         self._faults[fault] = (message, time.monotonic() + FAULT_SHOWN)
 
@@ -262,7 +262,7 @@ class StageNode(LabNode):
         self._faults = {k: fault for k, fault in self._faults.items() if fault[1] > now}
         return '; '.join(message for message, _ in self._faults.values())
 
-    def _say(self) -> None:
+    def _report_state(self) -> None:
         faults = self._recent_faults()
         now = {'running': self._segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
         message = f'{now}; {faults}' if faults else now

@@ -21,7 +21,7 @@ from course import (
     QUICK,
     voltage_of,
 )
-from graph import alive, Graph
+from graph import Graph
 import numpy as np
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import Samples
@@ -226,14 +226,6 @@ class Fault:
 
 FAULTS = {
     'nothing is wrong': Fault(BLOCKS, {}),
-    'another block size mid-stream': Fault(
-        [
-            *BLOCKS[:K],
-            *(c for b in BLOCKS[K : K + 5] for c in cut(b, 7, 340, 341)),
-            *BLOCKS[K + 5 :],
-        ],
-        {},
-    ),
     'half a block is dropped': Fault(
         [*BLOCKS[:K], *cut(BLOCKS[K], 500)[1:], *BLOCKS[K + 1 :]],
         {
@@ -279,14 +271,6 @@ FAULTS = {
             'model': 'the block of voltage at t = 1.42 s holds NaN or infinite numbers',
         },
         warnings=frozenset({'not_finite'}),
-    ),
-    'many samples are no numbers': Fault(
-        [*BLOCKS[:K], *(with_nan(b, 400) for b in BLOCKS[K : K + 3]), *BLOCKS[K + 3 :]],
-        {
-            'stage': '400 samples are no numbers: the last command stays in force',
-            'model': 'the block of voltage at t = 1.52 s holds NaN or infinite numbers',
-        },
-        failure='NaN or infinite',
     ),
 }
 
@@ -451,32 +435,3 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     g.wait(lambda: node.status()['message'] == 'with topic model', 'a memory that is known')
     y = column(rig.answers[-20:])[1]
     np.testing.assert_allclose(column(rig.prediction[-20:])[1], y, atol=1e-3 * np.ptp(y))
-
-
-def test_an_identifier_that_is_killed_and_comes_back(rig):
-    g, models = rig.g, len(rig.models)
-    old = g.handle('identifier')
-    rig.send(BLOCKS)
-    rig.settle()
-    assert g.set('identifier', 'swarm_iterations', 10_000_000)[0]
-    assert g.set('identifier', 'thresholds', '100')[0]
-    assert g.call('identifier/identify')[0]
-    g.wait(lambda: old.status()['message'] == 'hysteresis', 'the swarm')
-    started, listeners = old.children(), g.listeners('voltage')
-    assert started
-    old.die()
-    g.wait(lambda: not any(alive(pid) for pid in started), 'the end of what it had started')
-    # until the middleware has given it up, it keeps the memory of what was sent to it
-    g.wait(lambda: g.listeners('voltage') < listeners, 'the dead node to be given up')
-    rig.rest(clear=False)
-    rig.send(BLOCKS[:K])
-    new = g.restart(old)
-    # what it has missed it does not make up
-    tick = rig.meet(rig.answered(), BLOCKS[K - 1].values[-1])
-    rig.send(shifted(BLOCKS[K:], tick))
-    end = identified(g)
-    assert new.status() == end
-    assert (end['state'], end['level']) == ('done', '1'), end
-    g.wait(lambda: len(rig.models) > models, 'the model')
-    said = model_of(rig.models[-1]).identification['warnings']
-    assert any('no step rises above the noise' in w for w in said), said

@@ -237,7 +237,7 @@ def test_a_restart_of_the_same_publisher_and_a_very_long_gap(lab):
     idle(lab)
 
 
-def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
+def test_a_second_publisher_is_refused_until_the_first_is_silent_and_at_rest(lab):
     idle(lab)
     seen, got = lab.collect('displacement'), lab.collect('applied_voltage')
     second = lab.node.create_publisher(Float64MultiArray, 'voltage', STREAM)
@@ -248,7 +248,8 @@ def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
     try:
         before, applied = len(seen), len(got)
         mine = level(0.0, 40, segment='first')
-        others = level(3.0, 40, 100000, 'second')
+        # slightly ahead, and far ahead
+        others = [*level(3.0, 20, 30, 'second'), *level(3.0, 20, 100000, 'second')]
         for a, b in zip(mine, others, strict=True):
             lab.publish('voltage', a)
             second.publish(to_message(b))
@@ -258,6 +259,20 @@ def test_a_second_publisher_is_refused_until_the_first_falls_silent(lab):
         assert {b.segment for b in seen[before:]} == {'first'}
         assert column(got[applied:])[1].max() == 0.0
         idle(lab)
+        # while the stage ramps behind a silence of the first
+        for b in [*level(0.0, 1), block(100, np.linspace(0, 9, 9000)), *level(9.0, 1, 9100)]:
+            lab.publish('voltage', b)
+        lab.wait(lambda: got[-1].values[-1] == 9.0, '9 V')
+        before, told = len(seen), len(lab.statuses('stage'))
+        assert lab.set('stage', 'ramp_slew', 2.0)[0]
+        assert lab.set('stage', 'silence', 0.05)[0]
+        lab.wait(lambda: got[-1].segment == 'ramp:silence', 'the ramp')
+        second.publish(to_message(level(3.0, 1, 9200, 'second')[0]))
+        warned(lab, 'second publisher', told)
+        assert len(seen) == before
+        assert lab.set('stage', 'ramp_slew', 20.0)[0]
+        idle(lab)
+        before, applied = len(seen) - 40, len(got)
         for b in level(3.0, 90, 200000, 'second'):
             second.publish(to_message(b))
         lab.wait(lambda: len(seen) >= before + 130, 'the second one alone')
