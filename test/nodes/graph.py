@@ -468,10 +468,6 @@ class Graph:
         message = to_message(block) if isinstance(block, Samples) else block
         self._publishers[topic].publish(message)
 
-    def listeners(self, topic: str) -> int:
-        """Return how many listen to a topic on which `publish` was used."""
-        return int(self._publishers[topic].get_subscription_count())
-
     def publish_text(self, topic: str, text: str) -> None:
         """Publish a latched text."""
         if topic not in self._publishers:

