@@ -7,7 +7,7 @@ Identification of 17 s at 20 kHz, as a whole and step by step.
 
     .venv-bench/bin/python benchmarks/bench_identification.py [--quick]
 
-The record is the simulated stage of the paper under the shipped programme with a slower triangle.
+The record is the simulated stage of the paper under the shipped program with a slower triangle.
 All is warm: compiled kernels are loaded before the clock starts.
 """
 
@@ -45,7 +45,7 @@ from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
 RUNS = 5
 #: what the three steps may take [s]
 LIMIT = 1.5
-#: slope of the triangle that makes the programme 17 s long [V/s]
+#: slope of the triangle that makes the program 17 s long [V/s]
 SLOPE = 4.9
 MAX_ORDER = 15
 
@@ -53,7 +53,7 @@ Work = Callable[[int], object]
 
 
 def record_of_17_s() -> Record:
-    """Return what the simulated stage answers to the programme."""
+    """Return what the simulated stage answers to the program."""
     stage = SimulatedStage.load('paper')
     path = Path(find_config('identification', 'program'))
     text = path.read_text(encoding='utf-8').replace('slope: 6}', f'slope: {SLOPE}}}')

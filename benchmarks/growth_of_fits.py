@@ -32,7 +32,7 @@ __all__ = ['EFFECT', 'FIT_MEASURES', 'base_model', 'labelled', 'to_diagnose']
 
 #: the effect that the diagnosed stage has, and its size [% of stroke]
 EFFECT, SIZE = 'creep', 0.3
-#: longest programme of an identification; what is longer is several records [s]
+#: longest program of an identification; what is longer is several records [s]
 LONGEST = 1800.0
 #: seconds of the identification record of which the longer ones are multiples
 SHIPPED = 15.5
@@ -69,10 +69,10 @@ def identifying(size: float, folder: Path) -> Measure:
 
 
 def _command(size: float, seed: int) -> tuple[NDArray[np.float64], tuple[Segment, ...]]:
-    """Return the diagnosis programme over and over, and its segments."""
-    from truths import programme
+    """Return the diagnosis program over and over, and its segments."""
+    from truths import program
 
-    _, v, labels = programme('diagnosis', seed)
+    _, v, labels = program('diagnosis', seed)
     n = round(size * RATE)
     count = -(-n // v.size)
     segments = [
@@ -97,7 +97,7 @@ def _answer(v: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
 
 
 def to_diagnose(size: float, seed: int = 1) -> Record:
-    """Return the answer of a stage with an effect to the diagnosis programme, over and over."""
+    """Return the answer of a stage with an effect to the diagnosis program, over and over."""
     v, segments = _command(size, seed)
     return Record((Piece(v, _answer(v, seed), RATE, segments=segments),), 'diagnosis')
 

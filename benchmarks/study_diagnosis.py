@@ -6,7 +6,7 @@ How often a diagnosis is right, on stages whose laws are not those of the candid
 
     python benchmarks/study_diagnosis.py docs/diagnosis_study.md
 
-Every case: a stage from `truths`, identified from the package's own programme, diagnosed on one
+Every case: a stage from `truths`, identified from the package's own program, diagnosed on one
 record and judged on another that nothing saw.  Finished cases are kept beside the table in
 ``build/study_diagnosis.jsonl``, so a study that was stopped goes on.
 """
@@ -38,7 +38,7 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from tqdm import tqdm
-from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, programme
+from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, program
 
 RATE = 20_000.0
 SIZES = (0.1, 0.3, 1.0)
@@ -159,7 +159,7 @@ def measured(
     took = time.perf_counter() - start
     records = []
     for number, kind in enumerate(('diagnosis', 'unseen')):
-        t, v, labels = programme(kind, seed)
+        t, v, labels = program(kind, seed)
         channels = other(t, 100 + 10 * number + seed)
         y = stage.respond(t, v, changed=True, channels=channels)
         records.append(record_of(v, y, labels, kind, channels))

@@ -40,7 +40,7 @@ NOISES = (1e-5, 1e-4, 5e-4)
 
 
 def record_of(stage: SimulatedStage, program: str, seed: int) -> Record:
-    """Return what the stage answers to a shipped programme, with its noise."""
+    """Return what the stage answers to a shipped program, with its noise."""
     sequence = Program.load(program).build(stage.model.sample_rate)
     return stage.play(sequence, np.random.default_rng(seed))
 

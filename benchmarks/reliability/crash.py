@@ -89,15 +89,15 @@ def _report(folder: Path) -> int:
 
 def jobs(inputs: Path, *, slow: bool) -> list[Job]:
     """Return the work, `slow` with identification and diagnosis, and make what it reads."""
-    stage, samples, programme = (inputs / x for x in ('model.yaml', 'record.npz', 'program.yaml'))
+    stage, samples, program = (inputs / x for x in ('model.yaml', 'record.npz', 'program.yaml'))
     pi.SimulatedStage.load('paper').model.save(stage)
     pi.write(record(60_000), samples, overwrite=True)
-    programme.write_text('{limits: [0, 10], segments: [{signal: hold, level: 5, duration: 2}]}')
+    program.write_text('{limits: [0, 10], segments: [{signal: hold, level: 5, duration: 2}]}')
 
     def command(kind: str, words: str, *outputs: str) -> Job:
         given = [word for word in words.split() if not word.startswith('-')]
         name = f'{kind} to {given[-1][4:]}' if kind == 'convert' else kind
-        places = {'STAGE': stage, 'SAMPLES': samples, 'PROGRAM': programme, 'IN': inputs}
+        places = {'STAGE': stage, 'SAMPLES': samples, 'PROGRAM': program, 'IN': inputs}
 
         def run(folder: Path) -> int:
             line = [kind]

@@ -7,11 +7,11 @@ Stages for judging a diagnosis: every effect in another form than the one that i
 Nothing here knows the package that is judged.  A stage answers a voltage from rest:
 
     stage = make_stage('creep', 0.3, seed=1)
-    t, v, labels = programme('diagnosis', seed=1)
+    t, v, labels = program('diagnosis', seed=1)
     y = stage.respond(t, v)
 """
 
-from .programmes import other_axis, programme, table_one_sines
+from .programs import other_axis, program, table_one_sines
 from .stage import make_stage, SPAN, Stage
 from .table import describe, EFFECTS, LATER, OUTSIDE
 
@@ -24,6 +24,6 @@ __all__ = [
     'describe',
     'make_stage',
     'other_axis',
-    'programme',
+    'program',
     'table_one_sines',
 ]

@@ -291,7 +291,7 @@ def make_stage(
     effect : str, tuple of str or None
         Names out of `EFFECTS` and `OUTSIDE`.
     strength : float
-        What about is left of each effect on the diagnosis programme after the best refit of
+        What about is left of each effect on the diagnosis program after the best refit of
         weights, polynomial and offset of the base [% of stroke, rms].
     seed : int
         Of the stage, and of the form of each law.

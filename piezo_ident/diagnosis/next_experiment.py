@@ -199,7 +199,7 @@ def _has_repeat(records: Sequence[Record], span: float) -> bool:
 
 _EVEN = ('even_nonlinearity', 'preload_loss', 'noncongruent_minor_loops', 'sensor_nonlinearity')
 _FAST_EFFECTS = ('delay_change', 'changed_dynamics', 'amplifier_lag', 'slew_limit')
-#: motions, the programme that has them, the effects that they show, and whether data have them
+#: motions, the program that has them, the effects that they show, and whether data have them
 _MOTIONS: tuple[tuple[str, Kind, tuple[str, ...], Motion], ...] = (
     (
         f'a hold of at least {HOLD:g} s after a step',

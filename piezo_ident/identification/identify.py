@@ -247,7 +247,7 @@ def find_delay(
     data = prepare(records)
     if not {s.kind for p in data.pieces for s in p.segments} & {'step', 'noise'}:
         raise IdentificationError(
-            'delay: no segment is labelled step or noise; drive the stage with the programme '
+            'delay: no segment is labelled step or noise; drive the stage with the program '
             'identification, or identify unlabelled data in one go'
         )
     with singular_is_ours():
@@ -283,7 +283,7 @@ def find_dynamics(
     if not data.labelled:
         raise IdentificationError(
             'dynamics: segments labelled noise and triangle are needed, since the hysteresis is '
-            'undone; drive the stage with the programme identification'
+            'undone; drive the stage with the program identification'
         )
     with singular_is_ours():
         delay = steps.delay or first_step(data.runs, settings, progress)
@@ -319,7 +319,7 @@ def find_hysteresis(
     if not prepare(records).labelled:
         raise IdentificationError(
             'hysteresis: segments labelled noise and triangle are needed; drive the stage with '
-            'the programme identification, or identify unlabelled data in one go'
+            'the program identification, or identify unlabelled data in one go'
         )
     return identify(records, settings, steps=steps, progress=progress)
 

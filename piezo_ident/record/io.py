@@ -117,7 +117,7 @@ def write(
     storage : {'mcap', 'sqlite3'}, optional
         Storage of a bag folder.
     custom_data : mapping of str to str, optional
-        For a bag's metadata: seed, programme.
+        For a bag's metadata: seed, program.
 
     Returns
     -------

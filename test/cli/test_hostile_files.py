@@ -165,7 +165,7 @@ def test_other_variables_of_a_workspace_are_left_alone(tmp_path, packed):
         'signal: triangle, slope: 1e-300',
     ],
 )
-def test_programmes_without_end(segment):
+def test_programs_without_end(segment):
     program = parse_program(f'{{limits: [0, 10], segments: [{{{segment}}}]}}')
     refused(lambda: program.build(sample_rate=1000.0), kind=ConfigError)
 

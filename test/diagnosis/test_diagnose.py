@@ -80,7 +80,7 @@ def measured(effect, size, seed):
     model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
     records = []
     for kind in ('diagnosis', 'unseen'):
-        t, v, labels = found.programme(kind, seed)
+        t, v, labels = found.program(kind, seed)
         records.append(record_of(v, stage.respond(t, v), labels, kind))
     return model.model, *records
 

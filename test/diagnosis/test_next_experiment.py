@@ -18,7 +18,7 @@ RATE = 2000.0
 
 
 def played(*segments: str, slew: float = 40.0) -> Record:
-    """Return what a programme would record."""
+    """Return what a program would record."""
     text = '\n'.join([f'{{limits: [0, 10], slew: {slew}, segments: [', ',\n'.join(segments), ']}'])
     sequence = parse_program(text).build(RATE)
     piece = Piece(sequence.v, np.zeros(sequence.n), RATE, segments=sequence.segments)
@@ -26,7 +26,7 @@ def played(*segments: str, slew: float = 40.0) -> Record:
 
 
 def shipped(name: str) -> Record:
-    """Return what a shipped programme would record."""
+    """Return what a shipped program would record."""
     sequence = Program.load(name).build(RATE)
     piece = Piece(sequence.v, np.zeros(sequence.n), RATE, segments=sequence.segments)
     return Record((piece,), name)

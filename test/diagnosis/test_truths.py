@@ -26,7 +26,7 @@ NAMES = truths.EFFECTS + truths.OUTSIDE
 
 @pytest.fixture(scope='module')
 def record():
-    t, v, labels = truths.programme('diagnosis', 1)
+    t, v, labels = truths.program('diagnosis', 1)
     return t, v, labels, truths.other_axis(t, np.random.default_rng(1))
 
 
@@ -132,8 +132,8 @@ def test_linear_parts_against_formulas():
 
 
 @pytest.mark.parametrize('kind', ['diagnosis', 'unseen'])
-def test_programmes(kind):
-    t, v, labels = truths.programme(kind, 3)
+def test_programs(kind):
+    t, v, labels = truths.program(kind, 3)
     assert 10 < t[-1] < 20
     assert v[0] == 0 and abs(v[-1]) < 1e-9
     assert v.min() >= 0 and v.max() <= 10
@@ -142,7 +142,7 @@ def test_programmes(kind):
         assert stop == start and name != following
     moves = [np.abs(np.diff(v[a:b])).max() * RATE for name, a, b in labels if name == 'ramp']
     assert max(moves) <= 40.01
-    assert np.any(truths.programme('diagnosis', 4)[1][:100000] != 0)
+    assert np.any(truths.program('diagnosis', 4)[1][:100000] != 0)
 
 
 def test_noise_has_its_size(short):

@@ -408,7 +408,7 @@ def test_rate_is_needed_from_somewhere():
 
 
 def test_missing_file_is_named():
-    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such file'):
+    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such program'):
         Program.load('nowhere.yaml')
 
 

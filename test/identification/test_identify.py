@@ -215,7 +215,7 @@ def test_dense_truth_that_no_ten_thresholds_can_hit():
         assert max(*sines, loops) <= limit
 
 
-def test_dense_truth_from_a_short_programme():
+def test_dense_truth_from_a_short_program():
     # 1.5 s of noise leave 0.09 % above 10 Hz, whatever the thresholds
     model = identify(short(DENSE), replace(QUICK, thresholds=None)).model
     assert max(sine_errors(DENSE.model, model)) <= 0.12

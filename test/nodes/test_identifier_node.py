@@ -441,7 +441,7 @@ def test_run_without_an_excitation_fails_with_the_reason(course):
 
 
 def test_run_without_a_stage_fails_with_the_reason(course):
-    course.start('excitation', {'rate_factor': 4.0, 'subscribers': 2})
+    course.start('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 2})
     said = 'no publisher of displacement within 1 s'
     # it may take a moment to know of the excitation
     course.wait(lambda: said in finish(course, 'identifier/run')['message'], said)

@@ -67,7 +67,7 @@ def test_readings_without_any_noise_have_no_fault(truth):
 
 
 @pytest.mark.parametrize('name', ['identification', 'validation', 'minor_loops'])
-def test_shipped_programmes_have_no_fault(stage, name):
+def test_shipped_programs_have_no_fault(stage, name):
     sequence = Program.load(CONFIG / f'program_{name}.yaml').build()
     read = stage.play(sequence, np.random.default_rng(2)).pieces[0]
     y = stage.ideal.play(sequence).pieces[0].y

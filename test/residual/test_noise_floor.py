@@ -12,7 +12,7 @@ import pytest
 from residual_data import creep, misfit, part_of, pink, RATE, V
 
 
-def test_stretches_of_a_programme():
+def test_stretches_of_a_program():
     found = [(s.label, s.kind, s.period) for s in stretches_of(part_of(np.zeros(V.size)))]
     # 50 Hz at 2 kHz: 40 samples; the holds start with their first sample
     assert found[:4] == [

@@ -27,7 +27,7 @@ _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 _UNHEARD = 'unheard'
 #: how long the last blocks may be under way after the excitation says done [s]
 _TAIL = 1.0
-#: after how long a programme that is not acknowledged is set once more [s]
+#: after how long a program that is not acknowledged is set once more [s]
 _AGAIN = 2.0
 
 

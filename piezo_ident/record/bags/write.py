@@ -325,7 +325,7 @@ def write_bag(
     overwrite : bool
         Replace an existing bag.
     custom_data : mapping of str to str, optional
-        For the bag's metadata beside ``sample_rate``: seed, programme.
+        For the bag's metadata beside ``sample_rate``: seed, program.
     block_size : int
         Samples a block.
 

@@ -183,7 +183,7 @@ def segments_figure(
         if s.kind in ORDER and np.ptp(run.piece.v[s.start : s.stop]) > 0.0
     ]
     if not cells:
-        raise NothingToDraw('no segment is labelled with a kind of the programmes')
+        raise NothingToDraw('no segment is labelled with a kind of the programs')
     cells = sorted(cells, key=lambda cell: ORDER.index(cell[1].kind))[:CELLS]
     rows = -(-len(cells) // 2)
     fig = style.figure(2.05 * rows + 0.3)

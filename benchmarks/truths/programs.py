@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Voltages for judging a diagnosis, put together independently of the package's programmes."""
+"""Voltages for judging a diagnosis, put together independently of the package's programs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Label', 'other_axis', 'programme', 'table_one_sines']
+__all__ = ['Label', 'other_axis', 'program', 'table_one_sines']
 
 Array = NDArray[np.float64]
 Label = tuple[str, int, int]
@@ -106,7 +106,7 @@ class _Tape:
         return np.arange(v.size) / self.rate, v, self.labels
 
 
-def programme(
+def program(
     kind: str, seed: int = 0, sample_rate: float = 20000.0
 ) -> tuple[Array, Array, list[Label]]:
     """
@@ -138,7 +138,7 @@ def programme(
     elif kind == 'unseen':
         _unseen(tape, rng)
     else:
-        raise ValueError(f'programme must be diagnosis or unseen, got {kind!r}')
+        raise ValueError(f'program must be diagnosis or unseen, got {kind!r}')
     return tape.result()
 
 
