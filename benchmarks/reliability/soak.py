@@ -75,12 +75,12 @@ class Observer:
     """Reads the stamps of all streams in a thread, and when they came."""
 
     def __init__(self, client: Any) -> None:
-        from piezo_ident.nodes.subscriptions import message_class, Taps
+        from piezo_ident.nodes.subscriptions import message_class, RawSubscriptions
         from rclpy.serialization import deserialize_message
 
         self._kind = message_class('std_msgs/msg/Float64MultiArray')
         self._read = deserialize_message
-        self._taps = Taps(client.node, [f'/{t}' for t in STREAMS])
+        self._inputs = RawSubscriptions(client.node, [f'/{t}' for t in STREAMS])
         self.streams = {topic: Stream() for topic in STREAMS}
         #: of each program: (time of the machine [s], time of the samples [s]) of its blocks
         self.clocks: list[list[tuple[float, float]]] = []
@@ -91,7 +91,7 @@ class Observer:
     def _work(self) -> None:
         looked = 0.0
         while not self._end.wait(POLL):
-            for stamp, topic, raw in self._taps.arrived():
+            for stamp, topic, raw in self._inputs.arrived():
                 data = np.asarray(self._read(raw, self._kind).data)
                 first, n = round(data[0] * RATE), data.size // 2
                 stream, name = self.streams[topic[1:]], topic[1:]
@@ -106,18 +106,18 @@ class Observer:
                     self.clocks[-1].append((1e-9 * stamp, first / RATE))
             if time.monotonic() - looked > 0.5:
                 looked = time.monotonic()
-                self._taps.look()
+                self._inputs.look()
 
     @property
     def unheard(self) -> int:
         """Messages that were sent to this process and did not arrive."""
-        return self._taps.lost
+        return self._inputs.lost
 
     def close(self) -> None:
         """Read no more."""
         self._end.set()
         self._thread.join()
-        self._taps.close()
+        self._inputs.close()
 
 
 def memory(pid: int) -> float:

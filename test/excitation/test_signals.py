@@ -59,6 +59,7 @@ def test_default_triangle_covers_the_range_it_is_given():
         assert_allclose(np.diff(peaks), (limits[1] - limits[0]) / 3)
 
 
+@settings(deadline=None)
 @given(levels=st.lists(st.floats(-10, 10), min_size=2, max_size=6), slope=st.floats(1.0, 1000.0))
 def test_corners_are_met_exactly(levels, slope):
     assume(np.abs(np.diff(levels)).sum() / slope > 1e-3)
@@ -119,6 +120,7 @@ def test_multisine_has_odd_lines_only_and_leaves_some_out():
         assert len(group & set(lines.tolist())) == 3
 
 
+@settings(deadline=None)
 @given(f=st.floats(0.5, 400.0), periods=st.integers(1, 12))
 def test_sine_has_whole_periods(f, periods):
     v = ex.sine(5.0, 5.0, f, periods, FS)
@@ -128,6 +130,7 @@ def test_sine_has_whole_periods(f, periods):
     assert abs(after - v[0]) <= 5.0 * 2 * np.pi * f * 0.5 / FS + 1e-9
 
 
+@settings(deadline=None)
 @given(
     a=st.floats(-10, 10),
     b=st.floats(-10, 10),
