@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.from_streams import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.restart import has_restarted
 from piezo_ident.record.stream import Stream
 
 __all__ = ['Capture', 'Snapshot', 'refuse_incomplete']

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.restart import has_restarted
+from piezo_ident.record.clock import has_restarted
 
 __all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
 

@@ -23,7 +23,7 @@ from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.restart import has_restarted
+from piezo_ident.record.clock import has_restarted
 
 __all__ = ['Predictor', 'TurningPoints', 'expected_error', 'warm_up']
 

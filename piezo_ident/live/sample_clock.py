@@ -28,7 +28,7 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.restart import has_restarted
+from piezo_ident.record.clock import has_restarted
 
 __all__ = ['Kind', 'SampleClock', 'Verdict']
 

@@ -20,12 +20,22 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Clock', 'Resolution', 'fit_clock', 'split_uniform', 'time_stamps']
+__all__ = [
+    'JUMP_BACK',
+    'Clock',
+    'Resolution',
+    'fit_clock',
+    'has_restarted',
+    'split_uniform',
+    'time_stamps',
+]
 
 Vector = NDArray[np.float64]
 
 #: rows looked at together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
+#: a clock that goes back by more samples than this (ten blocks) has restarted
+JUMP_BACK = 1000
 #: fewer steps than this between two finer runs are gaps, not a slower sampling rate
 _SHORT = 8
 #: deviation from the uniform grid, in samples, that nobody needs to hear of
@@ -325,3 +335,35 @@ def _reproduces(clock: Clock, t: Vector) -> bool:
         np.array_equal(time_stamps(clock, i, min(i + _CHUNK, t.size)), t[i : i + _CHUNK])
         for i in chunks
     )
+
+
+def has_restarted(first: float, last: float, begin: float, period: float) -> bool:
+    """
+    Return whether time that jumps back is a restart of the sample clock.
+
+    It is when the new stretch starts at or before the start of the old one, or more than
+    `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.
+
+    Parameters
+    ----------
+    first : float
+        Time of the first sample of the new stretch [s].
+    last : float
+        Time of the newest sample so far [s].
+    begin : float
+        Time of the first sample since the last restart [s].
+    period : float
+        Sampling period [s].
+
+    Examples
+    --------
+    >>> has_restarted(0.0, last=0.02, begin=0.0, period=5e-5)
+    True
+    >>> has_restarted(0.01, last=0.02, begin=0.0, period=5e-5)
+    False
+    >>> has_restarted(1.01, last=2.02, begin=0.0, period=5e-5)
+    True
+    """
+    if first > last:
+        return False
+    return first <= begin or last - first > JUMP_BACK * period

@@ -18,8 +18,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
+from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
-from piezo_ident.record.restart import has_restarted
 
 __all__ = ['Rows', 'at_times', 'in_order']
 

@@ -14,11 +14,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array, robust_range
 from piezo_ident.common.errors import DataError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment']
 
@@ -326,6 +330,12 @@ class Record:
         where = f'{part.duration:.6g} of {self.duration:.6g} s are used'
         fault = Fault('part', where, self.n - n, 'what comes later is left out')
         return replace(part, faults=(*self.faults, fault))
+
+    def plot(self) -> Figure:
+        """Draw voltage and displacement over time."""
+        import piezo_ident as pi
+
+        return pi.report.plot(self)
 
     def _repr_html_(self) -> str:
         rates = ', '.join(f'{rate:g}' for rate in dict.fromkeys(p.sample_rate for p in self))

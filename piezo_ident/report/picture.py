@@ -16,6 +16,7 @@ from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
 from piezo_ident.model.metrics import FORMULA
+from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
 from piezo_ident.report.table import length, number, Table
@@ -33,16 +34,17 @@ DPI = 110
 Result = Identification | Diagnosis | FreeRun
 
 
-def plot(result: Result) -> Figure:
+def plot(result: Result | Record) -> Figure:
     """
     Draw the picture that tells most of a result.
 
     Of an identification that is the hysteresis loop, measured and modelled, with the error; of a
-    free run the longest piece over time; of a diagnosis the residual before and after.
+    free run the longest piece over time; of a diagnosis the residual before and after; of a record
+    voltage and displacement over time.
 
     Parameters
     ----------
-    result : Identification, Diagnosis or FreeRun
+    result : Identification, Diagnosis, FreeRun or Record
 
     Returns
     -------
@@ -54,9 +56,11 @@ def plot(result: Result) -> Figure:
         When the result holds no data.
     """
     from piezo_ident.report.figures.diagnosis import worst_pieces
-    from piezo_ident.report.figures.free_run import loops_figure, overview_figure
+    from piezo_ident.report.figures.free_run import loops_figure, overview_figure, record_figure
     from piezo_ident.report.figures.residual import residual_figure
 
+    if isinstance(result, Record):
+        return record_figure(result)
     if isinstance(result, Identification):
         return loops_figure(piece_runs(result.model, result.records, result.memories))
     if isinstance(result, Diagnosis):

@@ -53,3 +53,8 @@ def test_html_names_what_it_holds_and_escapes_it():
     page = Record((Piece(V, Y, RATE),), '<b>')._repr_html_()
     assert '&lt;b&gt;' in page
     assert '75' in page
+
+
+def test_plot_draws_voltage_and_displacement():
+    drawn = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 5.0))).plot()
+    assert [len(axes.lines) for axes in drawn.axes] == [2, 2]

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.free_run import PieceRun, sine_frequency, SineError
-from piezo_ident.record.record import Segment
+from piezo_ident.record.record import Record, Segment
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
-__all__ = ['loops_figure', 'overview_figure', 'segments_figure', 'sines_figure']
+__all__ = ['loops_figure', 'overview_figure', 'record_figure', 'segments_figure', 'sines_figure']
 
 #: segments shown side by side, and in which order they are chosen
 CELLS = 8
@@ -123,6 +123,20 @@ def _draw_error(
     style.symmetric(axes, scale * limit)
     style.note(axes, '; '.join(remarks))
     return unit, scale
+
+
+def record_figure(record: Record) -> Figure:
+    """Draw voltage and displacement of a record over time."""
+    fig = style.figure(3.6)
+    axes = fig.subplots(2, 1, sharex=True)
+    for piece in record:
+        style.line(axes[0], piece.t, piece.v, COLOURS['measured'])
+        style.line(axes[1], piece.t, 1e6 * piece.y, COLOURS['measured'])
+    tidy(axes[0], '', 'voltage / V')
+    tidy(axes[1], 'time / s', 'displacement / µm')
+    axes[0].margins(x=0.01)
+    fig.align_ylabels(list(axes))
+    return fig
 
 
 def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
