@@ -1,7 +1,20 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results for people and for programs: a folder with a page, a summary, a picture, JSON."""
+"""
+Results for people and for programs: a folder with a page, a summary, a picture, JSON.
+
+Examples
+--------
+>>> import numpy as np
+>>> import piezo_ident as pi
+>>> v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
+>>> record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0)
+>>> result = pi.identify(record, pi.Settings(thresholds=4))
+>>> pi.report.to_json(result)['sample_rate']
+1000.0
+>>> pi.report.save_plot(result, 'loop.png')
+"""
 
 from piezo_ident.report.diagnosis import changes, diagnosis_text, validated
 from piezo_ident.report.folder import check_report_folder, write_report

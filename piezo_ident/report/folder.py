@@ -70,11 +70,13 @@ def write_report(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import piezo_ident as pi
-    >>> stage = pi.SimulatedStage.load('paper')
-    >>> record = stage.play(pi.Program.load('identification'))  # doctest: +SKIP
-    >>> pi.write_report(pi.identify(record), 'report/').name  # doctest: +SKIP
-    'report.html'
+    >>> v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
+    >>> record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0)
+    >>> page = pi.write_report(pi.identify(record, pi.Settings(thresholds=4)), 'report')
+    >>> page.name, len(list(page.parent.glob('*.png'))) > 2
+    ('report.html', True)
     """
     if isinstance(result, Diagnosis):
         data, page, shown = _diagnosis(result, progress)
