@@ -85,6 +85,10 @@ def measured(effect, size, seed):
     return model.model, *records
 
 
+#: a search among a few candidates takes seconds
+FEW = DiagnosisSettings(effects=('creep', 'thermal_drift', 'periodic_disturbance'))
+
+
 def unseen_errors(result, record) -> tuple[float, float]:
     before, after = (free_run(m, record).errors.percent for m in (result.given, result.model))
     return before, after
@@ -217,7 +221,7 @@ def test_a_share_is_of_what_a_refit_leaves(truths):
 
 def test_hum_stays_in_its_record(truths):
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
-    result = diagnose(model, record)
+    result = diagnose(model, record, FEW)
     assert 'switched off beside the hysteresis as it was given' in ' '.join(result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
@@ -230,10 +234,10 @@ def test_hum_stays_in_its_record(truths):
 
 def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
     model, record, _ = measured('creep', 0.3, 1)
-    refined = diagnose(model, record).model
+    refined = diagnose(model, record, FEW).model
     again = model_from_dict(model_to_dict(refined))
     assert [e.name for e in again.effects] == ['creep']
-    second = diagnose(again, record)
+    second = diagnose(again, record, FEW)
     assert second.verdict == 'none', second.sentence
     assert second.before.overall < 0.1
 
@@ -241,7 +245,7 @@ def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
 def test_seed_repeats_and_inputs_stay(truths):
     model, record, _ = measured(None, 0.0, 1)
     y = record.pieces[0].y.copy()
-    one, other = (diagnose(model, record, DiagnosisSettings(seed=3)) for _ in range(2))
+    one, other = (diagnose(model, record, replace(FEW, seed=3)) for _ in range(2))
     assert one.sentence == other.sentence
     assert one.candidates == other.candidates
     np.testing.assert_array_equal(record.pieces[0].y, y)
@@ -249,7 +253,7 @@ def test_seed_repeats_and_inputs_stay(truths):
 
 def test_a_candidate_that_is_left_out_is_not_named(truths):
     model, record, _ = measured('creep', 0.3, 1)
-    result = diagnose(model, record, DiagnosisSettings(without=('creep',)))
+    result = diagnose(model, record, replace(FEW, without=('creep',)))
     assert 'creep' not in {e.name for e in result.effects}
     assert 'creep' not in {c.name for c in result.candidates}
 
@@ -272,7 +276,7 @@ def test_every_step_can_be_cancelled(truths):
                 raise Cancelled(name)
 
         with pytest.raises(Cancelled, match=step):
-            diagnose(model, record, progress=progress)
+            diagnose(model, record, FEW, progress=progress)
 
 
 # -- refusals ----------------------------------------------------------------------------------
@@ -344,7 +348,7 @@ def test_one_pass_over_the_range_names_nothing(truths):
     piece = record.pieces[0]
     sine = next(s for s in piece.segments if s.label.startswith('sine:1Hz'))
     once = Record((piece.cut(0, sine.start + int(RATE)),), 'once')
-    result = diagnose(model, once)
+    result = diagnose(model, once, FEW)
     assert not result.effects
     assert result.verdict in ('none', 'unexplained')
     assert 'nothing that is fitted could be tested' in result.sentence

@@ -73,7 +73,6 @@ _SHARES = {
     'hysteresis': (0.8, 0.98),
     'residual': (0.02, 0.1),
     'candidates': (0.1, 0.95),
-    'whole records': (0.95, 0.95),
     'verdict': (0.95, 0.98),
 }
 
