@@ -103,12 +103,11 @@ def diagnose(
     >>> import numpy as np
     >>> import piezo_ident as pi
     >>> from piezo_ident.model.stage_model import EffectSetting
-    >>> from piezo_ident.record.record import Piece
     >>> model = pi.SimulatedStage.load('paper').model
     >>> stage = replace(model, effects=(EffectSetting('saturation', {'high': 0.8}),))
     >>> t = np.arange(20_000) / 20_000
     >>> v = 2.5 * (1 + np.floor(20 * t) % 2) * (1 - np.cos(40 * np.pi * t))
-    >>> record = pi.Record((Piece(v, stage.simulate(v), 20_000),))
+    >>> record = pi.Record.from_arrays(v, stage.simulate(v), sample_rate=20_000)
     >>> few = pi.DiagnosisSettings(effects=('saturation', 'backlash'))
     >>> result = pi.diagnose(model, record, few)
     >>> result.verdict, round(result.effects[0].parameters['high'].value, 2)
