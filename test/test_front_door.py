@@ -1,9 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The front door: every public name is there."""
+"""The front door: every public name is there, is documented, and its example runs."""
 
 import ast
+import doctest
+import inspect
 from pathlib import Path
 import subprocess
 import sys
@@ -39,3 +41,24 @@ def test_a_name_that_is_not_there():
 def test_the_door_itself_imports_nothing_heavy():
     code = 'import sys, piezo_ident; sys.exit("numpy" in sys.modules)'
     assert subprocess.run([sys.executable, '-c', code]).returncode == 0
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_public_name_has_a_docstring_with_an_example_that_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    thing = getattr(pi, name)
+    text = inspect.getdoc(thing)
+    assert text
+    if isinstance(thing, type) and issubclass(thing, Exception):
+        return
+    test = doctest.DocTestParser().get_doctest(
+        text,
+        {'pi': pi, **vars(sys.modules[getattr(thing, '__module__', thing.__name__)])},
+        name,
+        None,
+        0,
+    )
+    assert test.examples, f'{name} has no example'
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    runner.run(test)
+    assert runner.failures == 0

@@ -63,6 +63,12 @@ class DiagnosisSettings:
     ------
     ConfigError
         When a name is not in the catalogue, or a number out of range.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.DiagnosisSettings(effects=('creep', 'slew_limit')).most_effects
+    4
     """
 
     effects: tuple[str, ...] | None = None
@@ -235,6 +241,17 @@ class Diagnosis:
     settings : DiagnosisSettings
     unseen : tuple of Unseen
         Errors on records that took no part.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> v = 5 - 5 * np.cos(2 * np.pi * 20 * np.arange(20_000) / 20_000)
+    >>> record = pi.Record.from_arrays(v, model.simulate(v), sample_rate=20_000)
+    >>> result = pi.diagnose(model, record, pi.DiagnosisSettings(effects=('saturation',)))
+    >>> result.verdict, result.effects
+    ('none', ())
     """
 
     verdict: str

@@ -123,6 +123,14 @@ class Program:
         Voltage before and after [V].
     slew : float
         Largest speed of the ramps [V/s].
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> program = pi.Program.load('validation')
+    >>> sequence = program.build(20_000)
+    >>> float(sequence.v.min()), float(sequence.v.max())
+    (0.0, 10.0)
     """
 
     name: str

@@ -340,6 +340,16 @@ class Identification:
         What was fitted, then what was given for validation.
     memories : mapping of (str, float) to ndarray
         Fitted play outputs at the start of a piece, by record name and start time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> v = 5 - 5 * np.cos(2 * np.pi * np.arange(4000) / 1000)
+    >>> y = 7e-6 * v + 2e-6 * np.sin(2 * np.pi * np.arange(4000) / 1000)
+    >>> result = pi.identify(pi.Record.from_arrays(v, y, sample_rate=1000))
+    >>> result.model.simulate(v).shape
+    (4000,)
     """
 
     model: StageModel

@@ -60,6 +60,13 @@ class GuardSettings:
     ------
     ConfigError
         When the limits are crossed, rest lies outside of them, or a speed or rate is not positive.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> settings = pi.GuardSettings(0, 10, slew=1000, ramp_slew=20, rest=0, sample_rate=1000)
+    >>> pi.Guard(settings).process([0.0, 12.0]).voltage.tolist()
+    [0.0, 1.0]
     """
 
     low: float

@@ -123,6 +123,14 @@ class SimulatedStage:
     sensor : Sensor
     seed : int
         Of the sensor noise.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('minor_loops'))
+    >>> 60e-6 < record.stroke < 80e-6
+    True
     """
 
     model: StageModel

@@ -124,6 +124,13 @@ class StageModel:
     ------
     ModelError
         When the dynamics are unstable or the rate is not positive.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> model.delay.samples, model.dynamics.a.size
+    (3, 10)
     """
 
     sample_rate: float

@@ -204,6 +204,13 @@ class Record:
     ------
     DataError
         When there is no piece.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> record = pi.Record.from_arrays([0, 1, 2], [0, 1e-6, 2e-6], sample_rate=100)
+    >>> record.n, record.duration
+    (3, 0.03)
     """
 
     pieces: tuple[Piece, ...]
