@@ -236,7 +236,7 @@ def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...
         model.check_rate(piece)
     pieces = [y for part in connected_pieces(record) for y in run_pieces(model, part, None)]
     if not all(np.isfinite(y_hat).all() for y_hat in pieces):
-        raise ModelError(f'{record.name}: {DIVERGES}')
+        raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
     return tuple(pieces)
 
 
