@@ -49,7 +49,8 @@ def test_nothing_is_lost_and_the_recording_is_cut_into_parts(tmp_path, monkeypat
             print('\n'.join(found.lines()))
             if not found.lost:
                 break
-            assert sum(n for where, n in found.lost.items() if 'messages' in where), 'not said'
+            # the nodes count it themselves
+            assert any(where.startswith(('by the', 'messages to')) for where in found.lost)
     assert not found.lost
     assert found.parts >= 3
     assert set(found.recorded.values()) == {found.samples}
