@@ -201,7 +201,7 @@ def test_imports_point_one_way():
 def test_the_root_holds_the_front_door_alone():
     assert {path.name for path in PACKAGE.glob('*.py')} == {'__init__.py', '__main__.py'}
     folders = {path.name for path in PACKAGE.iterdir() if any(path.glob('*.py'))}
-    assert folders - {'plots'} <= set(ROOMS)
+    assert folders <= set(ROOMS)
 
 
 @pytest.mark.parametrize(

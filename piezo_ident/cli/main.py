@@ -171,7 +171,7 @@ def _build_parser() -> _Parser:
         '--program',
         type=_name,
         default='identification',
-        help='programme: a file, or the name of one',
+        help='program: a file, or the name of one',
     )
     p.add_argument('--seed', type=_whole, help="of the sensor noise; the stage's own when absent")
     p.add_argument('--sample-rate', type=float, metavar='HZ', help="the stage's own when absent")

@@ -117,6 +117,8 @@ def diagnose(
     """
     settings = settings or DiagnosisSettings()
     records = [records] if isinstance(records, Record) else list(records)
+    for record in records:
+        record.require_displacement()
     part = _beginnings(model, records, settings.most_samples)
     is_whole = part == records
     try:

@@ -213,9 +213,13 @@ def prepare(records: Sequence[Record]) -> Prepared:
     ------
     IdentificationError
         When they carry no response of a stage to a voltage.
+    DataError
+        When one holds no displacement.
     """
     if not records:
         raise IdentificationError('no record was given')
+    for record in records:
+        record.require_displacement()
     records = [without_faults(record.first(MOST_SAMPLES // len(records))) for record in records]
     rate, left = common_rate(records)
     refuse_undriven(records)

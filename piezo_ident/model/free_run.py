@@ -158,6 +158,8 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     ------
     ModelError
         When a piece has another sampling rate than the model, or the prediction overflows.
+    DataError
+        When the record holds no displacement; `StageModel.simulate` needs none.
 
     Examples
     --------
@@ -170,6 +172,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     >>> run.errors.percent < 0.01
     True
     """
+    record.require_displacement()
     record = without_faults(record)
     for piece in record:
         try:

@@ -303,6 +303,19 @@ class Record:
         """Whether the displacement is known; it is NaN where a voltage alone was read."""
         return not np.isnan(self.pieces[0].y[0])
 
+    def require_displacement(self) -> None:
+        """
+        Refuse a record of voltage alone.
+
+        Raises
+        ------
+        DataError
+        """
+        if not self.is_measured:
+            raise DataError(
+                f'{self.name}: holds a voltage and no displacement; only a prediction can use it'
+            )
+
     @property
     def stroke(self) -> float:
         """Largest minus smallest displacement [m], single wild samples left out."""
