@@ -29,7 +29,7 @@ from piezo_ident.common.files import temporary_output
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.model.files import load
-from piezo_ident.model.free_run import Errors, free_run, FreeRun, predict, sine_errors
+from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict, sine_errors
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Record
 from piezo_ident.record.tables import blocks_of, WRITERS
@@ -214,7 +214,7 @@ def _print_errors(run: FreeRun, console: Console) -> None:
 
 
 def _error_data(run: FreeRun) -> dict[str, Any]:
-    def row(errors: Errors) -> dict[str, Any]:
+    def row(errors: FreeRunErrors) -> dict[str, Any]:
         return {
             'percent_of_stroke': errors.percent,
             'fit_percent': errors.fit,

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.effects.second_order import Section
+from piezo_ident.effects.second_order import SecondOrderSection
 from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.chain import Block, Slot
 
@@ -53,7 +53,9 @@ class ChangedDynamics(Effect):
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
         columns = zip(*(self.array(p.name).tolist() for p in self.parameters), strict=True)
-        self._sections = [Section(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns]
+        self._sections = [
+            SecondOrderSection(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns
+        ]
         self._silent = not np.any([self.array('gain'), self.array('rate_gain')])
 
     @classmethod

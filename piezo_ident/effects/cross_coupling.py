@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.effects.second_order import Section, slope_of_mode
+from piezo_ident.effects.second_order import SecondOrderSection, slope_of_mode
 from piezo_ident.operators.chain import Block, Slot
 
 __all__ = ['CrossCoupling']
@@ -64,7 +64,9 @@ class CrossCoupling(Effect):
         # rate is that of the channel whatever the prewarping
         slope = 2.0 * self.sample_rate / slope_of_mode(frequency, self.sample_rate)
         rate = self.number('rate_gain') * slope
-        self._section = Section(frequency, self.number('damping'), gain, rate, self.sample_rate)
+        self._section = SecondOrderSection(
+            frequency, self.number('damping'), gain, rate, self.sample_rate
+        )
         self._gain = gain
         self._started = False
 

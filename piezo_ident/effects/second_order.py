@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 
-__all__ = ['Section', 'slope_of_mode']
+__all__ = ['SecondOrderSection', 'slope_of_mode']
 
 
 @kernel
@@ -50,7 +50,7 @@ def slope_of_mode(frequency: float, sample_rate: float) -> float:
     return float(1.0 / np.tan(np.pi * frequency / sample_rate))
 
 
-class Section:
+class SecondOrderSection:
     """
     ``g (M(s) - 1) + k R(s)`` with M = w^2/D, R = w s/D and D = s^2 + 2 zeta w s + w^2.
 

@@ -23,7 +23,7 @@ from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     errors_of,
-    Fitted,
+    FitOutcome,
     Identification,
     key_of,
     Memories,
@@ -165,7 +165,7 @@ def _labelled(
     settings: Settings,
     progress: Progress,
     steps: Steps,
-) -> Fitted:
+) -> FitOutcome:
     fit = triangle_excerpts(runs)
     if not fit:
         raise IdentificationError(
@@ -204,7 +204,7 @@ def _labelled(
     for run in runs:
         kept = run.held_out()
         masks.append((run.mask('triangle', 'noise', 'settle', 'step') & ~kept, kept))
-    return Fitted(model, delay_result, dynamics, hysteresis, masks, warnings)
+    return FitOutcome(model, delay_result, dynamics, hysteresis, masks, warnings)
 
 
 def _either(

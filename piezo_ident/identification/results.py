@@ -274,7 +274,7 @@ class Headline:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitOutcome:
     """
     What either way of fitting gives, with labelled segments or without.
 

@@ -20,7 +20,7 @@ from piezo_ident.identification.prepare import Excerpt, Run, true_runs
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
-    Fitted,
+    FitOutcome,
     key_of,
     Progress,
     Settings,
@@ -308,7 +308,7 @@ def _why_static(windows: NDArray[np.bool_], band: float) -> str:
 
 def fit_unlabelled(
     runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
-) -> Fitted:
+) -> FitOutcome:
     """
     Fit the run that covers the widest range, but for its end.
 
@@ -367,7 +367,7 @@ def fit_unlabelled(
         *warn_of_range(run, n_fit, scaling),
     ]
     progress('hysteresis', 1.0)
-    return Fitted(
+    return FitOutcome(
         model=model,
         delay=joint.delay,
         dynamics=joint.dynamics,

@@ -22,7 +22,7 @@ from piezo_ident.record.blocks import Samples
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.from_streams import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 
 __all__ = ['Capture', 'Snapshot', 'refuse_incomplete']
 
@@ -128,7 +128,7 @@ class _Clock:
 class Snapshot:
     """A capture as it was at one moment; making a record of it can wait for a quiet hour."""
 
-    streams: Mapping[str, Stream]
+    streams: Mapping[str, BlockStream]
     faults: tuple[Fault, ...] = ()
     tolerance: float | None = None
 
@@ -186,7 +186,7 @@ class Capture:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, BlockStream] = {}
         self._clocks: dict[str, _Clock] = {}
         self._segments: dict[str, int] = {}
         self._unreadable: dict[str, tuple[int, str]] = {}
@@ -205,7 +205,7 @@ class Capture:
         arrival : int
             When it came [ns], by a clock that all topics share.
         """
-        self._streams.setdefault(key, Stream()).append(samples, arrival)
+        self._streams.setdefault(key, BlockStream()).append(samples, arrival)
         clock = self._clocks.setdefault(key, _Clock())
         clock.add(samples.t)
         if key == 'voltage':

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    'Errors',
     'FreeRun',
+    'FreeRunErrors',
     'PieceRun',
     'SineError',
     'free_run',
@@ -53,7 +53,7 @@ _SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])'
 
 
 @dataclass(frozen=True)
-class Errors:
+class FreeRunErrors:
     """
     How far a free run is from the measurement.
 
@@ -96,9 +96,9 @@ class FreeRun:
         Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
         For each piece, whether its memory at the start was estimated from its early part.
-    errors : Errors
+    errors : FreeRunErrors
         Of every sample.
-    errors_after_start : Errors or None
+    errors_after_start : FreeRunErrors or None
         Of the samples at which the start is forgotten, or was known; None when there are none.
     warnings : tuple of str
         What limits the trust in the prediction.
@@ -115,8 +115,8 @@ class FreeRun:
     record: Record
     pieces: tuple[Vector, ...]
     estimated: tuple[bool, ...]
-    errors: Errors
-    errors_after_start: Errors | None
+    errors: FreeRunErrors
+    errors_after_start: FreeRunErrors | None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -265,7 +265,7 @@ def run_pieces(
     return predicted
 
 
-def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) -> Errors:
+def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) -> FreeRunErrors:
     """Return the errors of each piece from a sample on, in blocks for the sake of memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
@@ -281,7 +281,7 @@ def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) 
     square = total(lambda y, y_hat: (y - y_hat) ** 2)
     centred = total(lambda y, y_hat: (y - y_hat - offset) ** 2)
     spread = total(lambda y, y_hat: (y - mean) ** 2)
-    return Errors(
+    return FreeRunErrors(
         n=n,
         percent=percent(np.sqrt(square / n), record.stroke),
         fit=nrmse_fit(np.sqrt(square), np.sqrt(spread)),

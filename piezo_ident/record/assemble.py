@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
-from piezo_ident.record.ordering import at_times, in_order, Rows
+from piezo_ident.record.ordering import at_times, in_order, OrderedRows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 
 __all__ = ['UNITS', 'ReadOptions', 'SegmentStarts', 'assemble', 'label_runs']
@@ -173,7 +173,7 @@ def _table(
     segments: SegmentStarts | None,
     channels: Mapping[str, ArrayLike],
     name: str,
-) -> Rows:
+) -> OrderedRows:
     columns = {}
     given = {'t': t, 'v': v, **({} if y is None else {'y': y}), **channels}
     for key, values in given.items():
@@ -204,10 +204,10 @@ def _table(
             f'{name}: segments need one start for each name, rising sample indices from 0 to {n}'
         )
     empty = np.zeros(0, dtype=np.int64)
-    return Rows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
+    return OrderedRows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
 
 
-def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
+def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> OrderedRows:
     finite = np.isfinite(table.t)
     for x in table.columns.values():
         finite &= np.isfinite(x)
@@ -226,7 +226,7 @@ def _drop_not_finite(table: Rows, name: str, met: list[Fault]) -> Rows:
     return replace(table.take(rows), torn=torn)
 
 
-def _check_limits(table: Rows, limits: tuple[float, float] | None, name: str) -> None:
+def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: str) -> None:
     v = table.columns['v']
     if limits is None or (limits[0] <= v.min() and v.max() <= limits[1]):
         return
@@ -239,7 +239,7 @@ def _check_limits(table: Rows, limits: tuple[float, float] | None, name: str) ->
     )
 
 
-def _check_ranges(table: Rows, unit: str, name: str) -> None:
+def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     """Refuse times, voltages and strokes that no piezo stage has."""
     ends = {'t': table.t, **table.columns}
     ranges = {k: (float(x.min()), float(x.max())) for k, x in ends.items() if k in 'tvy'}
@@ -269,7 +269,7 @@ def _check_ranges(table: Rows, unit: str, name: str) -> None:
 
 
 def _pieces(
-    table: Rows, epochs: list[int], name: str, sample_rate: float | None, met: list[Fault]
+    table: OrderedRows, epochs: list[int], name: str, sample_rate: float | None, met: list[Fault]
 ) -> tuple[Piece, ...]:
     t = table.t
     resolution = Resolution.of(t)
@@ -332,7 +332,7 @@ def _clocks(
 
 
 def _report_breaks(
-    table: Rows,
+    table: OrderedRows,
     epochs: list[int],
     parts: list[tuple[int, int]],
     clocks: list[Clock],
@@ -362,7 +362,7 @@ def _report_breaks(
         met.append(Fault('rate_change', where, len(changes), 'record split there'))
 
 
-def _piece(table: Rows, part: tuple[int, int], clock: Clock) -> Piece:
+def _piece(table: OrderedRows, part: tuple[int, int], clock: Clock) -> Piece:
     start, stop = part
     columns = {k: x[start:stop] for k, x in table.columns.items()}
     starts = table.starts

@@ -15,7 +15,7 @@ from piezo_ident.record.assemble import assemble, ReadOptions
 from piezo_ident.record.join import join
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 
 __all__ = [
     'APPLIED',
@@ -35,7 +35,7 @@ MAX_MISSING = 0.05
 
 
 def record_of_streams(
-    streams: Mapping[str, Stream],
+    streams: Mapping[str, BlockStream],
     *,
     name: str,
     tolerance: float | None = None,
@@ -48,7 +48,7 @@ def record_of_streams(
 
     Parameters
     ----------
-    streams : mapping of str to Stream
+    streams : mapping of str to BlockStream
         Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
         command and applied voltage differ, the amplifier's guard was at work: the stage did not
         get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
@@ -114,7 +114,7 @@ def record_of_streams(
     )
 
 
-def _sparse(streams: Mapping[str, Stream]) -> dict[str, Fault]:
+def _sparse(streams: Mapping[str, BlockStream]) -> dict[str, Fault]:
     """Return the further channels for whose sake too many other samples would be cut out."""
     n = min(streams['voltage'].n, streams['displacement'].n)
     return {

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Fault
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 
 __all__ = ['Joined', 'join']
 
@@ -37,15 +37,17 @@ class Joined:
     faults: tuple[Fault, ...]
 
 
-def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = None) -> Joined:
+def join(
+    streams: Mapping[str, BlockStream], beside: Mapping[str, BlockStream] | None = None
+) -> Joined:
     """
     Join streams on their time stamps.
 
     Parameters
     ----------
-    streams : mapping of str to Stream
+    streams : mapping of str to BlockStream
         By quantity; the first gives the order and the segments.
-    beside : mapping of str to Stream, optional
+    beside : mapping of str to BlockStream, optional
         Streams that are looked up where they have a value, and leave NaN where they have none.
 
     Returns
@@ -95,7 +97,7 @@ def join(streams: Mapping[str, Stream], beside: Mapping[str, Stream] | None = No
 
 
 def _labels(
-    stream: Stream, place: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+    stream: BlockStream, place: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> tuple[list[str], list[int]]:
     """Return the label of each stretch and its first row, from how many rows before one stay."""
     names, starts = stream.labels()
@@ -148,7 +150,7 @@ class _Laps:
 
 
 def _in_step(
-    t: NDArray[np.float64], streams: Mapping[str, Stream], beside: Mapping[str, Stream]
+    t: NDArray[np.float64], streams: Mapping[str, BlockStream], beside: Mapping[str, BlockStream]
 ) -> _Laps | None:
     """
     Return the runs of the clock in which each stream has the stamps of the lead from its first on.
@@ -178,8 +180,8 @@ def _in_step(
 
 def _joined_in_step(
     t: NDArray[np.float64],
-    streams: Mapping[str, Stream],
-    beside: Mapping[str, Stream],
+    streams: Mapping[str, BlockStream],
+    beside: Mapping[str, BlockStream],
     laps: _Laps,
 ) -> Joined:
     """Join streams by cutting what one of them has at the end of a run and another has not."""

@@ -21,7 +21,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
 
-__all__ = ['Rows', 'at_times', 'in_order']
+__all__ = ['OrderedRows', 'at_times', 'in_order']
 
 #: time may jump back in a record only between stretches of at least this many samples
 MIN_STRETCH = 10
@@ -30,7 +30,7 @@ MAX_REPEAT = 200
 
 
 @dataclass(frozen=True)
-class Rows:
+class OrderedRows:
     """Columns, the row where each label begins, and the rows that lost their predecessor."""
 
     t: NDArray[np.float64]
@@ -39,9 +39,9 @@ class Rows:
     starts: NDArray[np.int64]
     torn: NDArray[np.int64]
 
-    def take(self, rows: NDArray[np.int64]) -> Rows:
+    def take(self, rows: NDArray[np.int64]) -> OrderedRows:
         """Return only these rows, which must be in order."""
-        return Rows(
+        return OrderedRows(
             self.t[rows],
             {k: x[rows] for k, x in self.columns.items()},
             self.names,
@@ -50,13 +50,13 @@ class Rows:
         )
 
 
-def in_order(table: Rows, name: str, met: list[Fault]) -> tuple[Rows, list[int]]:
+def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRows, list[int]]:
     """
     Drop repeated rows and find where the clock restarts.
 
     Parameters
     ----------
-    table : Rows
+    table : OrderedRows
         Finite rows as measured.
     name : str
         What errors call the data.
@@ -65,7 +65,7 @@ def in_order(table: Rows, name: str, met: list[Fault]) -> tuple[Rows, list[int]]
 
     Returns
     -------
-    Rows
+    OrderedRows
         What is left, rising in time within each epoch.
     list of int
         The row at which each epoch begins; the first is 0.
@@ -103,7 +103,7 @@ def in_order(table: Rows, name: str, met: list[Fault]) -> tuple[Rows, list[int]]
 
 
 def _stretches(
-    table: Rows, jumps: NDArray[np.int64], name: str
+    table: OrderedRows, jumps: NDArray[np.int64], name: str
 ) -> tuple[NDArray[np.int64] | None, list[int], NDArray[np.float64]]:
     """
     Sort stretches of rising time into repeats and restarts; refuse what is neither.

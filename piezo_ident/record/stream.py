@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['SPOOLED', 'LossCount', 'Stream']
+__all__ = ['SPOOLED', 'BlockStream', 'LossCount']
 
 #: numbers in a chunk of a stream
 CHUNK = 1 << 17
@@ -27,7 +27,7 @@ CHUNK = 1 << 17
 SPOOLED = 1 << 21
 
 
-class Stream:
+class BlockStream:
     """
     All blocks of one topic so far, in flat buffers that grow chunk by chunk.
 
@@ -66,9 +66,9 @@ class Stream:
         last = self._segments[-1] if self._segments else ''
         self._segments.append(last if last == samples.segment else samples.segment)
 
-    def copy(self) -> Stream:
+    def copy(self) -> BlockStream:
         """Return the stream as it is now, without copying what no longer changes."""
-        other = Stream()
+        other = BlockStream()
         other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
         other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
         other._segments = self._segments[:]

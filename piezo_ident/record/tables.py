@@ -32,7 +32,7 @@ from piezo_ident.record.assemble import label_runs
 from piezo_ident.record.mat_read import read_variables
 from piezo_ident.record.record import Record
 
-__all__ = ['READERS', 'WRITERS', 'Blocks', 'Table', 'blocks_of', 'labels_of']
+__all__ = ['READERS', 'WRITERS', 'Blocks', 'RecordTable', 'blocks_of', 'labels_of']
 
 Vector = NDArray[np.float64]
 #: yields the columns block by block, each time it is called
@@ -51,7 +51,7 @@ _POINTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class RecordTable:
     """Raw columns of a file, the segments' names and starts, and the names of unused columns."""
 
     columns: dict[str, NDArray[np.float64]]
@@ -132,7 +132,7 @@ def _check_names(names: Iterable[str], path: Path) -> None:
 # --- CSV ------------------------------------------------------------------------------------
 
 
-def read_csv(path: Path) -> Table:
+def read_csv(path: Path) -> RecordTable:
     """Read a CSV file with a header line; comments may stand above it."""
     try:
         # newline='' leaves line ends to the csv module; utf-8-sig drops a byte order mark
@@ -171,7 +171,7 @@ def _uncommented(lines: Iterable[str]) -> Iterator[str]:
     yield from rest
 
 
-def _parse_csv(reader: Any, path: Path) -> Table:
+def _parse_csv(reader: Any, path: Path) -> RecordTable:
     header = _header(reader, path)
     numeric = {name: i for i, name in enumerate(header) if _wanted(name)}
     label = header.index('segment') if 'segment' in header else None
@@ -202,7 +202,7 @@ def _parse_csv(reader: Any, path: Path) -> Table:
         n += len(columns[0])
     if not n:
         raise DataError(f'{path}: no rows below the header; record some samples')
-    return Table(
+    return RecordTable(
         {name: np.concatenate(parts) for name, parts in chunks.items()},
         names,
         starts,
@@ -286,7 +286,7 @@ def _quoted(text: str) -> str:
 # --- npz ------------------------------------------------------------------------------------
 
 
-def read_npz(path: Path) -> Table:
+def read_npz(path: Path) -> RecordTable:
     """Read a NumPy archive; pickled objects are refused."""
     with _damage(path, 'npz archive', 'save it again with numpy.savez'):
         with zipfile.ZipFile(path) as archive:
@@ -300,7 +300,7 @@ def _used(name: str) -> bool:
     return re.fullmatch(_USED, name) is not None
 
 
-def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Path) -> Table:
+def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Path) -> RecordTable:
     _check_names(everything, path)
     columns = {}
     for name in filter(_wanted, arrays):
@@ -319,14 +319,14 @@ def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Pat
     if ('segment_name' in arrays) != ('segment_start' in arrays):
         raise DataError(f'{path}: segment_name and segment_start need each other; save both')
     if 'segment_name' not in arrays:
-        return Table(columns, ignored=ignored)
+        return RecordTable(columns, ignored=ignored)
     starts = np.asarray(arrays['segment_start'])
     if starts.dtype.kind not in 'fiu':
         raise DataError(f'{path}: segment_start holds no numbers; save sample indices from 0')
     names = np.ravel(arrays['segment_name'])
     if names.dtype.kind != 'U':
         raise DataError(f'{path}: segment_name holds no text; save it as text (MATLAB: a cellstr)')
-    return Table(columns, [name.strip() for name in names.tolist()], starts.ravel(), ignored)
+    return RecordTable(columns, [name.strip() for name in names.tolist()], starts.ravel(), ignored)
 
 
 def write_npz(
@@ -352,7 +352,7 @@ def write_npz(
 # --- MATLAB ---------------------------------------------------------------------------------
 
 
-def read_mat(path: Path) -> Table:
+def read_mat(path: Path) -> RecordTable:
     """Read a MATLAB file of version 4 to 7."""
     with _damage(path, 'MATLAB file', 'save it again with save -v7'):
         with path.open('rb') as file:
@@ -394,7 +394,7 @@ def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
         raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
 
 
-READERS: Mapping[str, Callable[[Path], Table]] = {
+READERS: Mapping[str, Callable[[Path], RecordTable]] = {
     '.csv': read_csv,
     '.npz': read_npz,
     '.mat': read_mat,

@@ -9,7 +9,7 @@ import numpy as np
 from piezo_ident.record import join as joining
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.join import join
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 import pytest
 
 RATE = 1000.0
@@ -18,7 +18,7 @@ LABELS = ('step', 'noise', '')
 
 def stream(runs, size, late=0, scale=1.0):
     """Return a stream of runs of the clock from zero, each of so many samples, in blocks."""
-    made = Stream()
+    made = BlockStream()
     for k, n in enumerate(runs):
         for i in range(0, n, size):
             rows = np.arange(i, min(i + size, n))
@@ -57,7 +57,7 @@ def test_it_is_what_the_table_of_partners_gives(lengths, data):
 
 
 def test_what_was_lost_in_the_middle_goes_by_the_table():
-    whole, torn = stream([300], 100), Stream()
+    whole, torn = stream([300], 100), BlockStream()
     for k in (0, 2):
         rows = np.arange(100 * k, 100 * (k + 1))
         torn.append(Samples(rows / RATE, -1.0 * rows, 'noise'), k)
@@ -69,7 +69,7 @@ def test_what_was_lost_in_the_middle_goes_by_the_table():
 
 def test_runs_that_came_at_another_time_are_no_partners():
     # the second run of one is the first of the other: only the arrivals tell
-    one, other = stream([50, 50], 10), Stream()
+    one, other = stream([50, 50], 10), BlockStream()
     for k in range(5):
         rows = np.arange(10 * k, 10 * (k + 1))
         other.append(Samples(rows / RATE, rows + 1000.0, 'step'), 1_000_000 * (10_020 + k))

@@ -32,7 +32,7 @@ from piezo_ident.record.bags.recover import (
 from piezo_ident.record.blocks import decode, quantity_of, Samples
 from piezo_ident.record.from_streams import APPLIED, record_of_streams
 from piezo_ident.record.record import Record
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
@@ -143,7 +143,7 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
             )
         asked = {'voltage': options.voltage_topic, 'displacement': options.displacement_topic}
         topics = _choose(carried_quantities(bag), asked, options.namespace, path)
-        streams = {quantity: Stream(spooled=True) for quantity in topics}
+        streams = {quantity: BlockStream(spooled=True) for quantity in topics}
         for quantity, samples, stamp in _blocks(bag, topics):
             streams[quantity].append(samples, stamp)
     return record_of_streams(

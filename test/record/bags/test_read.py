@@ -16,7 +16,7 @@ from piezo_ident.record.blocks import Dimension, Samples
 from piezo_ident.record.from_streams import APPLIED
 from piezo_ident.record.join import join
 from piezo_ident.record.record import Piece, Record, Segment
-from piezo_ident.record.stream import Stream
+from piezo_ident.record.stream import BlockStream
 import pytest
 from rosbags.rosbag2 import storage_mcap
 import yaml
@@ -146,7 +146,7 @@ def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
 
 
 def test_streams_cut_into_other_blocks():
-    streams = {'voltage': Stream(), 'displacement': Stream()}
+    streams = {'voltage': BlockStream(), 'displacement': BlockStream()}
     t = np.arange(700) / RATE
     for i in range(0, 700, 100):
         streams['voltage'].append(Samples(t[i : i + 100], t[i : i + 100]), i)
