@@ -122,7 +122,8 @@ class Graph:
                 handle.kill()
         finally:
             self._end.set()
-            self._thread.join(5.0)
+            # a node that is destroyed while the thread spins ends the process
+            self._thread.join(60.0)
             self._executor.shutdown(timeout_sec=1.0)
             self.node.destroy_node()
             rclpy.shutdown(context=self.context)
