@@ -14,9 +14,9 @@ from piezo_ident.common.errors import DataError
 
 def numbers(tick):
     tick('half', 0.5)
-    time.sleep(0.1)
+    time.sleep(0.2)
     tick('most', 0.9)
-    time.sleep(0.1)
+    time.sleep(0.2)
     return array('d', [2.0] * 200_000), np.arange(300_000.0), MappingProxyType({'a': 1})
 
 
