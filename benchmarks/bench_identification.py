@@ -106,7 +106,7 @@ def whole(record: Record, runs: int) -> tuple[str, str]:
 
 def by_steps(record: Record, runs: int) -> tuple[str, str]:
     """Return the table of the steps, each alone."""
-    settings = Settings()
+    settings = Settings(thresholds=10)
     data = prepare([record])
     delay = Delay(first_step(data.runs, settings, silent).samples)
     _, G = second_step(data.runs, delay, settings, silent)
