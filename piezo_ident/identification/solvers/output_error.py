@@ -77,10 +77,14 @@ def _first_row(
     row = np.zeros(lags)
     # all lags of a stretch while it is in the cache
     for start in range(0, n, STRETCH):
+        size = min(STRETCH, n - start)
+        a = x[x_at + start : x_at + start + size]
         for j in range(lags):
+            # slices, whose indices cannot be negative, let the loop run in vector lanes
+            b = z[z_at + start - j : z_at + start - j + size]
             total = 0.0
-            for k in range(start, min(start + STRETCH, n)):
-                total += x[x_at + k] * z[z_at + k - j]
+            for k in range(size):
+                total += a[k] * b[k]
             row[j] += total
     return row
 
