@@ -266,4 +266,5 @@ def _constant(x: Vector, least: int = STUCK) -> Runs:
     """Return the stretches of at least so many equal samples."""
     same = np.concatenate([[False], x[1:] == x[:-1], [False]])
     edges = np.flatnonzero(same[1:] != same[:-1]).reshape(-1, 2)
-    return [(int(a), int(b) + 1) for a, b in edges if b + 1 - a >= least]
+    edges = edges[edges[:, 1] + 1 - edges[:, 0] >= least]
+    return [(int(a), int(b) + 1) for a, b in edges]
