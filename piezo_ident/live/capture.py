@@ -12,14 +12,14 @@ what was forgotten to make room.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
+from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.from_streams import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
@@ -72,56 +72,42 @@ def refuse_incomplete(
             )
 
 
-@dataclass
-class _Clock:
-    """Where the sample clock of one topic stands, and what happened to it."""
+class _Topic:
+    """The blocks of one topic that are kept, its clock, and what could not be kept."""
 
-    last: float = float('nan')
-    begin: float = float('nan')
-    period: float = float('nan')
-    lost: int = 0
-    late: int = 0
-    restarts: int = 0
-    seconds: list[float] = field(default_factory=list)  # of each block that is kept
-    runs: list[int] = field(default_factory=list)  # blocks at which the clock restarted
-    total: float = 0.0
-    samples: int = 0  # since the last time that room was made
-    dropped: int = 0  # blocks that are no longer kept
+    def __init__(self) -> None:
+        self.stream, self.clock = BlockStream(), BlockClock()
+        # counts of samples at which the clock restarted, and samples that are no longer kept
+        self._runs: list[int] = []
+        self.dropped = 0
 
-    def add(self, t: NDArray[np.float64]) -> None:
-        """Take note of a block."""
-        n = t.size
-        first, last = (float(t[0]), float(t[-1])) if n else (self.last, self.last)
-        if n > 1 and 0.0 < last - first < np.inf:
-            self.period = (last - first) / (n - 1)
-        seconds = n * self.period if np.isfinite(self.period) else 0.0
-        step = first - self.last
-        if not np.isfinite(first):
-            # where it lies nobody knows; the record will say so
-            pass
-        elif np.isnan(self.begin):
-            self.begin = first
-        elif step > 1.5 * self.period:
-            self.lost += round(step / self.period) - 1
-        elif step <= 0.0:
-            if has_restarted(first, self.last, self.begin, self.period):
-                self.restarts += 1
-                self.runs.append(len(self.seconds))
-                self.begin = first
-            else:
-                self.late += n
-        if np.isfinite(last):
-            self.last = last
-        self.seconds.append(seconds)
-        self.total += seconds
-        self.samples += n
+    def add(self, samples: Samples, arrival: int) -> None:
+        """Take a block; where one with impossible times lies, the record will say."""
+        t, restarts = samples.t, self.clock.restarts
+        if t.size and np.isfinite(t).all():
+            self.clock.judge(t)
+            if self.clock.restarts > restarts:
+                self._runs.append(self.total)
+        self.stream.append(samples, arrival)
 
-    def drop(self, blocks: int) -> None:
-        """Forget the oldest blocks."""
-        self.total -= sum(self.seconds[:blocks])
-        self.dropped += blocks
-        del self.seconds[:blocks]
-        self.runs = [i - blocks for i in self.runs if i > blocks]
+    @property
+    def total(self) -> int:
+        """Samples so far."""
+        return self.dropped + self.stream.n
+
+    def seconds(self, n: int) -> float:
+        """Return how long so many samples are [s]; zero before the period is known."""
+        return n * self.clock.period if np.isfinite(self.clock.period) else 0.0
+
+    def make_room(self, limit: float) -> float:
+        """Forget the oldest run, or a tenth of the only one; return how long it was [s]."""
+        n = next((run - self.dropped for run in self._runs if run > self.dropped), 0)
+        if not n:
+            share = 0.1 * limit / self.clock.period if self.seconds(self.stream.n) > limit else 0
+            n = round(share) or self.stream.n // 10
+        n = self.stream.drop(n)
+        self.dropped += n
+        return self.seconds(n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +172,7 @@ class Capture:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._streams: dict[str, BlockStream] = {}
-        self._clocks: dict[str, _Clock] = {}
+        self._topics: dict[str, _Topic] = {}
         self._segments: dict[str, int] = {}
         self._unreadable: dict[str, tuple[int, str]] = {}
         self._forgotten = 0.0
@@ -205,53 +190,31 @@ class Capture:
         arrival : int
             When it came [ns], by a clock that all topics share.
         """
-        self._streams.setdefault(key, BlockStream()).append(samples, arrival)
-        clock = self._clocks.setdefault(key, _Clock())
-        clock.add(samples.t)
+        topic = self._topics.setdefault(key, _Topic())
+        topic.add(samples, arrival)
         if key == 'voltage':
             self.segment = samples.segment
             label = samples.segment or 'unlabelled'
             if len(self._segments) >= MOST_LABELS and label not in self._segments:
                 label = 'others'
             self._segments[label] = self._segments.get(label, 0) + samples.t.size
-        if (
-            clock.total > self.limit
-            or clock.samples > MOST_SAMPLES
-            or len(clock.seconds) > MOST_BLOCKS
-        ):
-            self._make_room(key)
+        n, blocks = topic.stream.n, topic.stream.blocks
+        if topic.seconds(n) > self.limit or n > MOST_SAMPLES or blocks > MOST_BLOCKS:
+            forgotten = topic.make_room(self.limit)
+            self._forgotten += forgotten if key == 'voltage' else 0.0
 
     def unreadable(self, key: str, reason: str) -> None:
         """Take note of a message that is no block."""
         self._unreadable[key] = (self._unreadable.get(key, (0, ''))[0] + 1, reason)
 
-    def _make_room(self, key: str) -> None:
-        clock = self._clocks[key]
-        blocks = next(iter(clock.runs), 0)
-        if not blocks and clock.total <= self.limit:
-            blocks = max(1, len(clock.seconds) // 10)
-        elif not blocks:
-            room = 0.0
-            while room < 0.1 * self.limit and blocks < len(clock.seconds) - 1:
-                room += clock.seconds[blocks]
-                blocks += 1
-        before = clock.total
-        clock.drop(blocks)
-        self._streams[key].drop(blocks)
-        clock.samples = self._streams[key].n
-        if key == 'voltage':
-            self._forgotten += before - clock.total
-
     def mark(self) -> dict[str, int]:
         """Return what tells later what was captured after now; not across `clear`."""
-        return {key: clock.dropped + len(clock.seconds) for key, clock in self._clocks.items()}
+        return {key: topic.total for key, topic in self._topics.items()}
 
     def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
         """Return the measured time of a topic after a mark that is kept [s]."""
-        if key not in self._clocks:
-            return 0.0
-        clock = self._clocks[key]
-        return sum(clock.seconds[max(0, mark.get(key, 0) - clock.dropped) :])
+        topic = self._topics.get(key, _Topic())
+        return topic.seconds(min(topic.stream.n, topic.total - mark.get(key, 0)))
 
     def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
         """
@@ -270,9 +233,9 @@ class Capture:
             where = f'the oldest {self._forgotten:.3g} s'
             action = f'forgotten, {self.limit:g} s are kept'
             faults.append(Fault('capture_limit', where, 1, action))
-        streams = {key: stream.copy() for key, stream in self._streams.items()}
+        streams = {key: topic.stream.copy() for key, topic in self._topics.items()}
         for key, stream in streams.items():
-            stream.drop(max(0, (since or {}).get(key, 0) - self._clocks[key].dropped))
+            stream.drop((since or {}).get(key, 0) - self._topics[key].dropped)
         return Snapshot(streams, tuple(faults), self.tolerance)
 
     def record(self, name: str = 'capture') -> Record:
@@ -282,24 +245,20 @@ class Capture:
     @property
     def keys(self) -> tuple[str, ...]:
         """What was captured, in order of appearance."""
-        return tuple(self._streams)
+        return tuple(self._topics)
 
     @property
     def n(self) -> int:
-        """Samples of the voltage."""
-        return self.count('voltage')
-
-    def count(self, key: str) -> int:
-        """Return the samples of a topic that are kept."""
-        return self._streams[key].n if key in self._streams else 0
+        """Samples of the voltage that are kept."""
+        return self._topics['voltage'].stream.n if 'voltage' in self._topics else 0
 
     def last_time(self, key: str) -> float:
         """Return the time of the newest sample of a topic [s]; NaN before the first."""
-        return self._clocks[key].last if key in self._clocks else float('nan')
+        return self._topics[key].clock.last if key in self._topics else float('nan')
 
     def seconds_of(self, key: str) -> float:
         """Return the measured time of a topic that is kept [s]."""
-        return self._clocks[key].total if key in self._clocks else 0.0
+        return self.seconds_since({}, key)
 
     @property
     def seconds(self) -> float:
@@ -314,22 +273,17 @@ class Capture:
     @property
     def lost(self) -> Mapping[str, int]:
         """Samples that never came, by topic, as its sample clock tells."""
-        return {key: clock.lost for key, clock in self._clocks.items()}
-
-    @property
-    def late(self) -> Mapping[str, int]:
-        """Samples that came again or out of turn, by topic."""
-        return {key: clock.late for key, clock in self._clocks.items()}
+        return {key: topic.clock.lost for key, topic in self._topics.items()}
 
     @property
     def problems(self) -> tuple[str, ...]:
         """What is wrong with the capture so far, one sentence a topic."""
         problems = []
-        for key, clock in self._clocks.items():
-            if clock.lost:
-                problems.append(f'{clock.lost} samples of {key} are missing')
-            if clock.late:
-                problems.append(f'{clock.late} samples of {key} came twice or out of turn')
+        for key, topic in self._topics.items():
+            if topic.clock.lost:
+                problems.append(f'{topic.clock.lost} samples of {key} are missing')
+            if topic.clock.late:
+                problems.append(f'{topic.clock.late} samples of {key} came twice or out of turn')
         for key, (count, reason) in self._unreadable.items():
             problems.append(f'{count} messages on {key} are no blocks ({reason})')
         return tuple(problems)

@@ -135,31 +135,31 @@ def _follow(
         if not np.isfinite(x):
             counts[0] += 1
             # the limits may have been moved since
-            x = min(max(state[1], low), high)
+            x = min(max(state[_COMMAND], low), high)
         else:
             if x < low or x > high:
                 counts[1] += 1
                 x = min(max(x, low), high)
-            state[1] = x
-            if state[5] > 0.0:
-                state[5] = 0.0
-                offset = state[0] - x
+            state[_COMMAND] = x
+            if state[_PENDING] > 0.0:
+                state[_PENDING] = 0.0
+                offset = state[_APPLIED] - x
                 # a distance that the ramp covers in one sample needs no ramp
                 if abs(offset) > ramp_step:
-                    state[2] = offset
-                    state[3] = 0.0
-                    state[4] = math.ceil(2.0 * abs(offset) / ramp_step)
-        if state[3] < state[4] and state[5] == 0.0:
-            tau = state[3] / state[4]
+                    state[_OFFSET] = offset
+                    state[_DONE] = 0.0
+                    state[_LENGTH] = math.ceil(2.0 * abs(offset) / ramp_step)
+        if state[_DONE] < state[_LENGTH] and state[_PENDING] == 0.0:
+            tau = state[_DONE] / state[_LENGTH]
             left = 1.0 - (tau - math.sin(2.0 * math.pi * tau) / (2.0 * math.pi))
-            x = min(max(x + state[2] * left, low), high)
-            state[3] += 1.0
+            x = min(max(x + state[_OFFSET] * left, low), high)
+            state[_DONE] += 1.0
             counts[3] += 1
-        change = x - state[0]
+        change = x - state[_APPLIED]
         if abs(change) > step * (1.0 + 1e-9):
             counts[2] += 1
-            x = state[0] + math.copysign(step, change)
-        state[0] = x
+            x = state[_APPLIED] + math.copysign(step, change)
+        state[_APPLIED] = x
         out[k] = x
 
 
@@ -195,6 +195,8 @@ class Guard:
         self._ramp: tuple[float, int, int] | None = None
         # whether nothing has been commanded since the last silence
         self._idled = False
+        # compiles, so that the first block does not have to wait
+        self.process(())
 
     @property
     def settings(self) -> GuardSettings:
@@ -216,11 +218,6 @@ class Guard:
         """Whether the rest voltage is applied."""
         return self.applied == self._settings.rest
 
-    @property
-    def is_joining(self) -> bool:
-        """Whether a new stream has not been joined yet."""
-        return bool(self._state[_PENDING] or self._state[_DONE] < self._state[_LENGTH])
-
     def process(self, command: ArrayLike, restarted: bool = False) -> Applied:
         """
         Return what may be applied of the next stretch of command.
@@ -239,40 +236,12 @@ class Guard:
             state[_DONE] = state[_LENGTH] = 0.0
             state[_PENDING] = 1.0
             self._ramp, self._idled = None, False
-        if not v.size or self._is_in_order(v):
-            return Applied(v)
         counts = np.zeros(len(REASONS), dtype=np.int64)
         out = np.empty_like(v)
-        _follow(
-            v,
-            settings.low,
-            settings.high,
-            settings.step,
-            settings.ramp_step,
-            state,
-            out,
-            counts,
-        )
+        limits = settings.low, settings.high, settings.step, settings.ramp_step
+        _follow(v, *limits, state, out, counts)
         altered = {why: int(n) for why, n in zip(REASONS, counts, strict=True) if n}
         return Applied(out, altered)
-
-    def _is_in_order(self, v: NDArray[np.float64]) -> bool:
-        """Take the short way for a command that is in order, and say whether it was."""
-        state, settings = self._state, self._settings
-        if state[_DONE] < state[_LENGTH]:
-            return False
-        # comparisons with NaN are false, so that this finds every sample that is no number too
-        if not (v.min() >= settings.low and v.max() <= settings.high):
-            return False
-        first = abs(v[0] - state[_APPLIED])
-        step = settings.step * (1.0 + 1e-9)
-        if not first <= (settings.ramp_step if state[_PENDING] else step):
-            return False
-        if v.size > 1 and not np.abs(np.diff(v)).max() <= step:
-            return False
-        state[_APPLIED] = state[_COMMAND] = v[-1]
-        state[_PENDING] = 0.0
-        return True
 
     def hold(self, n: int) -> NDArray[np.float64]:
         """Return what is applied while `n` samples of a stream are missing: the last voltage."""

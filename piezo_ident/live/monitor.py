@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.clock import has_restarted
 
 __all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
 
@@ -41,24 +41,12 @@ class Matched:
 
 
 class _Side:
-    """One of two streams: its waiting blocks, newest time, and number of clock restarts."""
+    """One of two streams: its clock, its waiting blocks, and the run of the clock it is in."""
 
     def __init__(self) -> None:
+        self.clock = BlockClock()
         self.waiting: list[Samples] = []
         self.run = 0
-        self.begin = self.last = float('nan')
-        self.period = 0.0
-
-    def restarts_with(self, t: NDArray[np.float64]) -> bool:
-        """Note the times of a block, and return whether the clock restarted before it."""
-        first, last = float(t[0]), float(t[-1])
-        if t.size > 1:
-            self.period = (last - first) / (t.size - 1)
-        again = last < self.last and has_restarted(first, self.last, self.begin, self.period)
-        if again or np.isnan(self.begin):
-            self.begin = first
-        self.last = last if again else max(last, float(np.nan_to_num(self.last, nan=last)))
-        return again
 
     @property
     def span(self) -> float:
@@ -67,7 +55,7 @@ class _Side:
 
     def forget(self) -> int:
         """Drop blocks that have waited too long, and return their number of samples."""
-        kept = [s for s in self.waiting if self.last - s.t[-1] <= WAIT][-MOST:]
+        kept = [s for s in self.waiting if self.clock.last - s.t[-1] <= WAIT][-MOST:]
         n = sum(s.t.size for s in self.waiting) - sum(s.t.size for s in kept)
         self.waiting = kept
         return n
@@ -101,9 +89,11 @@ class Matcher:
         return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
 
     def _match(self, new: Samples, own: _Side, other: _Side) -> list[tuple[Samples, Samples]]:
-        if np.isnan(own.begin):
+        restarts = own.clock.restarts
+        if np.isnan(own.clock.last):
             own.run = other.run
-        if own.restarts_with(new.t):
+        own.clock.judge(new.t)
+        if own.clock.restarts > restarts:
             own.waiting.clear()
             # the second of the two to restart has only caught up
             own.run = other.run if other.run > own.run else own.run + 1

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
+from piezo_ident.live.block_clock import BlockClock
+from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.clock import has_restarted
 
 __all__ = ['Predictor', 'TurningPoints', 'expected_error', 'warm_up']
 
@@ -166,35 +167,36 @@ class Predictor:
 
     Attributes
     ----------
-    lost : int
-        Samples that are missing or not usable.
-    late : int
-        Samples that arrived again or out of order, and were left out.
-    restarts : int
-        Number of restarts of the sample clock.
     problem : str
         The last problem of the stream; empty without one.
     """
 
     def __init__(self) -> None:
         self.model: StageModel | None = None
-        self.lost = self.late = self.restarts = 0
         self.problem = ''
-        self._stream: Stream | None = None
-        self._lowest = float('inf')
-        self._period = self._begin = self._last = float('nan')
-        self._blocks = 0
+        self._clock = BlockClock()
         self._clear()
 
     def _clear(self) -> None:
         self._old = TurningPoints()
         self._recent: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
-        self._stream = None
+        self._stream: Stream | None = None
+        self._lowest = float('inf')
 
     @property
-    def sample_rate(self) -> float:
-        """Rate of the stream [Hz]; NaN before it is known."""
-        return 1.0 / self._period
+    def lost(self) -> int:
+        """Samples that are missing or not usable."""
+        return self._clock.lost
+
+    @property
+    def late(self) -> int:
+        """Samples that arrived again or out of order, and were left out."""
+        return self._clock.late
+
+    @property
+    def restarts(self) -> int:
+        """Number of restarts of the sample clock."""
+        return self._clock.restarts
 
     @property
     def memory_known(self) -> bool:
@@ -208,7 +210,7 @@ class Predictor:
     @property
     def memory_lost(self) -> bool:
         """Whether blocks arrive and the memory of the plays is not known."""
-        return bool(np.isfinite(self._last)) and not self.memory_known
+        return bool(np.isfinite(self._clock.last)) and not self.memory_known
 
     def set_model(self, model: StageModel) -> None:
         """
@@ -219,7 +221,7 @@ class Predictor:
         ModelError
             When its sampling rate differs from that of the stream.
         """
-        if np.isfinite(self._period):
+        if np.isfinite(self._clock.period):
             self._check_rate(model)
         self.model = model
         self._stream = self._caught_up(model) if self._recent else None
@@ -227,10 +229,10 @@ class Predictor:
             self.problem = ''
 
     def _check_rate(self, model: StageModel) -> None:
-        if model.is_static or abs(self._period * model.sample_rate - 1.0) < 1e-6:
+        if model.is_static or abs(self._clock.period * model.sample_rate - 1.0) < 1e-6:
             return
         raise ModelError(
-            f'the stream is sampled at {1.0 / self._period:.6g} Hz, the model holds for '
+            f'the stream is sampled at {1.0 / self._clock.period:.6g} Hz, the model holds for '
             f'{model.sample_rate:g} Hz; identify a model at the rate of the stream'
         )
 
@@ -239,7 +241,7 @@ class Predictor:
         # without older samples the recent ones are the whole run
         if len(self._old):
             if model.effects_in('input') or model.effects_in('hysteresis'):
-                t, v = self._old.path(self._period)
+                t, v = self._old.path(self._clock.period)
             else:
                 # plays alone do not depend on time
                 v = self._old.values
@@ -266,32 +268,24 @@ class Predictor:
         t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
         if not self._usable(t, v):
             return None
-        n, step = t.size, float(t[0]) - self._last
-        period = float(t[-1] - t[0]) / (n - 1) if n > 1 else self._period
-        if np.isnan(step):
-            self._start(t, period)
-        elif step <= 0.5 * period:
-            is_repeated = self._blocks == 1 and float(t[-1]) == self._last
-            if not is_repeated and has_restarted(float(t[0]), self._last, self._begin, period):
-                self.restarts += 1
-                if t[0] > 0.5 * period:
-                    # a program that starts again starts at zero
-                    self.problem = f'time jumps back from {self._last:.6g} to {t[0]:.6g} s'
-                self._start(t, period)
-            else:
-                new = t > self._last + 0.5 * period
-                self.late += n - int(new.sum())
-                self.problem = f'samples at t = {t[0]:.6g} s came again or out of turn'
-                if not new.any():
-                    return None
-                t, v = t[new], v[new]
-        elif abs(period / self._period - 1.0) > 1e-3:
+        clock = self._clock
+        before, last = clock.period, clock.last
+        kind, count = clock.judge(t)
+        if kind is Kind.LATE:
+            self.problem = f'samples at t = {t[0]:.6g} s came again or out of turn'
+            t, v = t[count:], v[count:]
+            if not t.size:
+                return None
+        elif kind is Kind.START:
+            # a program that starts again starts at zero
+            if clock.restarts and t[0] > 0.5 * clock.period:
+                self.problem = f'time jumps back from {last:.6g} to {t[0]:.6g} s'
+            self._clear()
+        elif abs(clock.period / before - 1.0) > 1e-3:
             self.problem = f'the sampling rate changed at t = {t[0]:.6g} s'
-            self._start(t, period)
-        elif step > 1.5 * period:
-            self._bridge(float(t[0]), float(v[0]), round(step / period) - 1)
-        self._last = float(t[-1])
-        self._blocks += 1
+            self._clear()
+        elif kind is Kind.GAP:
+            self._bridge(last, float(t[0]), float(v[0]), count)
         y = self._advance(t, v)
         if y is None:
             return None
@@ -309,7 +303,7 @@ class Predictor:
             )
         elif fault == NOT_UNIFORM:
             self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
-        elif t.size == 1 and np.isnan(self._period):
+        elif t.size == 1 and np.isnan(self._clock.period):
             self.problem = (
                 f'the block at t = {t[0]:.6g} s is one sample, which tells no sampling rate; it '
                 'is left out'
@@ -317,19 +311,12 @@ class Predictor:
             return False
         return bool(fault == FINE)
 
-    def _start(self, t: NDArray[np.float64], period: float) -> None:
-        self._clear()
-        self._begin, self._period, self._blocks = float(t[0]), period, 0
-        self._lowest = float('inf')
-
-    def _bridge(self, t1: float, v1: float, missing: int) -> None:
-        self.lost += missing
+    def _bridge(self, t0: float, t1: float, v1: float, missing: int) -> None:
         self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'
-        self._lowest = float('inf')
-        if missing * self._period > BRIDGE:
-            self._start(np.array([t1]), self._period)
+        if missing * self._clock.period > BRIDGE:
+            self._clear()
             return
-        v0, t0 = float(self._recent[-1][1][-1]), self._last
+        v0 = float(self._recent[-1][1][-1])
         share = np.arange(1, missing + 1) / (missing + 1)
         self._advance(t0 + (t1 - t0) * share, v0 + (v1 - v0) * share)
         self._lowest = float('inf')

@@ -37,6 +37,11 @@ class BlockStream:
         Move the samples to temporary files whenever there are more than `SPOOLED`.  Such a stream
         can be neither copied nor shortened.
 
+    Attributes
+    ----------
+    n : int
+        Number of samples.
+
     Raises
     ------
     DataError
@@ -45,7 +50,8 @@ class BlockStream:
 
     def __init__(self, *, spooled: bool = False) -> None:
         self._files: list[BinaryIO] = []
-        self._spooled, self._in_files = spooled, 0
+        self._spooled = spooled
+        self.n = 0
         self._chunks = [array('d')]  # only the last one grows, so that copies share the others
         self._sizes = array('q')
         self._arrivals = array('q')
@@ -61,6 +67,7 @@ class BlockStream:
                 self._chunks.append(array('d'))
         self._chunks[-1].frombytes(rows.tobytes())
         self._sizes.append(samples.t.size)
+        self.n += samples.t.size
         self._arrivals.append(arrival)
         # one string for all blocks of a segment, not one a block
         last = self._segments[-1] if self._segments else ''
@@ -69,23 +76,29 @@ class BlockStream:
     def copy(self) -> BlockStream:
         """Return the stream as it is now, without copying what no longer changes."""
         other = BlockStream()
+        other.n = self.n
         other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
         other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
         other._segments = self._segments[:]
         return other
 
-    def drop(self, blocks: int) -> None:
-        """Forget the oldest blocks."""
-        left = 2 * sum(self._sizes[:blocks])
+    def drop(self, n: int) -> int:
+        """Forget the oldest blocks, at least so many samples; return how many it were."""
+        ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
+        blocks = int(np.searchsorted(ends, n)) + 1 if n > 0 else 0
+        gone = int(ends[:blocks].max(initial=0))
+        left = 2 * gone
         while left and len(self._chunks) > 1 and left >= len(self._chunks[0]):
             left -= len(self._chunks.pop(0))
         self._chunks[0] = self._chunks[0][left:]
+        self.n -= gone
         del self._sizes[:blocks], self._arrivals[:blocks], self._segments[:blocks]
+        return gone
 
     @property
-    def n(self) -> int:
-        """Number of samples."""
-        return self._in_files + sum(len(chunk) for chunk in self._chunks) // 2
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return len(self._sizes)
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -111,7 +124,6 @@ class BlockStream:
                 f'no room for a long record in {tempfile.gettempdir()} ({error.strerror}); make '
                 'room, or set TMPDIR to a place with room'
             ) from None
-        self._in_files = self.n
         self._chunks = [array('d')]
 
     def _column(self, k: int) -> NDArray[np.float64]:

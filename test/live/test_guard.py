@@ -49,7 +49,7 @@ def test_no_number_at_all_leaves_the_drive_where_it_is():
     guard = Guard(USUAL, applied=4.0)
     out = guard.process([math.nan] * 3)
     assert out.voltage.tolist() == [4.0] * 3
-    assert guard.is_joining
+    assert guard.process([5.0]).altered == {'joining': 1}
 
 
 def test_a_new_stream_joins_softly_and_is_then_followed_exactly():
