@@ -36,6 +36,11 @@ T = np.arange(V.size) / RATE
 Y_HAT = 7e-6 * lfilter([0.3], [1, -0.7], V)
 
 
+def noise(seed: int = 0) -> np.ndarray:
+    """White noise of 2 nm rms."""
+    return 2e-9 * np.random.default_rng(seed).standard_normal(V.size)
+
+
 def pink(n: int, rng: np.random.Generator) -> np.ndarray:
     """1/f noise of unit standard deviation."""
     spectrum = np.fft.rfft(rng.standard_normal(n))

@@ -52,10 +52,14 @@ from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-from piezo_ident.residual.faults import find_faults
-from piezo_ident.residual.lines import find_lines, without_lines
-from piezo_ident.residual.noise_floor import residual_noise_floor
-from piezo_ident.residual.stretches import ResidualPart, stretches_of
+from piezo_ident.residual import (
+    all_stretches,
+    find_faults,
+    find_lines,
+    residual_noise_floor,
+    ResidualPart,
+    without_lines,
+)
 
 __all__ = ['diagnose']
 
@@ -183,11 +187,12 @@ def _diagnosed(
     base = _base(simulator, given)
     _check_related(rows, base)
     parts = _parts(simulator, base.state)
-    found = find_lines(parts, [s for i, part in enumerate(parts) for s in stretches_of(part, i)])
+    found = find_lines(parts, all_stretches(parts))
     # hum is no noise: it can be explained
     resting = _parts(simulator, base.state, whole=True)
-    rests = [s for i, part in enumerate(resting) for s in stretches_of(part, i)]
-    floor = residual_noise_floor([without_lines(part, found.lines) for part in resting], rests)
+    floor = residual_noise_floor(
+        [without_lines(part, found.lines) for part in resting], all_stretches(resting)
+    )
     span = abs(model.scaling.Y)
     noise = row_noise(floor, faults, rows.m, span)
     progress('residual', 1.0)
@@ -216,7 +221,7 @@ def _diagnosed(
     explainable = max(base.mean_square - noise, 1e-300)
     bent = (base.mean_square - rounds[0].before.mean_square) / explainable
     tested = {setting.name for setting in model.effects}
-    if found.highest > 0.0:
+    if found.searched:
         # where no line stands out there is nothing to fit
         tested.add(HUM)
     progress('verdict', 1.0)

@@ -1,12 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""On what a residual depends: its mean over voltage, speed, time since a turn or a step."""
+"""On what a residual depends: its mean over voltage, speed, and time since a step."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,36 +32,26 @@ class Curve:
 
     Attributes
     ----------
-    against : {'v', 'dv/dt', 'time since the turn', 'time since the step'}
+    against : {'v', 'dv/dt', 'time since the step'}
     branch : {'up', 'down', 'both'}
-        Direction of the drive.  'both': the residual is multiplied by the direction, and for the
-        step also by its share of the largest, so that what follows the drive adds up.
-    unit : str
-        Of x.
+        Direction of the drive.  'both': the residual is multiplied by the step as a share of the
+        largest, so that what follows the drive adds up.
     x : ndarray, shape (m,)
         Mean of the quantity in each bin.
     mean, std : ndarray, shape (m,)
         Mean residual and its standard deviation [m]; whole stretches of time count as one
         observation, so correlated samples do not make it look better known than it is.
-    count : ndarray of int, shape (m,)
-        Samples after averaging.
     share : float
         Share of the residual's variance, where the quantity is defined, that the curve (both
         branches together) fitted to every other stretch of time explains in the rest; 0..1.
-    per_decade, per_decade_std : float
-        Slope over lg t [m a decade], and its standard deviation; NaN over v and dv/dt.
     """
 
     against: str
     branch: str
-    unit: str
     x: Array
     mean: Array
     std: Array
-    count: Integers
     share: float
-    per_decade: float = float('nan')
-    per_decade_std: float = float('nan')
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +61,17 @@ class _Motion:
     e: Array
     v: Array
     speed: Array
-    since: Array
     direction: Array
     chunk: Integers
 
 
-#: of a hold: bins of time, mean residual and samples in each, step as a share of the largest
-_Hold = tuple[Integers, Array, Integers, float]
+#: of a hold: bins of time, mean residual in each, step as a share of the largest
+_Hold = tuple[Integers, Array, float]
 
 
 def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
     """
-    Return the mean residual over v, dv/dt, and the time since the last turn and the last step.
+    Return the mean residual over v, dv/dt, and the time since the last step.
 
     Quantities without data have no curve.
     """
@@ -91,7 +80,6 @@ def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tu
     if motion is not None:
         found += _against_v(motion)
         found += _against_speed(motion)
-        found += _since_turn(motion)
     found += _since_step(parts, stretches)
     return tuple(found)
 
@@ -102,7 +90,7 @@ def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Mo
     if total == 0:
         return None
     m = max(1, -(-total // SAMPLES))
-    columns: list[list[Array]] = [[] for _ in range(5)]
+    columns: list[list[Array]] = [[] for _ in range(4)]
     chunks: list[Integers] = []
     seconds = sum(s.n / parts[s.part].piece.sample_rate for s in moving)
     chunk_time = max(CHUNK_TIME, seconds / CHUNKS)
@@ -113,33 +101,22 @@ def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Mo
         speed = np.gradient(v) * rate
         averaged = [block_means(x, m) for x in (parts[s.part].e[s.start : s.stop], v, speed)]
         direction = np.sign(averaged[2])
-        since = _since(direction) * m / rate
-        for column, x in zip(columns, (*averaged, since, direction), strict=True):
+        for column, x in zip(columns, (*averaged, direction), strict=True):
             column.append(x)
         chunk = np.arange(averaged[0].size) * m / rate // chunk_time
         chunks.append(number + chunk.astype(np.int64))
         number = int(chunks[-1][-1]) + 1 if chunk.size else number
-    e, v, speed, since, direction = (np.concatenate(column) for column in columns)
-    return _Motion(e, v, speed, since, direction, np.concatenate(chunks))
-
-
-def _since(direction: Array) -> Array:
-    """Return how many samples ago the direction changed; NaN before it first did."""
-    turns = np.flatnonzero(np.diff(direction) != 0.0) + 1
-    k = np.arange(direction.size)
-    last = np.searchsorted(turns, k, side='right') - 1
-    if turns.size == 0:
-        return np.full(direction.size, np.nan)
-    return np.where(last >= 0, k - turns[np.maximum(last, 0)] + 0.5, np.nan)
+    e, v, speed, direction = (np.concatenate(column) for column in columns)
+    return _Motion(e, v, speed, direction, np.concatenate(chunks))
 
 
 def _against_v(motion: _Motion) -> list[Curve]:
     ends = np.linspace(motion.v.min(), motion.v.max() + 1e-12, BINS + 1)
     bins = np.clip(np.searchsorted(ends, motion.v, side='right') - 1, 0, BINS - 1)
     bins = bins + BINS * (motion.direction < 0.0)
-    share = _held_out(motion.e, bins, motion.chunk, np.ones(motion.e.size))
+    share = _held_out(motion.e, bins, motion.chunk)
     return [
-        _curve('v', branch, 'V', motion.v, motion.e, bins, motion.chunk, own, share)
+        _curve('v', branch, motion.v, motion.e, bins, motion.chunk, own, share)
         for branch, own in (('up', motion.direction > 0.0), ('down', motion.direction < 0.0))
     ]
 
@@ -152,30 +129,14 @@ def _against_speed(motion: _Motion) -> list[Curve]:
     bins = np.zeros(motion.speed.size, dtype=np.int64)
     bins[moving] = _decades(np.abs(motion.speed[moving]))
     bins = 2 * bins + (motion.speed < 0.0)
-    share = _held_out(
-        motion.e[moving], bins[moving], motion.chunk[moving], np.ones(int(moving.sum()))
-    )
+    share = _held_out(motion.e[moving], bins[moving], motion.chunk[moving])
     return [
-        _curve('dv/dt', branch, 'V/s', motion.speed, motion.e, bins, motion.chunk, own, share)
+        _curve('dv/dt', branch, motion.speed, motion.e, bins, motion.chunk, own, share)
         for branch, own in (
             ('up', moving & (motion.speed > 0.0)),
             ('down', moving & (motion.speed < 0.0)),
         )
     ]
-
-
-def _since_turn(motion: _Motion) -> list[Curve]:
-    known = np.isfinite(motion.since) & (motion.direction != 0.0)
-    if known.sum() < 4 * BINS:
-        return []
-    x, sign = motion.since[known], motion.direction[known]
-    bins = _decades(x)
-    e, chunk = motion.e[known] * sign, motion.chunk[known]
-    share = _held_out(motion.e[known], bins, chunk, sign)
-    curve = _curve(
-        'time since the turn', 'both', 's', x, e, bins, chunk, np.ones(x.size, bool), share
-    )
-    return [_with_slope(curve)] if curve.x.size > 1 else []
 
 
 def _decades(t: Array) -> Integers:
@@ -186,7 +147,6 @@ def _decades(t: Array) -> Integers:
 def _curve(
     against: str,
     branch: str,
-    unit: str,
     x: Array,
     e: Array,
     bins: Integers,
@@ -210,18 +170,11 @@ def _curve(
     std = np.sqrt(spread * correction) / filled
     shown = np.flatnonzero((count >= FEWEST) & (visits >= VISITS))
     shown = shown[np.argsort(centre[shown])]
-    return Curve(
-        against, branch, unit, centre[shown], mean[shown], std[shown], count[shown], share
-    )
+    return Curve(against, branch, centre[shown], mean[shown], std[shown], share)
 
 
-def _held_out(
-    e: Array,
-    bins: Integers,
-    chunk: Integers,
-    weight: Array,
-) -> float:
-    """Return the share of the variance of e that bin means times weight explain, held out."""
+def _held_out(e: Array, bins: Integers, chunk: Integers) -> float:
+    """Return the share of the variance of e that means of the bins explain, held out."""
     left = whole = 0.0
     size = int(bins.max(initial=0)) + 1
     for fold in (0, 1):
@@ -229,37 +182,19 @@ def _held_out(
         fit = ~test
         if not (test.any() and fit.any()):
             return 0.0
-        centre = float(e[fit].mean())
         # what e has to offer without the curve is its mean over the other half
-        top = np.bincount(bins[fit], weight[fit] * (e[fit] - centre), size)
-        bottom = np.bincount(bins[fit], weight[fit] ** 2, size)
-        value = np.where(bottom > 0.0, top / np.maximum(bottom, 1e-300), 0.0)
+        centre = float(e[fit].mean())
+        count = np.bincount(bins[fit], minlength=size)
+        value = np.bincount(bins[fit], e[fit] - centre, size) / np.maximum(count, 1)
         rest = e[test] - centre
         whole += float(rest @ rest)
-        rest = rest - weight[test] * value[bins[test]]
+        rest = rest - value[bins[test]]
         left += float(rest @ rest)
+    return _explained(left, whole)
+
+
+def _explained(left: float, whole: float) -> float:
     return float(np.clip(1.0 - left / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
-
-
-def _with_slope(curve: Curve) -> Curve:
-    slope, std = _slope(np.log10(curve.x), curve.mean, curve.std)
-    return replace(curve, per_decade=slope, per_decade_std=std)
-
-
-def _slope(x: Array, y: Array, std: Array) -> tuple[float, float]:
-    known = std > 0.0
-    if known.sum() < 3:
-        return float('nan'), float('nan')
-    x, y, w = x[known], y[known], 1.0 / std[known] ** 2
-    mean = float(np.average(x, weights=w))
-    power = float(np.sum(w * (x - mean) ** 2))
-    if power <= 0.0:
-        return float('nan'), float('nan')
-    slope = float(np.sum(w * (x - mean) * y)) / power
-    rest = y - float(np.average(y, weights=w)) - slope * (x - mean)
-    # a curve that is no line knows its slope less well than its points say
-    excess = max(1.0, float(np.sum(w * rest**2)) / max(int(known.sum()) - 2, 1))
-    return slope, float(np.sqrt(excess / power))
 
 
 def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
@@ -271,57 +206,44 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     rows: list[_Hold] = []
     first = min(2.0 / parts[s.part].piece.sample_rate for s in holds)
     for s in holds:
-        rate = parts[s.part].piece.sample_rate
-        t = (np.arange(s.n) + 0.5) / rate
-        k = np.floor(PER_DECADE * np.log10(t / first)).astype(np.int64)
-        count = np.bincount(np.maximum(k, 0))
-        sums = np.bincount(np.maximum(k, 0), parts[s.part].e[s.start : s.stop])
+        t = (np.arange(s.n) + 0.5) / parts[s.part].piece.sample_rate
+        k = np.maximum(np.floor(PER_DECADE * np.log10(t / first)), 0).astype(np.int64)
+        count, sums = np.bincount(k), np.bincount(k, parts[s.part].e[s.start : s.stop])
         used = np.flatnonzero(count)
-        rows.append((used, sums[used] / count[used], count[used], s.step / largest))
-    size = max(int(r[0][-1]) for r in rows) + 1
-    curve, _ = _common(rows, size)
+        rows.append((used, sums[used] / count[used], s.step / largest))
+    size = max(int(used[-1]) for used, _, _ in rows) + 1
     left = whole = 0.0
     for fold in (0, 1):
-        test = rows[fold::2]
         other, known = _common(rows[1 - fold :: 2], size)
-        for k, e, _, weight in test:
+        for k, e, weight in rows[fold::2]:
             own = known[k]
-            if own.sum() < 2:
-                continue
-            rest = e[own] - e[own].mean()
-            whole += float(rest @ rest)
-            fitted = weight * other[k[own]]
-            rest = rest - (fitted - fitted.mean())
-            left += float(rest @ rest)
-    share = float(np.clip(1.0 - left / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+            if own.sum() >= 2:
+                fitted = weight * other[k[own]]
+                whole += float(np.sum((e[own] - e[own].mean()) ** 2))
+                left += float(np.sum((e[own] - e[own].mean() - fitted + fitted.mean()) ** 2))
+    curve, _ = _common(rows, size)
     x = first * 10.0 ** ((np.arange(size) + 0.5) / PER_DECADE)
-    top, bottom, count = np.zeros(size), np.zeros(size), np.zeros(size, dtype=np.int64)
-    visits = np.zeros(size, dtype=np.int64)
-    for k, e, n, weight in rows:
-        fitted = weight * curve[k]
-        rest = e - fitted
-        rest = rest - rest.mean()
-        top[k] += (weight * rest) ** 2
+    top, bottom, visits = np.zeros((3, size))
+    for k, e, weight in rows:
+        rest = e - weight * curve[k]
+        top[k] += (weight * (rest - rest.mean())) ** 2
         bottom[k] += weight**2
-        count[k] += n
         visits[k] += 1
     shown = visits >= 2
-    correction = visits / np.maximum(visits - 1, 1)
-    std = np.sqrt(top * correction) / np.maximum(bottom, 1e-300)
-    origin = float(curve[shown][0]) if shown.any() else 0.0
-    mean = curve[shown] - origin
-    made = Curve(
-        'time since the step', 'both', 's', x[shown], mean, std[shown], count[shown], share
-    )
-    return [_with_slope(made)] if made.x.size > 1 else []
+    if shown.sum() < 2:
+        return []
+    std = np.sqrt(top * visits / np.maximum(visits - 1, 1)) / np.maximum(bottom, 1e-300)
+    mean = curve[shown] - curve[shown][0]
+    share = _explained(left, whole)
+    return [Curve('time since the step', 'both', x[shown], mean, std[shown], share)]
 
 
 def _common(rows: Sequence[_Hold], size: int) -> tuple[Array, NDArray[np.bool_]]:
     """Return the curve g that fits e = offset of the hold + weight g(bin) best, and its bins."""
-    n = sum(k.size for k, _, _, _ in rows)
+    n = sum(k.size for k, _, _ in rows)
     A, b = np.zeros((n, size + len(rows))), np.zeros(n)
     at = 0
-    for i, (k, e, _, weight) in enumerate(rows):
+    for i, (k, e, weight) in enumerate(rows):
         places = np.arange(at, at + k.size)
         A[places, k] = weight
         A[places, size + i] = 1.0

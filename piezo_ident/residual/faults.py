@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.model.metrics import percent
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, runs_of, strokes_of
 from scipy.ndimage import binary_dilation, maximum_filter1d
@@ -35,8 +36,6 @@ FLAT, LEFT = 5, 6.0
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
 #: jitter is read where the fast part of the motion has at most this share of the scatter's power
 SMOOTH = 1.0
-
-
 #: samples in which a quantum is looked for, in rows of so many
 MOST, MOST_ROW = 2**17, 2**10
 
@@ -46,18 +45,9 @@ class FaultSearch:
     """
     Faults found.
 
-    Attributes
-    ----------
-    faults : tuple of Fault
-        ``missed_samples``, ``timing_jitter``, ``quantisation``, ``outliers``, ``clipping``.
-    bad : tuple of ndarray of bool
-        For each part the samples that are missed, outliers or clipped, shape (n,).
-    out : tuple of ndarray of bool
-        The clipped ones among them, which no bridge can replace.
-    jitter : float
-        Rms of the sampling instants [s]; 0 when none is seen.
-    quantum : float
-        Step of the readings [m]; 0 when there is none.
+    `bad` are for each part the samples that are missed, outliers or clipped, `out` the clipped
+    ones among them, which no bridge can replace; `jitter` is the rms of the sampling instants [s]
+    and `quantum` the step of the readings [m], each 0 when there is none.
     """
 
     faults: tuple[Fault, ...]
@@ -123,8 +113,8 @@ def _of_all(
     if noise.quantum > COARSE * noise.rest and noise.quantum > COARSE_SHARE * stroke:
         what = (
             f'readings are multiples of {1e9 * noise.quantum:.4g} nm, '
-            f'{100 * noise.quantum / stroke:.2g} % of the stroke and more than twice the rest of '
-            'the noise'
+            f'{percent(noise.quantum, stroke):.2g} % of the stroke and more than twice the rest '
+            'of the noise'
         )
         faults.append(Fault('quantisation', where, n, what))
     if jitter > 0.0:
@@ -138,12 +128,7 @@ def _of_all(
 
 @dataclass(frozen=True)
 class _Noise:
-    """
-    Fast noise of the readings.
-
-    `rms` from third differences, `quantum` the step of the converter or of the file's decimals (0
-    when there is none), `rest` the rms without the quantum's own q / sqrt(12) [m].
-    """
+    """Fast noise of readings: rms, their step q (0 for none), rms without q / sqrt(12) [m]."""
 
     rms: float
     quantum: float

@@ -50,12 +50,8 @@ class Line:
     ----------
     frequency : float
         [Hz]
-    std : float
-        Of the frequency [Hz].
     amplitude : float
         Largest over the records [m].
-    p_value : float
-        Chance of such a peak anywhere in the search without a line.
     harmonics : tuple of (int, Line)
         Order of each harmonic found with it, and the harmonic.
     records : tuple of (str, float, float)
@@ -63,81 +59,53 @@ class Line:
     """
 
     frequency: float
-    std: float
     amplitude: float
-    p_value: float
     harmonics: tuple[tuple[int, Line], ...] = ()
     records: tuple[tuple[str, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class LineSearch:
-    """
-    The lines found, and what the search could see.
+    """The lines found, by falling amplitude; `searched`: whether a stretch was long enough."""
 
-    Attributes
-    ----------
-    lines : tuple of Line
-        By falling amplitude.
-    lowest, highest : float
-        Band that was searched [Hz]; zero when no stretch is long enough.
-    smallest : float
-        Amplitude that would just have been found in the middle of the band [m].
-    """
-
-    lines: tuple[Line, ...]
-    lowest: float = 0.0
-    highest: float = 0.0
-    smallest: float = float('inf')
+    lines: tuple[Line, ...] = ()
+    searched: bool = False
 
 
 def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> LineSearch:
     """
-    Search for narrow lines that are not locked to the drive.
+    Search residuals of one sampling rate for narrow lines that are not locked to the drive.
 
     Where v repeats, the residual of consecutive periods is subtracted: what the drive makes,
     with all its harmonics, is gone, and a line of any other frequency stays with a known gain.
-
-    Parameters
-    ----------
-    parts : sequence of ResidualPart
-        Of one sampling rate.
     """
     series, rate, high = series_of(parts, stretches)
     if not series:
-        return LineSearch(())
+        return LineSearch()
     seconds = max(s.t + s.x.size / rate for s in series) - min(s.t for s in series)
     size = fft.next_fast_len(round(FINE * seconds * rate), real=True)
     longest = max(s.x.size for s in series) / rate
     f = np.arange(1 + int(high / rate * size)) * (rate / size)
-    band = (f >= (FEWEST + 2) / longest) & (f <= high)
-    keep = band.copy()
+    keep = (f >= (FEWEST + 2) / longest) & (f <= high)
+    searched = bool(keep.any())
     bins = max(1.0, TRIALS * float(keep.sum()) / FINE)
     negligible = SMALLEST * max(strokes_of(parts).values())
     search = _Search(series, f, size)
     found: list[Line] = []
-    smallest = float('inf')
     for _ in range(2 * LINES):
-        score, information, gain = search.score()
-        if not found and keep.any():
-            with np.errstate(divide='ignore'):
-                least = np.sqrt(4.0 * np.log(bins / SIGNIFICANT) / information)
-            smallest = max(float(np.median(least[keep])), negligible)
+        score, gain = search.score()
         # strong lines are significant beside themselves too; the strongest is where it is
-        chances = np.where(keep, np.minimum(1.0, bins * np.exp(-score)), 1.0)
-        significant = chances <= SIGNIFICANT
+        significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
             break
-        best = int(np.argmax(np.where(significant, gain, -1.0)))
-        frequency, std = search.refined(best)
+        frequency = search.refined(int(np.argmax(np.where(significant, gain, -1.0))))
         sines = [(name, *search.sine(frequency, name)) for name in search.records]
         amplitude = max(a for _, a, _ in sines)
         if amplitude >= negligible and search.is_steady(frequency):
-            found.append(Line(frequency, std, amplitude, float(chances[best]), (), tuple(sines)))
+            found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
         keep &= np.abs(f - frequency) > 2.0 / longest
-    lowest, highest = (float(f[band][0]), float(f[band][-1])) if band.any() else (0.0, 0.0)
-    return LineSearch(_grouped(found, 2.0 / longest), lowest, highest, smallest)
+    return LineSearch(_grouped(found, 2.0 / longest), searched)
 
 
 class _Search:
@@ -161,15 +129,15 @@ class _Search:
             series.append(replace(s, x=s.x - wave.imag))
         return _Search(series, self._f, self._size)
 
-    def score(self) -> tuple[Array, Array, Array]:
+    def score(self) -> tuple[Array, Array]:
         """
-        Return for every f -ln of its chance under noise alone, the information, and the gain.
+        Return for every f -ln of its chance under noise alone, and the gain.
 
         The gain is what a sine takes off the weighted squares: its maximum is the frequency,
         while the chance also depends on how well the noise is known there.
         """
         n = self._f.size
-        total, most, gain = np.zeros(n), np.zeros(n), np.zeros(n)
+        total, gain = np.zeros(n), np.zeros(n)
         tiny = np.finfo(float).tiny
         for name in self.records:
             top = np.zeros(n, dtype=np.complex128)
@@ -190,26 +158,23 @@ class _Search:
             k = np.maximum(safe**2 / np.maximum(doubt, tiny), 1.0)
             gain += ratio
             total += k * np.log1p(ratio / k)
-            most = np.maximum(most, information)
-        return _log_chance(total, len(self.records)), most, gain
+        return _log_chance(total, len(self.records)), gain
 
-    def refined(self, best: int) -> tuple[float, float]:
-        """Return the frequency of the least squared error and its standard deviation."""
+    def refined(self, best: int) -> float:
+        """Return the frequency of the least squared error."""
 
         def gain(frequency: float) -> float:
             fits = [self._fit(frequency, name) for name in self.records]
             return sum(abs(a) ** 2 * information for a, information in fits)
 
         step = float(self._f[1])
-        centre, curvature = float(self._f[best]), 0.0
+        centre = float(self._f[best])
         for width in (0.5 * step, 0.1 * step):
             left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
             bend = left - 2.0 * middle + right
             if bend < 0.0:
                 centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
-                curvature = -bend / width**2
-        # the gain is half of twice the logarithm of the likelihood
-        return centre, float(1.0 / np.sqrt(2.0 * curvature)) if curvature > 0.0 else float('inf')
+        return centre
 
     def sine(self, frequency: float, record: str) -> tuple[float, float]:
         """Return amplitude and phase of A sin(2 pi f t + phase)."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
-__all__ = ['FloorSource', 'NoiseFloor', 'residual_noise_floor']
+__all__ = ['NoiseFloor', 'residual_noise_floor']
 
 Array = NDArray[np.float64]
 
@@ -27,18 +27,6 @@ SETTLING, SETTLING_TIME = 0.2, 0.02
 LONGEST_BLOCK = 4096
 
 
-@dataclass(frozen=True)
-class FloorSource:
-    """One stretch, 'repeat' or 'rest', in which the noise was read: n samples from a time [s]."""
-
-    record: str
-    segment: str
-    kind: str
-    start_time: float
-    n: int
-    rms: float
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseFloor:
     """
@@ -50,7 +38,6 @@ class NoiseFloor:
         Of single samples [m]; None when it is unknown.
     source : str
         Where it was read, in words.
-    sources : tuple of FloorSource
     blocks : ndarray of int, shape (k,)
         Block lengths [samples], from 1.
     block_rms : ndarray, shape (k,)
@@ -61,7 +48,6 @@ class NoiseFloor:
 
     rms: float | None
     source: str
-    sources: tuple[FloorSource, ...] = ()
     blocks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     block_rms: Array = field(default_factory=lambda: np.zeros(0))
     frequency: Array = field(default_factory=lambda: np.zeros(0))
@@ -92,27 +78,13 @@ class NoiseFloor:
         slope = float(np.clip((y[-1] - y[k]) / (x[-1] - x[k]), -0.5, 0.0))
         return float(np.exp(y[-1] + slope * (at - x[-1])))
 
-    def share(self, mean_square: float, m: float = 1.0) -> float | None:
-        """
-        Return the share that a model could explain: 1 - floor^2 / mean square.
-
-        The mean square [m^2] is that of the residual, or of its means over m samples.
-        """
-        floor = self.at(m)
-        if floor is None:
-            return None
-        if mean_square <= 0.0:
-            return 0.0
-        return float(np.clip(1.0 - floor * floor / mean_square, 0.0, 1.0))
-
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    source: FloorSource
-    blocks: NDArray[np.int64]
-    variances: Array
     series: Array
     sample_rate: float
+    #: of means over 1, 2, 4, ... samples
+    variances: Array
 
 
 def residual_noise_floor(
@@ -147,7 +119,7 @@ def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
     frame = min(max(p, round(FRAME * rate)), difference.size)
     series = _detrended(difference, frame, _polynomial(frame)) / np.sqrt(2.0)
     # means over more than half a period would see the end of one against the start of the next
-    return _reading(part, s, series, frame, min(p // 2, frame // 16), ORDER + 1)
+    return _reading(part, series, frame, min(p // 2, frame // 16), ORDER + 1)
 
 
 def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
@@ -161,7 +133,7 @@ def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
     # a few relaxations are no exact logarithm; the squares bend towards them
     basis = np.column_stack([np.ones(n), t, t * t, lg, lg * lg])
     series = _detrended(part.e[s.start + skip : s.stop], n, basis)
-    return _reading(part, s, series, n, n // 16, basis.shape[1])
+    return _reading(part, series, n, n // 16, basis.shape[1])
 
 
 def _polynomial(n: int) -> Array:
@@ -179,62 +151,44 @@ def _detrended(x: Array, frame: int, basis: Array) -> Array:
 
 
 def _reading(
-    part: ResidualPart,
-    s: Stretch,
-    series: Array,
-    frame: int,
-    longest: int,
-    removed: int,
+    part: ResidualPart, series: Array, frame: int, longest: int, removed: int
 ) -> _Reading | None:
     if series.size < 16:
         return None
     top = int(np.log2(max(1, min(longest, LONGEST_BLOCK))))
-    blocks = 2 ** np.arange(top + 1)
     rows = series.reshape(-1, frame)
     variances = []
-    for m in blocks:
+    for m in 2 ** np.arange(top + 1):
         count = frame // m
         means = rows[:, : count * m].reshape(rows.shape[0], count, m).mean(axis=2)
         # of several frames the median: drift may have bent one of them
         power = np.sum(means**2, axis=1) / max(count - removed, 1)
         variances.append(float(np.median(power) if power.size > 2 else power.mean()))
-    source = FloorSource(
-        part.record,
-        s.label,
-        s.kind,
-        float(part.piece.start_time + s.start / part.piece.sample_rate),
-        series.size,
-        float(np.sqrt(variances[0])),
-    )
-    return _Reading(source, blocks, np.array(variances), series, part.piece.sample_rate)
+    return _Reading(series, part.piece.sample_rate, np.array(variances))
 
 
 def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:
-    sources = tuple(r.source for r in readings)
-    longest = max(r.blocks.size for r in readings)
+    longest = max(r.variances.size for r in readings)
     variances = np.array(
         [
-            _median([(r.variances[i], r.source.n) for r in readings if r.blocks.size > i])
+            _median([(r.variances[i], r.series.size) for r in readings if r.variances.size > i])
             for i in range(longest)
         ]
     )
-    # averaging never adds noise, and never takes more than that of independent samples away
-    single = variances[0]
-    for i in range(1, longest):
-        variances[i] = np.clip(variances[i], 0.0, variances[i - 1])
+    # averaging never adds noise
+    variances = np.minimum.accumulate(variances)
     widest = max(readings, key=lambda r: r.series.size)
     frequency, density = signal.welch(
         widest.series, widest.sample_rate, nperseg=min(4096, max(16, widest.series.size // 8))
     )
-    seconds = sum(r.source.n / r.sample_rate for r in readings)
+    seconds = sum(r.series.size / r.sample_rate for r in readings)
     how = {
         'repeat': 'differences of repeated periods',
         'rest': 'rests of the voltage without creep',
     }[kind]
     return NoiseFloor(
-        rms=float(np.sqrt(single)),
+        rms=float(np.sqrt(variances[0])),
         source=f'{how}, {len(readings)} stretches, {seconds:.3g} s',
-        sources=sources,
         blocks=2 ** np.arange(longest),
         block_rms=np.sqrt(variances),
         frequency=frequency,

@@ -11,8 +11,9 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.residual.stretches import block_means
 
-__all__ = ['EDGES', 'Way', 'turns_of', 'way_since_turn', 'ways']
+__all__ = ['EDGES', 'Way', 'turns_of', 'ways']
 
 Array = NDArray[np.float64]
 
@@ -29,16 +30,9 @@ FEWEST = 20
 @dataclass(frozen=True)
 class Way:
     """
-    Residuals on a stretch of the way behind a turn.
+    Rms of each residual on a stretch of the way behind a turn, from n means over 2 ms.
 
-    Attributes
-    ----------
-    start, stop : float
-        Way since the turn, share of the voltage range.
-    rms : tuple of float
-        Of each residual [the residual's unit].
-    n : int
-        Means over 2 ms that it stands on.
+    The way is a share of the voltage range.
     """
 
     start: float
@@ -49,22 +43,8 @@ class Way:
 
 def turns_of(v: Array, least: float) -> NDArray[np.int64]:
     """
-    Return where a voltage turns and then moves by `least` or more the other way.
+    Return the indices at which a voltage turns and then moves by `least` [V] the other way.
 
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-        [V]
-    least : float
-        [V]
-
-    Returns
-    -------
-    ndarray of int
-        Index of each extreme, ascending.
-
-    Examples
-    --------
     >>> turns_of(np.array([0.0, 5.0, 4.9, 6.0, 1.0, 2.0]), 0.5)
     array([3, 4])
     """
@@ -87,7 +67,7 @@ def turns_of(v: Array, least: float) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64)
 
 
-def way_since_turn(v: Array, span: float) -> Array:
+def _way_since_turn(v: Array, span: float) -> Array:
     """Return how far v has come since it last turned, share of its span; NaN before a turn."""
     turns = turns_of(v, TURN * span)
     way = np.full(v.size, np.nan)
@@ -102,7 +82,7 @@ def ways(
     residuals: Sequence[Sequence[Array]],
 ) -> tuple[Way, ...]:
     """
-    Return the rms of residuals by the way since the last turn.
+    Return the rms of residuals by the way since the last turn; nothing where none is found.
 
     Parameters
     ----------
@@ -110,11 +90,6 @@ def ways(
         Voltage [V], samples that count, and rate [Hz] of each piece.
     residuals : sequence of sequence of ndarray
         For each piece, one or more residuals.
-
-    Returns
-    -------
-    tuple of Way
-        Empty where the voltage never turns, or stands still.
     """
     span = max((float(np.ptp(v)) for v, _, _ in pieces), default=0.0)
     if span == 0.0:
@@ -122,11 +97,9 @@ def ways(
     found: list[Array] = []
     for (v, sound, rate), errors in zip(pieces, residuals, strict=True):
         m = max(1, round(MEAN * rate))
-        n = v.size // m * m
-        slow = v[:n].reshape(-1, m).mean(axis=1)
-        keep = sound[:n].reshape(-1, m).all(axis=1)
-        means = [e[:n].reshape(-1, m).mean(axis=1) for e in errors]
-        found.append(np.stack([way_since_turn(slow, span), *means])[:, keep])
+        keep = sound[: v.size // m * m].reshape(-1, m).all(axis=1)
+        way = _way_since_turn(block_means(v, m), span)
+        found.append(np.stack([way, *(block_means(e, m) for e in errors)])[:, keep])
     table = np.concatenate(found, axis=1)
     rows = []
     for start, stop in itertools.pairwise(EDGES):

@@ -24,6 +24,7 @@ from scipy.ndimage import (
 __all__ = [
     'ResidualPart',
     'Stretch',
+    'all_stretches',
     'block_means',
     'find_repeats',
     'rests',
@@ -55,15 +56,14 @@ class ResidualPart:
     """
     What a model leaves of one piece of a record.
 
-    Parameters
+    Attributes
     ----------
     record : str
-        Name of the record.
+    piece : Piece
     e : ndarray, shape (n,)
         Measured minus simulated displacement, free run [m].
     sound : ndarray of bool, shape (n,), optional
-        False where samples were bridged, or the memory of the start still matters; all when
-        absent.
+        False where samples were bridged, or the memory of the start still matters.
 
     Raises
     ------
@@ -115,23 +115,11 @@ class Stretch:
     """
     A sound stretch of one part in which the voltage does one thing.
 
-    Attributes
-    ----------
-    part : int
-        Number of the part.
-    label : str
-        Of the segment; empty without labels.
-    start, stop : int
-        First sample, and the one behind the last.
-    kind : {'rest', 'repeat', 'motion'}
-    period : int
-        Samples after which v repeats; 0 where it does not.
-    step : float
-        Change of v that led into a rest [V].
+    It is a 'rest', a 'repeat' or a 'motion' from sample `start` to before `stop`.  A repeat has a
+    `period` in samples, a rest the `step` of v [V] that led into it.
     """
 
     part: int
-    label: str
     start: int
     stop: int
     kind: str
@@ -163,6 +151,11 @@ def block_means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
     return np.asarray(x[:n].reshape(-1, m).mean(axis=1))
 
 
+def all_stretches(parts: Sequence[ResidualPart]) -> list[Stretch]:
+    """Return the stretches of all parts, numbered as the parts are."""
+    return [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
+
+
 def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
     """
     Cut a part where its voltage comes to rest, starts to repeat, or changes its segment.
@@ -184,11 +177,11 @@ def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
                 a -= a > start
                 if b - a < shortest:
                     continue
-                found += _motion(v, number, s.label, edge, a, shortest)
+                found += _motion(v, number, edge, a, shortest)
                 step = float(v[a] - v[max(a - shortest, 0)])
-                found.append(Stretch(number, s.label, a, b, 'rest', step=step))
+                found.append(Stretch(number, a, b, 'rest', step=step))
                 edge = b
-            found += _motion(v, number, s.label, edge, stop, shortest)
+            found += _motion(v, number, edge, stop, shortest)
     return found
 
 
@@ -200,17 +193,8 @@ def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
     """
     Return where a voltage rests, as the first sample that repeats the one before, and the end.
 
-    It rests where it is constant, or but for the noise of a measured voltage.
+    It rests where it is constant, or but for the noise of a measured voltage; `rate` in Hz.
 
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-        [V]
-    rate : float
-        [Hz]
-
-    Examples
-    --------
     >>> rests(np.array([0.0, 1.0, 1.0, 1.0, 2.0]), 1000.0)
     [(2, 4)]
     """
@@ -229,7 +213,7 @@ def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
 
 
 def _motion(
-    v: NDArray[np.float64], number: int, label: str, start: int, stop: int, shortest: int
+    v: NDArray[np.float64], number: int, start: int, stop: int, shortest: int
 ) -> list[Stretch]:
     """Return the repeating stretches of a motion, and what lies between them."""
     if stop - start < shortest:
@@ -237,11 +221,11 @@ def _motion(
     found, edge = [], start
     for a, b, period in find_repeats(v[start:stop]):
         if start + a - edge >= shortest:
-            found.append(Stretch(number, label, edge, start + a, 'motion'))
-        found.append(Stretch(number, label, start + a, start + b, 'repeat', period))
+            found.append(Stretch(number, edge, start + a, 'motion'))
+        found.append(Stretch(number, start + a, start + b, 'repeat', period))
         edge = start + b
     if stop - edge >= shortest:
-        found.append(Stretch(number, label, edge, stop, 'motion'))
+        found.append(Stretch(number, edge, stop, 'motion'))
     return found
 
 
@@ -252,10 +236,6 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     Candidates are minima of the mean square difference between the signal and itself shifted,
     behind its first maximum; each is then held against the signal sample by sample, so that what
     comes before and after does no harm.  At least three periods are asked for.
-
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
 
     Notes
     -----

@@ -5,14 +5,13 @@
 
 import numpy as np
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import find_lines, ResidualPart, stretches_of
-from piezo_ident.residual.lines import without_lines
+from piezo_ident.residual import all_stretches, find_lines, ResidualPart, without_lines
 import pytest
-from residual_data import misfit, part_of, pink, RATE, SEGMENTS, STROKE, T, V, Y_HAT
+from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
 
 
 def search(*parts: ResidualPart):
-    return find_lines(parts, [s for i, p in enumerate(parts) for s in stretches_of(p, i)])
+    return find_lines(parts, all_stretches(parts))
 
 
 def noise(rng: np.random.Generator) -> np.ndarray:
@@ -27,9 +26,7 @@ def test_hum_of_a_ten_thousandth_of_the_stroke_beside_a_drive_of_50_hz():
     (line,) = search(part).lines
     # one bin of the whole record is 0.1 Hz
     assert line.frequency == pytest.approx(50.03, abs=0.002)
-    assert abs(line.frequency - 50.03) < 5 * line.std
     assert line.amplitude == pytest.approx(amplitude, rel=0.03)
-    assert line.p_value < 1e-9
     ((_, _, phase),) = line.records
     assert phase == pytest.approx(0.7, abs=0.1)
     rest = without_lines(part, [line]).e - part.e + hum
@@ -95,5 +92,5 @@ def test_too_short_for_a_search():
     part = ResidualPart('r', Piece(V[:300], Y_HAT[:300], RATE, 0.0), np.ones(300))
     found = search(part)
     assert found.lines == ()
-    assert found.highest == 0.0
-    assert SEGMENTS
+    assert not found.searched
+    assert search(part_of(np.zeros(V.size))).searched

@@ -6,22 +6,17 @@
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import NoiseFloor, residual_noise_floor, ResidualPart, stretches_of
+from piezo_ident.residual import residual_noise_floor, ResidualPart, stretches_of
 from piezo_ident.residual.stretches import block_means, find_repeats
 import pytest
 from residual_data import creep, misfit, part_of, pink, RATE, V
 
 
 def test_stretches_of_a_program():
-    found = [(s.label, s.kind, s.period) for s in stretches_of(part_of(np.zeros(V.size)))]
-    # 50 Hz at 2 kHz: 40 samples; the holds start with their first sample
-    assert found[:4] == [
-        ('idle', 'rest', 0),
-        ('sine:1Hz', 'repeat', 2000),
-        ('sine:50Hz', 'repeat', 40),
-        ('noise', 'motion', 0),
-    ]
-    assert [kind for label, kind, _ in found if label == 'staircase'] == ['rest'] * 4
+    found = [(s.kind, s.period) for s in stretches_of(part_of(np.zeros(V.size)))]
+    # rest, 1 Hz, 50 Hz (40 samples at 2 kHz), noise; four holds start with their first sample
+    assert found[:4] == [('rest', 0), ('repeat', 2000), ('repeat', 40), ('motion', 0)]
+    assert found[4:8] == [('rest', 0)] * 4
 
 
 def test_repeats_are_found_without_labels():
@@ -101,17 +96,7 @@ def test_floor_is_unknown_without_either():
     floor = residual_noise_floor([part], stretches_of(part))
     assert floor.rms is None
     assert floor.at(4) is None
-    assert floor.share(1.0) is None
     assert floor.source.startswith('floor unknown')
-
-
-def test_explainable_share():
-    floor = NoiseFloor(1e-9, 'given')
-    assert floor.share(4e-18) == pytest.approx(0.75)
-    assert floor.share(0.5e-18) == 0.0
-    assert floor.share(0.0) == 0.0
-    # means over four samples of white noise have a quarter of its variance
-    assert floor.share(1e-18, 4) == pytest.approx(0.75)
 
 
 def test_bridged_samples_are_cut_out():

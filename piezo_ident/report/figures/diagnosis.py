@@ -81,8 +81,8 @@ def draw_diagnosis(
         (
             'signature',
             'What the residual depends on',
-            f'{SAME} Mean over the voltage, its rate, and the time since it turned or stepped '
-            '(there multiplied by the direction, and by the size of the step), with two standard '
+            f'{SAME} Mean over the voltage, its rate, and the time since a step '
+            '(there multiplied by the size of the step), with two standard '
             'deviations; the share of variance is held out. What is left should be flat.',
             lambda: residual_dependence_figure(*analyses()),
         ),

@@ -48,7 +48,6 @@ PER_DECADE, LONGEST = 150, 2**21
 AXES = {
     'v': 'voltage / V',
     'dv/dt': 'dv/dt / V s$^{-1}$',
-    'time since the turn': 'time since the turn / s',
     'time since the step': 'time since the step / s',
 }
 
@@ -194,13 +193,13 @@ def residual_spectrum_figure(
     if floor.frequency.size > 2:
         noise = 1e9 * np.sqrt(floor.density[1:-1])
         axes.loglog(floor.frequency[1:-1], noise, 'k--', linewidth=1.0, label='noise floor')
-    for each in before.lines.lines:
+    for each in before.lines:
         for order, found in [(1, each), *each.harmonics]:
             _mark_line(axes, found.frequency, found.amplitude, order)
     tidy(axes, 'frequency / Hz', 'residual / nm Hz$^{-1/2}$')
     axes.set_xlim(first, last)
     # room for the names of the lines
-    reach = 3.0 if not before.lines.lines else 30.0
+    reach = 3.0 if not before.lines else 30.0
     axes.set_ylim(0.3e9 * bottom, reach * 1e9 * top)
     style.plain_log(axes.xaxis, first, last)
     if np.log10(top / bottom) < 4.0:
@@ -222,7 +221,7 @@ def residual_dependence_figure(
     before: ResidualAnalysis, after: ResidualAnalysis | None = None
 ) -> Figure:
     """
-    Draw the mean residual over voltage, speed, and the time since the last turn and step.
+    Draw the mean residual over voltage, speed, and the time since the last step.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a residual is white, whether it follows the input: correlations, honest bands."""
+"""Whether a residual follows the input: cross-correlation and coherence, with honest bounds."""
 
 from __future__ import annotations
 
@@ -11,16 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.residual.stretches import block_means, ResidualPart
-from scipy import fft, linalg, signal, special, stats
+from scipy import fft, linalg, signal, stats
 
-__all__ = [
-    'Coherence',
-    'CrossCorrelation',
-    'Whiteness',
-    'coherence',
-    'cross_correlation',
-    'whiteness',
-]
+__all__ = ['Coherence', 'CrossCorrelation', 'coherence', 'cross_correlation']
 
 Array = NDArray[np.float64]
 
@@ -37,45 +30,17 @@ OVERLAP = 1.0 / 1.056
 
 
 @dataclass(frozen=True, eq=False)
-class Whiteness:
-    """
-    Autocorrelation of a residual over lags [s], shape (m,), from one sample on.
-
-    99 % of the values of white noise lie within `band`; the statistic of Ljung and Box is chi
-    square of m degrees of freedom for white noise.
-    """
-
-    lag: Array
-    correlation: Array
-    band: float
-    statistic: float
-    p_value: float
-
-    @property
-    def white(self) -> bool:
-        """Whether nothing speaks against white noise."""
-        return self.p_value > 1.0 - CONFIDENCE
-
-
-@dataclass(frozen=True, eq=False)
 class CrossCorrelation:
     """
     Cross-correlation of an input ('v' or 'dv/dt') with a residual that follows it by lags [s].
 
-    Unrelated signals stay within `band`, shape (m,), at all lags together in 99 % of cases;
-    `p_value` is the chance of the largest value at any lag.
+    Unrelated signals stay within `band`, shape (m,), at all lags together in 99 % of cases.
     """
 
     input: str
     lag: Array
     correlation: Array
     band: Array
-    p_value: float
-
-    @property
-    def related(self) -> bool:
-        """Whether the residual follows the input."""
-        return self.p_value < 1.0 - CONFIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +55,17 @@ class Coherence:
     tested : ndarray of bool, shape (p,)
         Frequencies at which the voltage has power.
     bound : float
-        ``1 - (1 - c)^(1/(L - 1))``: unrelated signals stay below it in a share c of cases.
-    averages : float
-        Independent averages L.
+        ``1 - (1 - c)^(1/(L - 1))`` of L independent averages: unrelated signals stay below it in
+        a share c of cases.
     share : float
         Share of the residual's power that is coherent with the voltage, bias taken away.
-    density : ndarray, shape (p,)
-        Power spectral density of the residual [m^2/Hz].
     """
 
     frequency: Array
     coherence: Array
     tested: NDArray[np.bool_]
     bound: float
-    averages: float
     share: float
-    density: Array
 
 
 def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
@@ -121,42 +81,6 @@ def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
 
 def _blocks(parts: Sequence[ResidualPart]) -> int:
     return max(1, -(-sum(part.piece.n for part in parts) // SAMPLES))
-
-
-def whiteness(parts: Sequence[ResidualPart], lags: int = 50) -> Whiteness | None:
-    """
-    Return the autocorrelation of single samples and the Ljung-Box statistic.
-
-    None when no run of sound samples is long enough.
-
-    Notes
-    -----
-    Ljung and Box (1978), Biometrika 65, 297-303, doi:10.1093/biomet/65.2.297.  It says that
-    something is left, never what.
-    """
-    chosen, rate = _chosen(parts)
-    sums, n = np.zeros(lags + 1), 0
-    for part in chosen:
-        for start, stop in part.runs():
-            x = part.e[start:stop]
-            if x.size <= 4 * lags:
-                continue
-            sums += _products(x - x.mean(), x - x.mean(), lags)[lags:]
-            n += x.size
-    if n == 0:
-        return None
-    if sums[0] <= 0.0:
-        return Whiteness(np.arange(1, lags + 1) / rate, np.zeros(lags), 0.0, 0.0, 1.0)
-    r = sums[1:] / sums[0]
-    k = np.arange(1, lags + 1)
-    statistic = float(n * (n + 2.0) * np.sum(r * r / (n - k)))
-    return Whiteness(
-        lag=k / rate,
-        correlation=r,
-        band=float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE) / np.sqrt(n)),
-        statistic=statistic,
-        p_value=float(special.gammaincc(0.5 * lags, 0.5 * statistic)),
-    )
 
 
 def _products(x: Array, y: Array, lags: int) -> Array:
@@ -206,14 +130,12 @@ def cross_correlation(
     std = np.sqrt(variance) / scale
     r = products / scale
     # lags are not independent, so counting each errs on the safe side
-    p_value = min(1.0, r.size * float(2.0 * stats.norm.sf(float(np.abs(r).max()) / std)))
     wide = float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / r.size)) * std
     return CrossCorrelation(
         input=which,
         lag=np.arange(-lags, lags + 1) * m / rate,
         correlation=r,
         band=np.full(r.size, wide),
-        p_value=p_value,
     )
 
 
@@ -293,7 +215,5 @@ def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
         coherence=c,
         tested=tested,
         bound=float(bound),
-        averages=float(averages),
         share=coherent / power if power > 0.0 else 0.0,
-        density=2.0 * ee / (count * rate * float(window @ window)),
     )
