@@ -62,3 +62,20 @@ def test_every_public_name_has_a_docstring_with_an_example_that_runs(name, tmp_p
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     runner.run(test)
     assert runner.failures == 0
+
+
+def test_arguments_of_another_kind_cost_one_line(tmp_path):
+    model = pi.SimulatedStage.load('paper').model
+    record = pi.Record.from_arrays([0, 1, 2], [0, 1e-6, 2e-6], sample_rate=20e3)
+    for call in (
+        lambda: pi.identify('record.csv'),
+        lambda: pi.identify([record, 'record.csv']),
+        lambda: pi.free_run(record, model),
+        lambda: pi.free_run(model, 'record.csv'),
+        lambda: pi.diagnose(record, model),
+        lambda: pi.diagnose(model, model),
+        lambda: pi.write_report(record, tmp_path / 'report'),
+        lambda: model.simulate('voltage.csv'),
+    ):
+        with pytest.raises(pi.DataError, match=r'expected|vector'):
+            call()

@@ -38,3 +38,18 @@ class IdentificationError(PiezoIdentError):
 
 class Cancelled(PiezoIdentError):
     """The work was stopped on request; nothing was written."""
+
+
+def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) -> None:
+    """
+    Refuse an argument of another type than the one that belongs there.
+
+    Raises
+    ------
+    DataError
+        With what is expected, what came instead, and what to do.
+    """
+    if not isinstance(value, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        names = ' or '.join(k.__name__ for k in kinds)
+        raise DataError(f'{where}: expected {names}, got {type(value).__name__}; {hint}')

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.errors import errors_of, row_noise
 from piezo_ident.diagnosis.forward_selection import ForwardSelection
@@ -51,7 +51,7 @@ from piezo_ident.diagnosis.verdict import (
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Record, records_of
 from piezo_ident.residual import (
     all_stretches,
     find_faults,
@@ -120,7 +120,8 @@ def diagnose(
     True
     """
     settings = settings or DiagnosisSettings()
-    records = [records] if isinstance(records, Record) else list(records)
+    records = records_of(records, 'diagnose, second argument')
+    expect(model, StageModel, 'diagnose, first argument', 'read a model with load')
     for record in records:
         record.require_displacement()
     part = _beginnings(model, records, settings.most_samples)

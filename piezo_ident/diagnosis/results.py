@@ -7,17 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, ModelError
+from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Piece
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = [
     'FORMULA',
@@ -204,8 +201,8 @@ class Residual:
     sound: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Showable):
     """
     Result of a diagnosis.
 
@@ -276,14 +273,3 @@ class Diagnosis:
     warnings: tuple[str, ...]
     settings: DiagnosisSettings
     unseen: tuple[Unseen, ...] = ()
-
-    def plot(self) -> Figure:
-        """Draw the residual before and after, of the piece that the model misses most."""
-        import piezo_ident as pi
-
-        return pi.report.plot(self)
-
-    def _repr_html_(self) -> str:
-        import piezo_ident as pi
-
-        return pi.report.to_html(self)

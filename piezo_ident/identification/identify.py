@@ -48,7 +48,7 @@ from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Record, records_of
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import ResidualPart, stretches_of
 import scipy
@@ -99,9 +99,7 @@ def identify(
     >>> bool(result.headline.percent < 0.1)
     True
     """
-    records, validation = (
-        [x] if isinstance(x, Record) else list(x) for x in (records, validation)
-    )
+    records, validation = (records_of(x, 'identify') for x in (records, validation))
     with singular_is_ours():
         return _identify(records, settings or Settings(), validation, progress, steps or Steps())
 

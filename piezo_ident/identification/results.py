@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, IdentificationError
+from piezo_ident.common.showable import Showable
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.step1_delay import StepDelay
 from piezo_ident.identification.step2_dynamics import FrequencyResponse, OrderTable
@@ -22,9 +22,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from scipy.optimize import OptimizeResult
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = [
     'DelayResult',
@@ -314,8 +311,8 @@ def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
     return float(np.sqrt(squares / n)) if n else float('nan')
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Showable):
     """
     Result of an identification.
 
@@ -397,17 +394,6 @@ class Identification:
 
     def _driven(self, data: str) -> list[ErrorRow]:
         return [row for row in self.errors if row.data == data and row.driven]
-
-    def plot(self) -> Figure:
-        """Draw the hysteresis loop, measured and modelled, with the error below."""
-        import piezo_ident as pi
-
-        return pi.report.plot(self)
-
-    def _repr_html_(self) -> str:
-        import piezo_ident as pi
-
-        return pi.report.to_html(self)
 
 
 def key_of(run: Run) -> tuple[str, float]:

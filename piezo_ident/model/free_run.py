@@ -14,19 +14,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 import re
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import expect, ModelError
+from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
 from piezo_ident.model.metrics import nrmse_fit, percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = [
     'FreeRun',
@@ -83,8 +80,8 @@ class FreeRunErrors:
         return self.percent_without_offset <= 0.5 * self.percent and self.percent > 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class FreeRun(Showable):
     """
     A model's free run over a record, beside what was measured.
 
@@ -129,17 +126,6 @@ class FreeRun:
         """Measured displacement of all pieces [m], shape (n,)."""
         return np.concatenate([piece.y for piece in self.record])
 
-    def plot(self) -> Figure:
-        """Draw the longest piece over time, measured and predicted, with the error."""
-        import piezo_ident as pi
-
-        return pi.report.plot(self)
-
-    def _repr_html_(self) -> str:
-        import piezo_ident as pi
-
-        return pi.report.to_html(self)
-
 
 def free_run(model: StageModel, record: Record) -> FreeRun:
     """
@@ -172,6 +158,8 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     >>> run.errors.percent < 0.01
     True
     """
+    expect(model, StageModel, 'free_run, first argument', 'read a model with load')
+    expect(record, Record, 'free_run, second argument', 'read a file with read')
     record.require_displacement()
     record = without_faults(record)
     for piece in record:

@@ -150,6 +150,16 @@ class StageModel:
                 'identify again with another order'
             )
 
+    def __repr__(self) -> str:
+        low, high = self.scaling.range
+        h, g = self.hysteresis, self.dynamics
+        effects = ', '.join(effect.name for effect in self.effects) or 'none'
+        return (
+            f'StageModel({self.sample_rate:g} Hz, {low:g} .. {high:g} V, '
+            f'{len(h.thresholds)} thresholds, na = {g.a.size}, nb = {g.b.size}, '
+            f'delay {self.delay.total:g} samples, effects: {effects})'
+        )
+
     @property
     def is_static(self) -> bool:
         """Whether neither G nor the delay nor an effect depends on the sampling rate."""
@@ -265,7 +275,10 @@ class StageModel:
         >>> (1e6 * y[[0, 999]]).round(1).tolist()
         [0.0, 71.3]
         """
-        x = np.asarray(v, dtype=np.float64)
+        try:
+            x = np.asarray(v, dtype=np.float64)
+        except (TypeError, ValueError):
+            x = np.array(np.nan)
         if x.ndim != 1 or not np.all(np.isfinite(x)):
             raise DataError('simulate: the voltage must be a vector of finite numbers, in volts')
         if not x.size:

@@ -10,21 +10,18 @@ sample is unusable, a new piece begins, because the stage's memory at its start 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array, robust_range
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, expect
+from piezo_ident.common.showable import Showable
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment']
+__all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment', 'records_of']
 
 #: the segment kinds that the programs use; other labels are kept and treated as unlabelled
 KINDS = (
@@ -195,8 +192,8 @@ class Piece:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
+@dataclass(frozen=True, eq=False, repr=False)
+class Record(Showable):
     """
     One measurement: pieces in order of time, and what was wrong with the data.
 
@@ -351,26 +348,22 @@ class Record:
         fault = Fault('part', where, self.n - n, 'what comes later is left out')
         return replace(part, faults=(*self.faults, fault))
 
-    def plot(self) -> Figure:
-        """Draw voltage and displacement over time."""
-        import piezo_ident as pi
-
-        return pi.report.plot(self)
-
-    def _repr_html_(self) -> str:
-        rates = ', '.join(f'{rate:g}' for rate in dict.fromkeys(p.sample_rate for p in self))
-        low, high = self.voltage_range
-        rows = [
-            ('samples', f'{self.n} in {len(self.pieces)} pieces'),
-            ('duration', f'{self.duration:.4g} s at {rates} Hz'),
-            ('voltage', f'{low:.4g} .. {high:.4g} V'),
-            ('stroke', f'{1e6 * self.stroke:.4g} \u00b5m'),
-            *([('segments', ', '.join(self.labels))] if self.labels else []),
-            *(('fault', str(fault)) for fault in self.faults),
-        ]
-        cells = ''.join(f'<tr><th>{name}</th><td>{escape(x)}</td></tr>' for name, x in rows)
-        return f'<table><caption>{escape(self.name)}</caption>{cells}</table>'
-
     def renamed(self, name: str) -> Record:
         """Return the same record under another name."""
         return replace(self, name=name)
+
+
+def records_of(records: Record | Iterable[Record], where: str) -> list[Record]:
+    """
+    Return one record, or several, as a list.
+
+    Raises
+    ------
+    DataError
+        When something else is given.
+    """
+    single = isinstance(records, (Record, str)) or not isinstance(records, Iterable)
+    several: list[Any] = [records] if single else list(records)
+    for record in several:
+        expect(record, Record, where, 'read a file with read')
+    return several

@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.files import write_together
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification, Progress, silent
@@ -78,6 +78,7 @@ def write_report(
     >>> page.name, len(list(page.parent.glob('*.png'))) > 2
     ('report.html', True)
     """
+    expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
     if isinstance(result, Diagnosis):
         data, page, shown = _diagnosis(result, progress)
     else:

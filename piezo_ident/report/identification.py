@@ -74,7 +74,8 @@ def headline(result: Identification) -> str:
 def facts(result: Identification) -> list[tuple[str, str]]:
     """Return the few numbers that stand beside the headline."""
     model, delay, floor = result.model, result.delay, result.noise_floor
-    na, nb = result.dynamics.order
+    # slow poles are removed after the search for the order
+    na, nb = model.dynamics.a.size, model.dynamics.b.size
     low, high = model.scaling.range
     lag = 1e6 * model.delay.total / model.sample_rate
     texts = {
@@ -345,7 +346,8 @@ def brief_table(result: Identification) -> Table:
     """Return facts and errors for a notebook."""
     rows = [(kind, number(result.error(kind))) for kind in KINDS]
     errors = [(f'error, {kind}', f'{x} % of stroke') for kind, x in rows if x != '–']
-    return Table('Model', ('', ''), [*facts(result), *errors])
+    warnings = [('warning', warning) for warning in result.warnings]
+    return Table('Model', ('', ''), [*facts(result), *errors, *warnings])
 
 
 def table_one(rows: Sequence[SineError]) -> str:

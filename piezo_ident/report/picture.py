@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results as one picture, in a file or with a summary in a notebook."""
+"""Results as one picture or a short table: in a file, in a notebook, at a prompt."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
-from piezo_ident.report.table import length, number, Table
+from piezo_ident.report.table import length, number, Table, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ['plot', 'save_plot', 'to_html']
+__all__ = ['plot', 'save_plot', 'to_html', 'to_text']
 
 #: endings that a picture may have
 ENDINGS = ('.png', '.pdf', '.svg')
@@ -101,17 +101,43 @@ def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
         drawn.savefig(file, dpi=style.DPI)
 
 
-def to_html(result: Result) -> str:
+def to_text(result: Result | Record) -> str:
+    """Return headline and table of a result as text, for a prompt."""
+    headline, table = _summary(result)
+    width = 2 + max(len(name) for name, _ in table.rows)
+    lines = [line for name, x in table.rows for line in wrapped(x, ' ' * width, name.ljust(width))]
+    return '\n'.join([*wrapped(headline), *lines])
+
+
+def to_html(result: Result | Record) -> str:
     """Return headline, table and picture of a result as HTML, for a notebook."""
     from piezo_ident.report.figures.style import png
 
+    headline, table = _summary(result)
+    picture = Shown('result', table.title, '', png(plot(result), DPI))
+    return summary_html(headline, table, picture)
+
+
+def _summary(result: Result | Record) -> tuple[str, Table]:
     if isinstance(result, Identification):
-        headline, table = identification.headline(result), identification.brief_table(result)
-    elif isinstance(result, Diagnosis):
-        headline, table = diagnosis.headline(result), diagnosis.brief_table(result)
-    else:
-        headline, table = _free_run(result)
-    return summary_html(headline, table, Shown('result', table.title, '', png(plot(result), DPI)))
+        return identification.headline(result), identification.brief_table(result)
+    if isinstance(result, Diagnosis):
+        return diagnosis.headline(result), diagnosis.brief_table(result)
+    return _record(result) if isinstance(result, Record) else _free_run(result)
+
+
+def _record(record: Record) -> tuple[str, Table]:
+    rates = ', '.join(f'{rate:g}' for rate in dict.fromkeys(p.sample_rate for p in record))
+    low, high = record.voltage_range
+    channels = sorted({name for piece in record for name in piece.channels})
+    rows = [('samples', str(record.n)), ('duration', f'{number(record.duration, 4)} s')]
+    rows += [('sampling rate', f'{rates} Hz'), ('voltage', f'{low:.4g} .. {high:.4g} V')]
+    rows += [('stroke', length(record.stroke))]
+    rows += [('segments', ', '.join(record.labels))] if record.labels else []
+    rows += [('channels', ', '.join(channels))] if channels else []
+    rows += [('fault', str(fault)) for fault in record.faults]
+    text = f'Record {record.name}' + (f', {len(record.pieces)} pieces' * (len(record.pieces) > 1))
+    return f'{text}.', Table('Record', ('', ''), rows)
 
 
 def _free_run(result: FreeRun) -> tuple[str, Table]:

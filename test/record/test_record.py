@@ -50,9 +50,11 @@ def test_stroke_does_not_count_single_wild_samples():
 
 
 def test_html_names_what_it_holds_and_escapes_it():
-    page = Record((Piece(V, Y, RATE),), '<b>')._repr_html_()
+    record = Record((Piece(V, Y, RATE),), '<b>')
+    page = record._repr_html_()
     assert '&lt;b&gt;' in page
     assert '75' in page
+    assert '75' in repr(record)
 
 
 def test_plot_draws_voltage_and_displacement():

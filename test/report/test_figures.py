@@ -155,6 +155,8 @@ def test_results_draw_and_show_themselves(identified, runs, tmp_path):
         figure = result.plot()
         figure.savefig(tmp_path / 'plot.png', dpi=30)
         assert np.any(imread(tmp_path / 'plot.png')[..., :3] < 0.5)
+        assert text in repr(result)
+        assert len(repr(result).splitlines()) < 40
         html = result._repr_html_()
         assert text in html
         assert '<img src="data:image/png;base64,' in html
