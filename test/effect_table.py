@@ -65,7 +65,7 @@ VIEW = View(
     duration=0.6,
     channels={'other_axis': (0.25, 0.5)},
     lines=(50.0, 150.0),
-    modes=tuple(PAPER.dynamics.modes(FS)),
+    modes=tuple((m.frequency, m.damping) for m in PAPER.dynamics.modes(FS)),
     max_frequency=120.0,
     thresholds=H.thresholds,
 )

@@ -185,7 +185,7 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         duration=rows.duration,
         channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
         lines=tuple(lines),
-        modes=tuple(model.dynamics.modes(model.sample_rate)),
+        modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
         max_frequency=top,
         thresholds=model.hysteresis.thresholds,
     )

@@ -12,6 +12,7 @@ of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,12 +22,31 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import dynamics as run_dynamics
 
-__all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'filter_arx']
+__all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'Mode', 'filter_arx']
 
 #: longest pure delay that a model may have [samples]
 MAX_DELAY = 1_000_000
 #: upper limit of `Dynamics.memory` [samples], longer than any record
 MAX_MEMORY = 2**40
+
+
+@dataclass(frozen=True)
+class Mode:
+    """
+    An oscillating pair of poles in continuous time.
+
+    Attributes
+    ----------
+    frequency, frequency_std : float
+        Natural frequency and its standard deviation [Hz].
+    damping, damping_std : float
+        Damping ratio and its standard deviation.
+    """
+
+    frequency: float
+    frequency_std: float
+    damping: float
+    damping_std: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,14 +179,36 @@ class Dynamics:
         denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
         return np.asarray(numerator / denominator, dtype=np.complex128)
 
-    def modes(self, sample_rate: float) -> list[tuple[float, float]]:
-        """Return (natural frequency [Hz], damping ratio) of each oscillating pole pair."""
-        modes = []
-        for pole in self.poles:
-            if pole.imag > 0.0 and abs(pole) > 0.0:
-                s = np.log(pole) * sample_rate
-                modes.append((float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))))
-        return sorted(modes)
+    def modes(
+        self, sample_rate: float, covariance: NDArray[np.float64] | None = None
+    ) -> list[Mode]:
+        """
+        Return each oscillating pair of poles as a mode, by frequency.
+
+        Parameters
+        ----------
+        sample_rate : float
+            [Hz]
+        covariance : ndarray, optional
+            Of (a, b).  To first order, a change of a_i moves a pole p by ``-p^(na-i) / A'(p)``;
+            without a covariance the standard deviations are NaN.
+        """
+        na = self.a.size
+        block = np.full((na, na), math.nan)
+        if covariance is not None and covariance.shape[0] >= na:
+            block = covariance[:na, :na]
+        slope = np.polyder(np.concatenate([[1.0], self.a])) if na else np.zeros(1)
+        rate = sample_rate / (2.0 * math.pi)
+        found = []
+        for pole in self.poles[self.poles.imag > 0.0]:
+            s = np.log(pole)
+            ds = -(pole ** np.arange(na - 1, -1, -1)) / np.polyval(slope, pole) / pole
+            size = abs(s)
+            d_size = np.real(np.conj(s) * ds) / size
+            d_damping = -ds.real / size + s.real * d_size / size**2
+            std = [float(np.sqrt(np.maximum(d @ block @ d, 0.0))) for d in (d_size, d_damping)]
+            found.append(Mode(float(rate * size), rate * std[0], float(-s.real / size), std[1]))
+        return sorted(found, key=lambda mode: mode.frequency)
 
 
 def filter_arx(

@@ -16,10 +16,11 @@ Examples
 >>> pi.report.save_plot(result, 'loop.png')
 """
 
-from piezo_ident.report.diagnosis import changes, diagnosis_text, validated
+from piezo_ident.report.diagnosis import diagnosis_text
 from piezo_ident.report.folder import check_report_folder, write_report
 from piezo_ident.report.identification import headline, identification_text, table_one
 from piezo_ident.report.picture import plot, save_plot, to_html, to_text
+from piezo_ident.report.refined import changes, validated
 from piezo_ident.report.table import length
 from piezo_ident.report.to_json import json_text, steps_to_json, to_json
 

@@ -5,30 +5,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 import math
-import sys
+from platform import python_version
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter, Unseen
+from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter
 from piezo_ident.effects import find_effect
 from piezo_ident.model import metrics
-from piezo_ident.model.free_run import free_run, sine_errors
-from piezo_ident.model.stage_model import EffectSetting, StageModel
-from piezo_ident.record.record import Record
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
-from piezo_ident.report.table import columns, FAULTS, length, number, Table, table, wrapped
+from piezo_ident.report.refined import changes
+from piezo_ident.report.table import (
+    FAULTS,
+    length,
+    number,
+    origin_tables,
+    plain_text,
+    share_text,
+    Table,
+    table,
+)
 from piezo_ident.residual.reversals import Way, ways
 
 __all__ = [
     'brief_table',
-    'changes',
     'diagnosis_page',
     'diagnosis_text',
     'headline',
-    'validated',
 ]
 
 #: columns of every table of errors
@@ -48,35 +53,6 @@ FOOTER = (
 )
 
 
-def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
-    """
-    Return a diagnosis with the errors of both models on records that took no part in it.
-
-    Raises
-    ------
-    ModelError
-        When a piece has another sampling rate than the models.
-    """
-    unseen = [_unseen(result, record) for record in records]
-    return replace(result, unseen=(*result.unseen, *unseen))
-
-
-def _unseen(result: Diagnosis, record: Record) -> Unseen:
-    models = (result.given, result.model)
-    runs = [free_run(model, record) for model in models]
-    before, after = (run.errors_after_start or run.errors for run in runs)
-    sines = zip(*(sine_errors(model, record) for model in models), strict=True)
-    return Unseen(
-        record=record.name,
-        before=before.percent,
-        after=after.percent,
-        before_centred=before.percent_without_offset,
-        after_centred=after.percent_without_offset,
-        n=after.n,
-        sines=tuple((a.frequency, a.percent, b.percent) for a, b in sines),
-    )
-
-
 def headline(result: Diagnosis) -> str:
     """Return the verdict in words, and the errors on records that took no part."""
     texts = [
@@ -87,46 +63,8 @@ def headline(result: Diagnosis) -> str:
     return ' '.join([*texts, result.sentence])
 
 
-def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
-    """Return how a refined model differs from the one that it came from; empty if not at all."""
-    texts = []
-    # a play without weight is none
-    old, new = (
-        np.concatenate([h.thresholds[h.weights > 0.0], h.weights[h.weights > 0.0], [h.p1, h.p2]])
-        for h in (given.hysteresis, refined.hysteresis)
-    )
-    if not np.array_equal(old, new):
-        texts.append('H refitted')
-    if given.scaling != refined.scaling:
-        texts.append('offset refitted')
-    if given.delay != refined.delay:
-        texts.append('another delay')
-    G, other = given.dynamics, refined.dynamics
-    if not (np.array_equal(G.a, other.a) and np.array_equal(G.b, other.b)):
-        texts.append('G retuned')
-    before = {e.name: _frozen(e.parameters) for e in given.effects}
-    after = {e.name: _frozen(e.parameters) for e in refined.effects}
-    texts += [_with(e) for e in refined.effects if e.name not in before]
-    texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
-    return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
-
-
-def _with(added: EffectSetting) -> str:
-    idle = find_effect(added.name).is_neutral(added.parameters)
-    return f'with {added.name}{", switched off" if idle else ""}'
-
-
-def _frozen(values: Mapping[str, object]) -> list[tuple[str, str]]:
-    return sorted((k, repr(np.asarray(x).tolist())) for k, x in values.items())
-
-
-def percent_of_explainable(share: float) -> str:
-    """Return a share of the explainable part as a percentage."""
-    return f'{100.0 * min(1.0, max(0.0, share)):.0f} %' if math.isfinite(share) else '–'
-
-
-def error_rows(result: Diagnosis) -> tuple[list[tuple[str, ...]], ...]:
-    """Return the errors overall, by segment and by frequency, in `STATES` and their ratio."""
+def error_table(result: Diagnosis) -> Table:
+    """Return the errors before and after: overall, by segment and by frequency of a sine."""
     states = (result.before, result.refit, result.after)
 
     def row(name: str, values: list[float]) -> tuple[str, ...]:
@@ -134,30 +72,21 @@ def error_rows(result: Diagnosis) -> tuple[list[tuple[str, ...]], ...]:
         return (name, *map(number, values), number(ratio, 2))
 
     # rests and ramps come last
-    easy = ('idle', 'ramp')
-    labels = sorted(result.before.by_segment, key=lambda x: x.partition(':')[0] in easy)
-    frequencies = sorted(result.before.by_frequency, key=float)
-    return (
-        [row('overall', [s.overall for s in states])],
-        [row(x, [s.by_segment.get(x, math.nan) for s in states]) for x in labels],
-        [
-            row(f'{float(f):g} Hz', [s.by_frequency.get(f, math.nan) for s in states])
-            for f in frequencies
-        ],
+    labels = sorted(
+        result.before.by_segment, key=lambda x: x.partition(':')[0] in ('idle', 'ramp')
     )
-
-
-def error_tables(result: Diagnosis) -> list[Table]:
-    """Return the errors before and after, by segment and by frequency, with their formula."""
-    overall, segments, frequencies = error_rows(result)
-    head = ('', *STATES, 'times smaller')
+    frequencies = sorted(result.before.by_frequency, key=float)
+    rows = [row('overall', [s.overall for s in states])]
+    rows += [row(x, [s.by_segment.get(x, math.nan) for s in states]) for x in labels]
+    for f in frequencies:
+        values = [s.by_frequency.get(f, math.nan) for s in states]
+        rows.append(row(f'sines of {float(f):g} Hz', values))
     note = (
-        f'In % of stroke: {FORMULA}. H refitted: the same model with its hysteresis and offsets '
+        f'{FORMULA}. H refitted: the same model with its hysteresis and offsets '
         f'fitted to these data and nothing added, held out likewise. {result.blocks} blocks of '
         'data were predicted in turn from the others.'
     )
-    tables = [Table('By segment', head, [*overall, *segments], note)]
-    return [*tables, *table('By frequency of a sine', head, frequencies)]
+    return Table('Errors in % of stroke', ('', *STATES, 'times smaller'), rows, note)
 
 
 def unseen_tables(result: Diagnosis) -> list[Table]:
@@ -171,11 +100,11 @@ def unseen_tables(result: Diagnosis) -> list[Table]:
             for f, before, after in x.sines
         ]
     return table(
-        'Records that took no part',
+        'Records that took no part, errors in % of stroke',
         ('', STATES[0], STATES[2], f'{STATES[0]}, no mean', f'{STATES[2]}, no mean', 'samples'),
         rows,
-        f'In % of stroke: {metrics.FORMULA}. No mean: without the mean of the error, as a sensor '
-        'shows it that was set to zero anew. Sines: steady state.',
+        f'{metrics.FORMULA}. No mean: without the mean of the error, since a sensor may have been '
+        'set to zero between two records. Sines: steady state.',
     )
 
 
@@ -249,34 +178,18 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _left(share: float, rms_percent: float) -> str:
-    return (
-        f'{percent_of_explainable(share)} of the explainable part, {number(rms_percent)} % of '
-        'stroke'
-    )
-
-
-def _setting_tables(result: Diagnosis) -> list[Table]:
-    settings = asdict(result.settings)
-    if settings['effects'] is None:
-        settings['effects'] = 'the whole catalogue'
-    rows = [
-        (name.replace('_', ' '), ', '.join(x) if isinstance(x, (tuple, list)) else str(x))
-        for name, x in settings.items()
-    ]
-    python = '.'.join(map(str, sys.version_info[:3]))
-    versions = (('piezo_ident', __version__), ('python', python), ('numpy', np.__version__))
-    return [
-        Table('Settings', ('setting', 'value'), [(name, x or 'none') for name, x in rows]),
-        Table('Versions', ('software', 'version'), versions),
-    ]
+    return f'{share_text(share)} of the explainable part, {number(rms_percent)} % of stroke'
 
 
 def ways_of(result: Diagnosis) -> tuple[Way, ...]:
     """Return the three residuals by the way since a turn [% of stroke]."""
     stroke = max(float(np.ptp(r.piece.y)) for r in result.residuals)
-    return ways(
+    found = ways(
         [(r.piece.v, r.sound, r.piece.sample_rate) for r in result.residuals],
-        [[100.0 * e / stroke for e in (r.given, r.before, r.after)] for r in result.residuals],
+        [[r.given, r.before, r.after] for r in result.residuals],
+    )
+    return tuple(
+        replace(way, rms=tuple(metrics.percent(rms, stroke) for rms in way.rms)) for way in found
     )
 
 
@@ -285,7 +198,7 @@ def _reversal_tables(found: Sequence[Way]) -> list[Table]:
         'By the way since the voltage last turned',
         ('share of the range', *STATES, 'means'),
         [
-            (f'{100.0 * w.start:g} .. {100.0 * w.stop:g} %', *map(number, w.rms), str(w.n))
+            (f'{share_text(w.start)} .. {share_text(w.stop)}', *map(number, w.rms), str(w.n))
             for w in found
         ],
         'In % of stroke: rms of the residual, free run, means over 2 ms; fitted to all of these '
@@ -304,14 +217,14 @@ def reversal_text(result: Diagnosis, found: Sequence[Way]) -> str:
     if given < STANDS * elsewhere[0]:
         return ''
     text = (
-        f'Near the reversals (the first {100.0 * NEAR:g} % of the range behind a turn) the model '
+        f'Near the reversals (the first {share_text(NEAR)} of the range behind a turn) the model '
         f'as given misses {number(given)} % of stroke, elsewhere {number(elsewhere[0])} %. '
-        f'{100.0 * max(1.0 - (refitted / given) ** 2, 0.0):.0f} % of its square go when H is '
+        f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
         'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
     )
     if result.effects and refined < refitted:
         names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
-        text += f'; {100.0 * (refitted**2 - refined**2) / given**2:.0f} % with {names}'
+        text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
     last, there = (refined, elsewhere[2]) if result.effects else (refitted, elsewhere[1])
     return f'{text}. {number(last)} % stay, elsewhere {number(there)} %.'
 
@@ -329,6 +242,33 @@ def _added(result: Diagnosis) -> list[str]:
     ]
 
 
+def _alike(result: Diagnosis) -> list[str]:
+    if result.group is None:
+        return []
+    return [', '.join(result.group.names), f'what would: {result.group.separating_experiment}']
+
+
+def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]:
+    rows = [(c.name, share_text(c.share), c.why_not) for c in result.candidates]
+    title, n = 'Candidates that were not added', len(rows)
+    if most is not None and n > most:
+        title, rows = f'{title}, the first {most} of {n}', rows[:most]
+    note = (
+        'Share of the explainable part of the residual that each explains when it is added alone.'
+    )
+    return table(title, ('effect', 'share', 'why not'), rows, note)
+
+
+def _untestable_tables(result: Diagnosis) -> list[Table]:
+    rows = [(x.name, x.needs) for x in result.untestable]
+    return table('What these data cannot test', ('effect', 'needs'), rows)
+
+
+def _fault_tables(result: Diagnosis) -> list[Table]:
+    rows = [(x.name, str(x.count), x.where, x.action) for x in result.faults]
+    return table('Faults in the data', FAULTS, rows)
+
+
 def diagnosis_page(
     result: Diagnosis,
     pictures: Sequence[Shown],
@@ -338,16 +278,10 @@ def diagnosis_page(
     warnings = list(result.warnings)
     if result.faults:
         warnings.append('the data had faults, see the table near the end')
-    group, found = result.group, ways_of(result)
-    alike = [] if group is None else [*group.names, f'what would: {group.separating_experiment}']
+    found = ways_of(result)
     changed = ', '.join(changes(result.given, result.model))
-
-    candidates = [(c.name, percent_of_explainable(c.share), c.why_not) for c in result.candidates]
-    note = (
-        'Share of the explainable part of the residual that each explains when it is added alone.'
-    )
-    untestable = [(x.name, x.needs) for x in result.untestable]
-    faults = [(x.name, str(x.count), x.where, x.action) for x in result.faults]
+    versions = {'piezo_ident': __version__, 'python': python_version(), 'numpy': np.__version__}
+    origin = origin_tables(asdict(result.settings), 'the whole catalogue', versions)
     return Page(
         title='Diagnosis of a piezo stage',
         source=', '.join(result.records),
@@ -355,12 +289,12 @@ def diagnosis_page(
         facts=facts(result),
         before=(
             Box('warnings', 'Warnings', warnings),
-            Box('missing', 'These data cannot tell apart', alike),
+            Box('missing', 'These data cannot tell apart', _alike(result)),
         ),
         sections=(
             Section(
                 'Error before and after',
-                [*named(pictures, 'error'), *error_tables(result), *unseen_tables(result)],
+                [*named(pictures, 'errors'), error_table(result), *unseen_tables(result)],
             ),
             Section(
                 'The residual before and after',
@@ -378,29 +312,15 @@ def diagnosis_page(
                     f'Refined model: {changed or "the same as the one that was given"}.',
                 ],
             ),
-            Section(
-                'What was not, and why',
-                [
-                    *named(pictures, 'ranking'),
-                    *table(
-                        'Candidates that were not added',
-                        ('effect', 'share', 'why not'),
-                        candidates,
-                        note,
-                    ),
-                ],
-            ),
+            Section('What was not, and why', _candidate_tables(result)),
             Section(
                 'What remains',
                 [
                     Table('What the model leaves', ('', ''), remains(result)),
-                    *table('What these data cannot test', ('effect', 'needs'), untestable),
+                    *_untestable_tables(result),
                 ],
             ),
-            Section(
-                'Origin',
-                [*table('Faults in the data', FAULTS, faults), *_setting_tables(result)],
-            ),
+            Section('Origin', [*_fault_tables(result), *origin]),
         ),
         after=(Box('missing', 'Pictures that these data do not allow', pairs(left_out)),),
         footer=FOOTER,
@@ -409,44 +329,23 @@ def diagnosis_page(
 
 def diagnosis_text(result: Diagnosis) -> str:
     """Return verdict, errors before and after, what was added and what was not, for a terminal."""
-    rows = [row for rows in error_rows(result) for row in rows]
-    lines = [*wrapped(headline(result)), '']
-    lines += columns(('error / % of stroke', *STATES, 'times smaller'), rows)
-    for each in unseen_tables(result):
-        lines += ['', *columns((each.title.lower(), *each.head[1:]), each.rows)]
-    near = reversal_text(result, ways_of(result))
-    lines += ['', *wrapped(near)] if near else []
-    lines.append('')
-    for what, text in (facts(result)[0], *remains(result)):
-        lines += wrapped(f'{what:<14}{text}', ' ' * 14)
-    for effect, text in zip(result.effects, _added(result), strict=True):
-        lines += ['', *wrapped(f'added: {text}', '  ')]
-        for name, parameter, value, unit, _ in parameter_rows(result):
-            if name == effect.name:
-                of_unit = f' [{unit}]' if unit else ''
-                lines += wrapped(f'  {parameter:<16}{value}{of_unit}', ' ' * 18)
-    if result.group is not None:
-        names = ', '.join(result.group.names)
-        what = f'what would: {result.group.separating_experiment}'
-        lines += ['', *wrapped(f'these data cannot tell apart: {names}; {what}', '  ')]
-    others = [
-        f'{c.name} ({percent_of_explainable(c.share)}): {c.why_not}' for c in result.candidates
-    ]
-    if len(others) > CANDIDATES:
-        others[CANDIDATES:] = [f'and {len(others) - CANDIDATES} more']
-    lines += _listed('not added', others)
-    untestable = [f'{x.name}: needs {x.needs}' for x in result.untestable]
-    lines += _listed('not testable with these data', untestable)
-    lines += _listed('faults in the data', [str(fault) for fault in result.faults])
-    for warning in result.warnings:
-        lines += ['', *wrapped(f'warning: {warning}', '  ')]
-    return '\n'.join(lines)
-
-
-def _listed(title: str, items: Sequence[str]) -> list[str]:
-    if not items:
-        return []
-    return ['', f'{title}:', *(x for item in items for x in wrapped(item, '    ', '  '))]
+    alike = _alike(result)
+    return plain_text(
+        [
+            headline(result),
+            error_table(result),
+            *unseen_tables(result),
+            reversal_text(result, ways_of(result)),
+            Table('', ('', ''), [facts(result)[0], *remains(result)]),
+            *(f'added: {text}' for text in _added(result)),
+            *_parameter_tables(result),
+            f'these data cannot tell apart: {"; ".join(alike)}' if alike else '',
+            *_candidate_tables(result, CANDIDATES),
+            *_untestable_tables(result),
+            *_fault_tables(result),
+            *(f'warning: {warning}' for warning in result.warnings),
+        ]
+    )
 
 
 def brief_table(result: Diagnosis) -> Table:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 import json
 import os
@@ -26,13 +26,24 @@ from piezo_ident.report.to_json import to_json
 if TYPE_CHECKING:
     from piezo_ident.report.figures.style import Drawn
 
-__all__ = ['check_report_folder', 'put_in_place', 'write_report']
+__all__ = ['PICTURES', 'check_report_folder', 'write_report']
 
 PAGE, MODEL = 'report.html', 'model.yaml'
 #: the numbers, by which an earlier report is known
 NUMBERS: Mapping[type, str] = {
     Identification: 'identification.json',
     Diagnosis: 'diagnosis.json',
+}
+#: all pictures that a report may have; those of an earlier one are replaced or deleted
+PICTURES: Mapping[type, tuple[str, ...]] = {
+    Identification: (
+        *('sines', 'loops', 'segments', 'delay', 'response', 'orders', 'weights'),
+        *(f'overview_{i}' for i in range(1, 5)),
+    ),
+    Diagnosis: (
+        *('errors', 'signature', 'spectrum', 'coherence'),
+        *(f'residual_{i}' for i in range(1, 5)),
+    ),
 }
 
 Result = Identification | Diagnosis
@@ -79,14 +90,24 @@ def write_report(
     ('report.html', True)
     """
     expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
+    kind = type(result)
     if isinstance(result, Diagnosis):
         data, page, shown = _diagnosis(result, progress)
     else:
         data, page, shown = _identified(result, progress)
     progress('writing', 0.9)
-    numbers = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
-    texts = {NUMBERS[type(result)]: numbers + '\n', MODEL: model_to_yaml(result.model), PAGE: page}
-    return put_in_place(folder, texts, shown, _names(type(result)))
+    target = Path(folder)
+    check_report_folder(target, kind)
+    numbers = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + '\n'
+    texts = {NUMBERS[kind]: numbers, MODEL: model_to_yaml(result.model)}
+    # file names need not be Unicode
+    files = {name: text.encode('utf-8', 'replace') for name, text in texts.items()}
+    files |= {f'{picture.name}.png': picture.png for picture in shown}
+    write_together(target, {**files, PAGE: page.encode('utf-8', 'replace')})
+    for name in set(PICTURES[kind]) - {picture.name for picture in shown}:
+        with suppress(OSError):
+            (target / f'{name}.png').unlink()
+    return target / PAGE
 
 
 def _identified(
@@ -121,17 +142,6 @@ def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:
     return shown
 
 
-def _names(kind: type) -> Sequence[str]:
-    """Return the names of all pictures that a report of a kind may have."""
-    if kind is Diagnosis:
-        from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES
-
-        return DIAGNOSIS_NAMES
-    from piezo_ident.report.figures.identification import IDENTIFICATION_NAMES
-
-    return IDENTIFICATION_NAMES
-
-
 def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     """
     Refuse a folder in which `write_report` would replace a file that is of no earlier report.
@@ -142,51 +152,11 @@ def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     ------
     DataError
     """
-    _refuse_foreign(Path(folder), (NUMBERS[kind], PAGE, MODEL), _names(kind))
-
-
-def _refuse_foreign(target: Path, texts: Sequence[str], names: Sequence[str]) -> None:
-    if any((target / name).exists() for name in texts if name in NUMBERS.values()):
+    target = Path(folder)
+    if (target / NUMBERS[kind]).exists():
         return
-    for name in (*texts, *(f'{name}.png' for name in names)):
+    for name in (PAGE, MODEL, *(f'{name}.png' for name in PICTURES[kind])):
         if (target / name).exists():
             raise DataError(
                 f'{target / name}: exists and is of no earlier report; choose another folder'
             )
-
-
-def put_in_place(
-    folder: str | os.PathLike[str],
-    texts: Mapping[str, str],
-    pictures: Sequence[Shown],
-    names: Sequence[str],
-) -> Path:
-    """
-    Write the files of a report, all of them or none, and return the page.
-
-    Parameters
-    ----------
-    folder : path
-        Made when it does not exist.
-    texts : mapping of str to str
-        By file name: the numbers, by which a report is known, come first.
-    pictures : sequence of Shown
-    names : sequence of str
-        Of all pictures that a report of this kind may have; those of an earlier one are deleted.
-
-    Raises
-    ------
-    DataError
-        When the folder cannot be written, or holds such files that are of no earlier report.
-    """
-    target = Path(folder)
-    _refuse_foreign(target, list(texts), names)
-    # file names need not be Unicode
-    files = {name: text.encode('utf-8', 'replace') for name, text in texts.items()}
-    page = files.pop(PAGE)
-    files |= {f'{picture.name}.png': picture.png for picture in pictures}
-    write_together(target, {**files, PAGE: page})
-    for name in set(names) - {picture.name for picture in pictures}:
-        with suppress(OSError):
-            (target / f'{name}.png').unlink()
-    return target / PAGE

@@ -13,18 +13,16 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.identification.results import ErrorRow, Identification
 from piezo_ident.model.free_run import SineError
-from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
-from piezo_ident.report.modes import modes
 from piezo_ident.report.table import (
-    columns,
     FAULTS,
     length,
     number,
-    printable,
+    origin_tables,
+    plain_text,
     Table,
     table,
-    wrapped,
 )
 
 __all__ = [
@@ -48,8 +46,6 @@ ABOUT = {
 }
 #: static gain that the paper leaves in G: its printed coefficients give G(1) = 0.6411
 PAPER_GAIN = 0.6411
-#: columns of the errors
-ERRORS = ('model / %', 'hysteresis alone / %', 'NRMSE fit / %', 'samples')
 FOOTER = (
     'Method: Gu, Li, Zhu and Su, IEEE/ASME Trans. Mechatronics 21(3), 2016, '
     'doi:10.1109/TMECH.2015.2465868. Every error is of a free run, never of one-step '
@@ -109,10 +105,10 @@ def error_table(result: Identification) -> Table:
     ]
     source = '' if result.noise_floor is None else 'from '
     return Table(
-        'Errors',
-        ('record', 'segment', 'data', *ERRORS),
+        'Errors in % of stroke',
+        ('record', 'segment', 'data', 'model', 'hysteresis alone', 'NRMSE fit / %', 'samples'),
         cells,
-        f'Errors in % of stroke: {FORMULA}, with the stroke of the whole record. NRMSE fit: '
+        f'{FORMULA}, with the stroke of the whole record. NRMSE fit: '
         '100 (1 - |y - y_hat| / |y - mean y|) over the samples of the row; it says nothing '
         'where the stage rests. "validation": of a record that took no part; "held out": neither '
         'fitted nor looked at before; "selection": not fitted, but chose between models. '
@@ -135,11 +131,11 @@ def sine_tables(rows: Sequence[SineError]) -> list[Table]:
         ('hysteresis alone', *(number(row.static_percent) for row in rows)),
     ]
     return table(
-        'Errors of sines in steady state',
+        'Errors of sines in steady state, % of stroke',
         ('frequency / Hz', *(f'{row.frequency:g}' for row in rows)),
         errors if rows else [],
-        'In % of stroke: 100 rms(y - y_hat) / (max y - min y), free run; the first second '
-        'and at least one period are dropped, and the stroke is that of what is left. '
+        f'{FORMULA}; the first second and at least one period are dropped, and the stroke is '
+        'that of what is left. '
         'Layout of Table I of the paper.',
     )
 
@@ -179,22 +175,18 @@ def dynamics_tables(result: Identification) -> list[Table]:
             f'leaves a static gain of {PAPER_GAIN} in G; the last column is b in its split.',
         )
     )
-    poles = [
+    modes = [
         (
-            'resonance' if mode.oscillates else 'real pole',
             *(number(mode.frequency, 4), number(mode.frequency_std, 2)),
-            number(mode.damping if mode.oscillates else None),
-            number(mode.damping_std if mode.oscillates else None, 2),
+            *(number(mode.damping), number(mode.damping_std, 2)),
         )
-        for mode in modes(G, model.sample_rate, dynamics.covariance)
+        for mode in G.modes(model.sample_rate, dynamics.covariance)
     ]
     note = (
-        'Real: corner frequency. A mode whose uncertainty is as large as itself only '
-        f'helps the others to fit. The input has power up to {number(dynamics.band, 4)} '
-        'Hz; what lies above is an extrapolation.'
+        'A mode whose uncertainty is as large as itself only helps the others to fit. The input '
+        f'has power up to {number(dynamics.band, 4)} Hz; what lies above is an extrapolation.'
     )
-    columns_of_modes = ('', 'frequency / Hz', '± / Hz', 'damping ratio', '±')
-    tables += table('Poles of G as modes', columns_of_modes, poles, note)
+    tables += table('Modes of G', ('frequency / Hz', '± / Hz', 'damping ratio', '±'), modes, note)
     methods = [
         (name, number(error) if math.isfinite(error) else 'unstable')
         for name, error in dynamics.methods.items()
@@ -252,25 +244,9 @@ def hysteresis_tables(result: Identification) -> list[Table]:
             'Solver of the weights',
             ('', 'sum of squares', 'above optimum', 'effort'),
             solvers,
-            f'Normalised, over {fit.n} samples; rms {number(100.0 * fit.rms)} % of stroke.',
+            f'Normalised, over {fit.n} samples; rms '
+            f'{number(percent(fit.rms, result.stroke / abs(s.Y)))} % of stroke.',
         ),
-    ]
-
-
-def origin_tables(result: Identification) -> list[Table]:
-    """Return settings and versions."""
-    origin = result.model.identification
-    versions = {'piezo_ident': __version__, **dict(origin.get('versions', {}))}
-    words = {None: 'chosen from the data', True: 'yes', False: 'no'}
-    settings = [
-        (name, words[value] if value is None or isinstance(value, bool) else str(value))
-        for name, value in asdict(result.settings).items()
-    ]
-    rows = [('method', str(origin.get('method', '–'))), *settings]
-    software = [(str(name), str(version)) for name, version in versions.items()]
-    return [
-        Table('Settings', ('setting', 'value'), rows),
-        Table('Versions', ('software', 'version'), software),
     ]
 
 
@@ -291,7 +267,9 @@ def identification_page(
     warnings = [text for text in result.warnings if text not in shown]
     if faults:
         warnings.append(f'the data had {len(faults)} kinds of faults, see below')
-
+    origin = result.model.identification
+    settings = {'method': origin.get('method', '–'), **asdict(result.settings)}
+    versions = {'piezo_ident': __version__, **dict(origin.get('versions', {}))}
     return Page(
         title='Identification of a piezo stage',
         source=', '.join(f'{r.name} ({r.duration:.4g} s)' for r in result.records),
@@ -319,7 +297,7 @@ def identification_page(
                 'Origin',
                 [
                     *table('Faults in the data', ('record', *FAULTS), faults),
-                    *origin_tables(result),
+                    *origin_tables(settings, 'chosen from the data', versions),
                 ],
             ),
         ),
@@ -330,16 +308,15 @@ def identification_page(
 
 def identification_text(result: Identification) -> str:
     """Return headline, facts, errors and warnings for a terminal."""
-    lines = [*wrapped(headline(result)), '']
-    lines += [printable(f'{what:<14}{text}') for what, text in facts(result)]
-    head = ('error / % of stroke', *ERRORS)
-    rows = [(f'{row[0]} {row[1]}, {row[2]}', *row[3:]) for row in error_table(result).rows]
-    lines += ['', *columns(head, rows)]
-    for item in pairs(result.not_identified):
-        lines += ['', *wrapped(f'not identified: {item}', '  ')]
-    for item in result.warnings:
-        lines += ['', *wrapped(f'warning: {item}', '  ')]
-    return '\n'.join(lines)
+    return plain_text(
+        [
+            headline(result),
+            Table('', ('', ''), facts(result)),
+            error_table(result),
+            *(f'not identified: {item}' for item in pairs(result.not_identified)),
+            *(f'warning: {item}' for item in result.warnings),
+        ]
+    )
 
 
 def brief_table(result: Identification) -> Table:
@@ -352,7 +329,5 @@ def brief_table(result: Identification) -> Table:
 
 def table_one(rows: Sequence[SineError]) -> str:
     """Return the errors of sines as a table for a terminal, one column a frequency."""
-    note = '% of stroke: 100 rms(y - y_hat) / (max y - min y), free run, steady state'
-    for each in sine_tables(rows):
-        return '\n'.join([*columns(each.head, each.rows), note])
-    return 'no sine segment is long enough for its steady state'
+    tables = sine_tables(rows)
+    return plain_text(tables or ['no sine segment is long enough for its steady state'])

@@ -19,7 +19,7 @@ from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
-from piezo_ident.report.table import length, number, Table, wrapped
+from piezo_ident.report.table import length, number, plain_text, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,10 +103,7 @@ def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
 
 def to_text(result: Result | Record) -> str:
     """Return headline and table of a result as text, for a prompt."""
-    headline, table = _summary(result)
-    width = 2 + max(len(name) for name, _ in table.rows)
-    lines = [line for name, x in table.rows for line in wrapped(x, ' ' * width, name.ljust(width))]
-    return '\n'.join([*wrapped(headline), *lines])
+    return plain_text(_summary(result))
 
 
 def to_html(result: Result | Record) -> str:

@@ -5,12 +5,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 import textwrap
 
-__all__ = ['FAULTS', 'Table', 'columns', 'length', 'number', 'printable', 'table', 'wrapped']
+__all__ = [
+    'FAULTS',
+    'Table',
+    'length',
+    'number',
+    'origin_tables',
+    'plain_text',
+    'share_text',
+    'table',
+]
 
 #: of a terminal [characters]
 WIDTH = 99
@@ -27,9 +36,10 @@ class Table:
     ----------
     title : str
     head : tuple of str
+        Not shown when all of it is empty.
     rows : sequence of tuple of str
     note : str
-        Stands below: units and formulas.
+        Stands below on a page: units and formulas.
     """
 
     title: str
@@ -43,6 +53,24 @@ class Table:
         cells = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
         return tuple(i > 0 and not all(map(_is_number, column)) for i, column in enumerate(cells))
 
+    def lines(self) -> list[str]:
+        """Return the table for a terminal; a last column of text is wrapped."""
+        rows = [self.head, *self.rows] if any(self.head) else list(self.rows)
+        cells = [[_printable(cell) for cell in row] for row in rows]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        left = [True, *self.text_columns[1:]]
+        if left[-1]:
+            widths[-1] = 0
+        indent = ' ' * (sum(widths[:-1]) + 2 * len(widths) - 2)
+        lines = [f'{self.title}:'] if self.title and any(self.head) else []
+        for row in cells:
+            parts = [
+                cell.ljust(width) if is_text else cell.rjust(width)
+                for cell, width, is_text in zip(row, widths, left, strict=True)
+            ]
+            lines += _wrapped('  '.join(parts).rstrip(), indent)
+        return lines
+
 
 def table(
     title: str, head: tuple[str, ...], rows: Sequence[tuple[str, ...]], note: str = ''
@@ -51,8 +79,14 @@ def table(
     return [Table(title, head, rows, note)] if rows else []
 
 
-def _is_number(cell: str) -> bool:
-    return not cell or (cell[0] in '0123456789-–∞' and len(cell) < 16)
+def plain_text(parts: Iterable[Table | str]) -> str:
+    """Return tables and paragraphs for a terminal; empty paragraphs are left out."""
+    blocks = (
+        part.lines() if isinstance(part, Table) else _wrapped(_printable(part), '')
+        for part in parts
+        if part
+    )
+    return '\n\n'.join('\n'.join(lines) for lines in blocks)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -76,22 +110,39 @@ def length(metres: float) -> str:
     return f'{number(metres * 1e9, 4)} nm'
 
 
-def printable(text: str) -> str:
-    """Return text without control characters: names in files must not steer a terminal."""
-    return ''.join(c if c.isprintable() else '?' for c in text)
+def share_text(share: float) -> str:
+    """Return a share as a percentage within 0 .. 100, a dash where there is none."""
+    return f'{100.0 * min(1.0, max(0.0, share)):.0f} %' if math.isfinite(share) else '–'
 
 
-def columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines for a terminal; the first column stands left, the others right."""
-    cells = [[printable(cell) for cell in row] for row in (head, *rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+def origin_tables(
+    settings: Mapping[str, object], unset: str, versions: Mapping[str, object]
+) -> list[Table]:
+    """Return the settings and versions of a result; a setting that is None reads `unset`."""
+
+    def text(value: object) -> str:
+        if isinstance(value, tuple):
+            return ', '.join(map(str, value)) or 'none'
+        if isinstance(value, bool):
+            return 'yes' if value else 'no'
+        return unset if value is None else str(value)
+
+    rows = [(name.replace('_', ' '), text(value)) for name, value in settings.items()]
     return [
-        '  '.join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
-        for row in cells
+        Table('Settings', ('setting', 'value'), rows),
+        Table('Versions', ('software', 'version'), [(n, str(x)) for n, x in versions.items()]),
     ]
 
 
-def wrapped(text: str, indent: str = '', first: str = '') -> list[str]:
-    """Return a text as lines for a terminal, `first` before the first and `indent` further."""
-    text = printable(text)
-    return textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=indent)
+def _is_number(cell: str) -> bool:
+    return not cell or (cell[0] in '0123456789-–∞' and len(cell) < 16)
+
+
+def _printable(text: str) -> str:
+    # names in files must not steer a terminal
+    return ''.join(c if c.isprintable() else '?' for c in text)
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    deep = len(indent) > WIDTH // 2
+    return textwrap.wrap(text, WIDTH, subsequent_indent='' if deep else indent) or ['']

@@ -28,7 +28,6 @@ from piezo_ident.model.free_run import PieceRun, sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from piezo_ident.report.identification import headline, KINDS
-from piezo_ident.report.modes import modes
 
 __all__ = ['diagnosis_schema', 'json_text', 'steps_to_json', 'to_json']
 
@@ -176,7 +175,7 @@ def _dynamics(dynamics: DynamicsResult, G: Dynamics, sample_rate: float) -> dict
         'b': G.b,
         'a_std': sigma[:na] if known else None,
         'b_std': sigma[na:] if known else None,
-        'modes': [asdict(mode) for mode in modes(G, sample_rate, dynamics.covariance)],
+        'modes': [asdict(mode) for mode in G.modes(sample_rate, dynamics.covariance)],
         'methods': dynamics.methods,
         'slope_measured': dynamics.slope_measured,
         'slope_model': dynamics.slope_model,
@@ -247,7 +246,6 @@ def _errors(errors: Errors) -> dict[str, Any]:
     return {
         'overall': sys.float_info.max if math.isnan(errors.overall) else _size(errors.overall),
         'by_segment': errors.by_segment,
-        # one way to write a frequency, whoever made the table
         'by_frequency': {str(float(f)): x for f, x in errors.by_frequency.items()},
     }
 

@@ -54,7 +54,7 @@ def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
     assert fit.delay.samples == 2
     assert fit.delay.source == 'steps'
     assert fit.not_identified == ()
-    assert any(abs(f / 700 - 1) < 0.03 for f, _ in fit.G.modes(FS))
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in fit.G.modes(FS))
     assert fit.G.is_stable
     assert fit.G.gain == pytest.approx(1.0, abs=1e-9)
 

@@ -129,10 +129,24 @@ def test_modes_of_a_known_resonance():
     f0, zeta, fs = 972.0, 0.021, 5000.0
     pole = np.exp(2 * np.pi * f0 / fs * (-zeta + 1j * np.sqrt(1 - zeta**2)))
     a = np.real(np.poly([pole, np.conj(pole), 0.4, -0.3]))[1:]
-    ((f, damping),) = Dynamics(a, [1.0]).modes(fs)
-    assert f == pytest.approx(f0, rel=1e-9)
-    assert damping == pytest.approx(zeta, rel=1e-9)
+    (mode,) = Dynamics(a, [1.0]).modes(fs)
+    assert mode.frequency == pytest.approx(f0, rel=1e-9)
+    assert mode.damping == pytest.approx(zeta, rel=1e-9)
+    assert np.isnan([mode.frequency_std, mode.damping_std]).all()
     assert Dynamics([0.1], [1.0]).modes(fs) == []
+
+
+def test_uncertainty_of_the_modes_against_a_sample_of_models():
+    fs, rng = 5000.0, np.random.default_rng(2)
+    pole = 0.95 * np.exp(2j * np.pi * np.array([0.1, 0.25]))
+    a = np.real(np.poly([*pole, *np.conj(pole), 0.4]))[1:]
+    root = 1e-5 * rng.standard_normal((5, 5))
+    covariance = np.pad(root @ root.T, (0, 1))
+    modes = Dynamics(a, [1.0]).modes(fs, covariance)
+    draws = [Dynamics(a + root @ rng.standard_normal(5), [1.0]).modes(fs) for _ in range(2000)]
+    for name in ('frequency', 'damping'):
+        drawn = np.std([[getattr(mode, name) for mode in draw] for draw in draws], axis=0)
+        assert [getattr(mode, f'{name}_std') for mode in modes] == pytest.approx(drawn, rel=0.1)
 
 
 def test_paper_stage():

@@ -18,8 +18,7 @@ import piezo_ident as pi
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.report import check_report_folder, headline, to_json
 from piezo_ident.report.diagnosis import headline as diagnosis_headline
-from piezo_ident.report.figures.diagnosis import DIAGNOSIS_NAMES
-from piezo_ident.report.figures.identification import IDENTIFICATION_NAMES
+from piezo_ident.report.folder import PICTURES
 import pytest
 
 UNSEEN = Unseen('other.csv', 0.8, 0.1, 0.7, 0.05, 20_000, ((1.0, 0.9, 0.2), (120.0, 3.2, 0.3)))
@@ -64,11 +63,9 @@ def folders(identified, tmp_path_factory):
 
 def test_folder_is_whole(folders):
     names = ['identification.json', 'diagnosis.json']
-    some = [
-        set(IDENTIFICATION_NAMES) - {'overview_3', 'overview_4'},
-        {name for name in DIAGNOSIS_NAMES if name[-1] not in '234'},
-    ]
-    for (result, folder), numbers, pictures in zip(folders, names, some, strict=True):
+    for (result, folder), numbers in zip(folders, names, strict=True):
+        last = {'_3', '_4'} if result is folders[0][0] else {'_2', '_3', '_4'}
+        pictures = {name for name in PICTURES[type(result)] if name[-2:] not in last}
         expected = {'report.html', 'model.yaml', numbers, *(f'{name}.png' for name in pictures)}
         assert {path.name for path in folder.iterdir()} == expected
         model = pi.load(folder / 'model.yaml')

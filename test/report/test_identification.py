@@ -7,8 +7,6 @@ from dataclasses import replace
 import json
 import math
 
-import numpy as np
-import piezo_ident as pi
 from piezo_ident.identification.results import Steps
 from piezo_ident.model.free_run import piece_runs, SineError, sines_of
 from piezo_ident.report import headline, identification_text, steps_to_json, table_one, to_json
@@ -18,8 +16,7 @@ from piezo_ident.report.identification import (
     hysteresis_tables,
     sine_tables,
 )
-from piezo_ident.report.modes import modes
-from piezo_ident.report.table import columns, length, number, Table
+from piezo_ident.report.table import length, number, plain_text, Table
 import pytest
 
 
@@ -79,7 +76,7 @@ def test_dynamics_tables_hold_the_coefficients(identified):
     assert delay.rows[0][1] == '3'
     assert [row[1] for row in coefficients.rows if row[1]] == [number(x, 6) for x in G.a]
     assert [row[3] for row in coefficients.rows if row[3]] == [number(x, 6) for x in G.b]
-    assert len(poles.rows) > 2
+    assert len(poles.rows) == len(G.modes(20_000.0))
     assert len(methods.rows) == len(identified.dynamics.methods)
 
 
@@ -132,29 +129,11 @@ def test_summary_for_a_terminal(identified):
 
 def test_table_of_sines():
     rows = [SineError(1.0, 1.03, 1.03, 10), SineError(120.0, 3.59, 10.06, 10)]
-    lines = table_one(rows).splitlines()
+    lines = table_one(rows).splitlines()[1:]
     assert lines[0].split() == ['frequency', '/', 'Hz', '1', '120']
     assert lines[1].split()[-2:] == ['1.03', '3.59']
     assert lines[2].split()[-2:] == ['1.03', '10.1']
     assert 'no sine' in table_one([])
-
-
-def test_modes_and_their_uncertainty():
-    model = pi.SimulatedStage.load('paper').model
-    G, n = model.dynamics, model.dynamics.a.size
-    rng = np.random.default_rng(2)
-    root = 1e-7 * rng.standard_normal((n, n))
-    covariance = np.zeros((2 * n, 2 * n))
-    covariance[:n, :n] = root @ root.T
-    given = [m for m in modes(G, model.sample_rate, covariance) if m.oscillates]
-    expected = np.array(G.modes(model.sample_rate))
-    assert np.allclose([(m.frequency, m.damping) for m in given], expected)
-    # against a sample of models drawn from that covariance
-    draws = [
-        [m[0] for m in replace(G, a=G.a + root @ rng.standard_normal(n)).modes(model.sample_rate)]
-        for _ in range(2000)
-    ]
-    assert [m.frequency_std for m in given] == pytest.approx(np.std(draws, axis=0), rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +160,9 @@ def test_lengths_and_columns():
         '3.000 nm',
         '0 nm',
     ]
-    assert columns(('a', 'b'), [('x', '1'), ('yy\x1b', '12')]) == ['a     b', 'x     1', 'yy?  12']
-    table = Table('t', ('', 'n', 'text'), [('a', '1', 'b'), ('b', '–', '2')])
+    table = Table('t', ('', 'n', 'text'), [('a', '1', 'b'), ('bb\x1b', '12', '2')])
     assert table.text_columns == (False, False, True)
+    assert table.lines() == ['t:', '      n  text', 'a     1  b', 'bb?  12  2']
+    assert Table('', ('', ''), [('a', 'b ' * 60)]).lines()[1].startswith('   b b')
     assert Table('t', ('', 'n'), []).text_columns == (False, False)
+    assert plain_text(['a\x1b', '', Table('', ('', ''), [('b', 'c')])]) == 'a?\n\nb  c'

@@ -31,34 +31,27 @@ READABLE = 6.0
 NAMES = 12
 
 
-def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> Figure:
+def loops_figure(runs: Sequence[PieceRun]) -> Figure:
     """
     Draw displacement over voltage, measured and modelled, with the error below.
 
     The triangle that covers the widest range is drawn, or the whole piece without one.
-
-    `edges` holds for each run the first sample of its end that was held out, or None.
 
     Raises
     ------
     NothingToDraw
         When the voltage does not move.
     """
-    number, s = _widest_loop(runs)
-    run, part = runs[number], slice(s.start, s.stop)
-    v, y, y_hat = run.piece.v[part], 1e6 * run.piece.y[part], 1e6 * run.y_hat[part]
+    run, s = _widest_loop(runs)
+    part = slice(s.start, s.stop)
+    v, y, y_hat = run.piece.v[part], run.piece.y[part], run.y_hat[part]
     fig = style.figure(5.2, 5.2)
     loops, errors = fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [2.4, 1]})
-    _loop(loops, v, y, COLOURS['under'], 'measured', 3.0)
-    limit, largest = style.axis_limit(1e-6 * (y - y_hat))
+    limit, largest = style.axis_limit(y - y_hat)
     unit, scale = style.length_unit(largest)
-    error = 1e-6 * scale * (y - y_hat)
-    kept = edges[number] if edges else None
-    edge = y.size if kept is None else min(max(kept - s.start, 0), y.size)
-    for cut, name in ((slice(0, edge), 'model'), (slice(edge, None), 'model held out')):
-        if y_hat[cut].size:
-            _loop(loops, v[cut], y_hat[cut], COLOURS[name], name.replace('model h', 'model, h'))
-            _loop(errors, v[cut], error[cut], COLOURS[name], width=0.6)
+    _loop(loops, v, 1e6 * y, COLOURS['under'], 'measured', 3.0)
+    _loop(loops, v, 1e6 * y_hat, COLOURS['model'], 'model')
+    _loop(errors, v, scale * (y - y_hat), COLOURS['model'], width=0.6)
     style.symmetric(errors, scale * limit)
     if largest > limit:
         style.note(errors, f'axis cut; largest {scale * largest:.3g} {unit}')
@@ -71,10 +64,10 @@ def loops_figure(runs: Sequence[PieceRun], edges: Sequence[int | None] = ()) -> 
     return fig
 
 
-def _widest_loop(runs: Sequence[PieceRun]) -> tuple[int, Segment]:
-    loops = [(i, s) for i, run in enumerate(runs) for s in run.piece.find('triangle')]
-    loops = loops or [(i, Segment('', 0, run.piece.n)) for i, run in enumerate(runs)]
-    width = [float(np.ptp(runs[i].piece.v[s.start : s.stop])) for i, s in loops]
+def _widest_loop(runs: Sequence[PieceRun]) -> tuple[PieceRun, Segment]:
+    loops = [(run, s) for run in runs for s in run.piece.find('triangle')]
+    loops = loops or [(run, Segment('', 0, run.piece.n)) for run in runs]
+    width = [float(np.ptp(run.piece.v[s.start : s.stop])) for run, s in loops]
     if not any(width):
         raise NothingToDraw('the voltage does not move')
     return loops[int(np.argmax(width))]
@@ -245,11 +238,9 @@ def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, remark: s
     trace.margins(x=0.01)
 
 
-def sines_figure(errors: Sequence[SineError], floor: float | None = None) -> Figure:
+def sines_figure(errors: Sequence[SineError]) -> Figure:
     """
     Draw the steady-state error over the frequency of the sines.
-
-    `floor` is the rms of the sensor noise [% of stroke].
 
     Raises
     ------
@@ -269,20 +260,11 @@ def sines_figure(errors: Sequence[SineError], floor: float | None = None) -> Fig
         ([e.percent for e in errors], COLOURS['model'], 'o-', 'model with dynamics'),
     ):
         axes.loglog(f, values, shape, color=colour, markersize=5, linewidth=1.3, label=name)
-    finish_frequencies(axes, f, floor, 'sensor noise')
-    return fig
-
-
-def finish_frequencies(
-    axes: Axes, f: NDArray[np.float64], floor: float | None, noise: str
-) -> None:
-    """Finish an axes of errors [% of stroke] over frequencies [Hz], with the noise floor."""
     tidy(axes, 'frequency of the sine / Hz', 'rms error / % of stroke')
-    if floor is not None and floor > 0.0:
-        axes.axhline(floor, color=style.GREY, linestyle=':', linewidth=1.3, label=noise)
     axes.margins(0.06)
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.6, high)
     style.plain_log(axes.yaxis, low, high)
     style.plain_log(axes.xaxis, f.min(), f.max() * 1.5)
     style.legend(axes, loc='best')
+    return fig

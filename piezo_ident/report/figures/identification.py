@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 from piezo_ident.identification.results import Identification
-from piezo_ident.model.free_run import PieceRun, sine_frequency, sines_of
+from piezo_ident.model.free_run import PieceRun, sines_of
 from piezo_ident.report.figures.free_run import (
     loops_figure,
     overview_figure,
@@ -25,23 +25,10 @@ from piezo_ident.report.figures.three_steps import (
     weights_figure,
 )
 
-__all__ = ['IDENTIFICATION_NAMES', 'draw_identification']
+__all__ = ['draw_identification']
 
 #: at most so many records get a picture of their own
 OVERVIEWS = 4
-#: strokes of sines that differ by no more than this factor have one level of noise in %
-ALIKE = 1.1
-#: names of all pictures that `draw_identification` can give
-IDENTIFICATION_NAMES = (
-    'sines',
-    'loops',
-    'segments',
-    *(f'overview_{i + 1}' for i in range(OVERVIEWS)),
-    'delay',
-    'response',
-    'orders',
-    'weights',
-)
 
 
 def draw_identification(
@@ -55,7 +42,6 @@ def draw_identification(
         text = f'{row.data} {row.percent:.2g} %'
         texts.setdefault((row.record, row.segment), []).append(text)
     errors = {key: ', '.join(parts) for key, parts in texts.items()}
-    edges = [_held_out_from(identification, run) for run in runs]
     response = (
         'G(z) z^-d of the model; without a noise segment none was measured. Dotted: modes.'
         if identification.dynamics.response is None
@@ -67,13 +53,13 @@ def draw_identification(
             'sines',
             'Error over frequency',
             'Steady state of each sine: rms error in % of its stroke, with and without G.',
-            lambda: sines_figure(sines_of(runs), _floor_of_sines(identification, runs)),
+            lambda: sines_figure(sines_of(runs)),
         ),
         (
             'loops',
             'Hysteresis',
             'Displacement over voltage, free run, and the error below.',
-            lambda: loops_figure(runs, edges),
+            lambda: loops_figure(runs),
         ),
         (
             'segments',
@@ -90,14 +76,15 @@ def draw_identification(
                 f'overview_{number}',
                 f'Whole record: {runs[i].record}',
                 'Each column of a long trace shows its smallest and largest sample.',
-                partial(overview_figure, runs[i], edges[i]),
+                partial(overview_figure, runs[i], _held_out_from(identification, runs[i])),
             )
         )
     wanted += [
         (
             'delay',
             'Delay',
-            'The delay is the first sample at which the averaged response leaves its noise.',
+            'The delay is the first sample at which the averaged response leaves its noise. Also: '
+            'the loss of least squares at each delay.',
             lambda: delay_figure(identification, runs),
         ),
         (
@@ -132,17 +119,3 @@ def _held_out_from(identification: Identification, run: PieceRun) -> int | None:
     if fitted == 0 or sum(row.n for row in rows) != run.piece.n:
         return None
     return fitted if fitted < run.piece.n else None
-
-
-def _floor_of_sines(identification: Identification, runs: Sequence[PieceRun]) -> float | None:
-    """Return the sensor noise in % of the stroke of the sines, None where these differ."""
-    strokes = [
-        float(np.ptp(run.piece.y[s.start : s.stop]))
-        for run in runs
-        for s in run.piece.segments
-        if sine_frequency(s.label)
-    ]
-    floor = identification.noise_floor
-    if floor is None or not strokes or not 0.0 < max(strokes) <= ALIKE * min(strokes):
-        return None
-    return floor * identification.stroke / max(strokes)

@@ -11,7 +11,6 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.results import Residual
@@ -19,12 +18,12 @@ from piezo_ident.record.record import Piece
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
-from scipy import fft, signal
+from scipy import signal
 
 __all__ = [
     'STATES',
     'differ',
-    'residual_correlation_figure',
+    'residual_coherence_figure',
     'residual_dependence_figure',
     'residual_figure',
     'residual_spectrum_figure',
@@ -42,8 +41,8 @@ NAMED, SHORT = 14, 20
 TINTS = ('#E9EEF3', '#F4F0E6')
 #: so many times smaller, the rest is drawn once more on a scale of its own
 ENLARGED = 4.0
-#: points of a spectrum in a decade; longest stretch that is transformed [samples]
-PER_DECADE, LONGEST = 150, 2**21
+#: points of a spectrum in a decade; samples that are transformed at once
+PER_DECADE, LONGEST = 150, 2**17
 #: title of the axis of each quantity
 AXES = {
     'v': 'voltage / V',
@@ -148,19 +147,15 @@ def _both(
 def _density(part: ResidualPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frequency [Hz] and amplitude density [m/sqrt(Hz)] of the longest sound stretch."""
     start, stop = max(part.runs(), key=lambda r: r[1] - r[0])
-    x = signal.detrend(part.e[start : min(stop, start + LONGEST)])
-    window = signal.windows.hann(x.size)
-    rate = part.piece.sample_rate
-    size = fft.next_fast_len(x.size, real=True)
-    power = 2.0 * np.abs(fft.rfft(window * x, size)) ** 2 / (rate * float(window @ window))
-    f = np.arange(power.size) * rate / size
-    # the first two bins hold the rest of the trend
+    n = min(stop - start, LONGEST)
+    f, power = signal.welch(
+        part.e[start:stop], part.piece.sample_rate, nperseg=n, detrend='linear'
+    )
+    # the first bins hold the rest of the trend; means over equal parts of a decade keep the power
     f, power = f[2:-1], power[2:-1]
     k = np.floor(PER_DECADE * np.log10(f / f[0])).astype(np.int64)
     count = np.bincount(k)
-    used = count > 0
-    # the mean of a bin keeps its power, so a narrow line still stands out
-    means = [np.bincount(k, values)[used] / count[used] for values in (f, power)]
+    means = [np.bincount(k, x)[count > 0] / count[count > 0] for x in (f, power)]
     return means[0], np.sqrt(means[1])
 
 
@@ -286,64 +281,40 @@ def _signed_log(axes: Axes, curves: Sequence[Curve]) -> None:
     sizes = sizes[sizes > 0.0]
     if sizes.size == 0 or sizes.max() < 30.0 * np.quantile(sizes, 0.1):
         return
-    # at most four decades to a side
+    # at most four decades to a side, and two ticks
     slowest = max(float(np.quantile(sizes, 0.1)), 1e-4 * float(sizes.max()))
-    threshold = 10.0 ** np.floor(np.log10(slowest))
-    axes.set_xscale('symlog', linthresh=threshold, linscale=0.3)
-    decades = np.arange(np.log10(threshold), np.log10(sizes.max()) + 0.5)
-    # ticks that would touch are left out
-    ticks = 10.0 ** decades[1 :: max(1, -(-decades.size // 3))]
+    first, last = np.floor(np.log10(slowest)), np.floor(np.log10(sizes.max()))
+    axes.set_xscale('symlog', linthresh=10.0**first, linscale=0.3)
+    ticks = 10.0 ** np.array([np.ceil(0.5 * (first + last)), last])
     ticks = np.concatenate([-ticks[::-1], [0.0], ticks])
     axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
     axes.minorticks_off()
 
 
-def residual_correlation_figure(
+def residual_coherence_figure(
     before: ResidualAnalysis, after: ResidualAnalysis | None = None
 ) -> Figure:
     """
-    Draw the coherence of voltage and residual, and their cross-correlations with their bands.
+    Draw the coherence of voltage and residual.
 
     Raises
     ------
     NothingToDraw
-        When there is too little data for either.
+        When there is too little data.
     """
-    if before.coherence is None and not before.correlations:
-        raise NothingToDraw('too few samples for coherence and correlation')
-    both = _both(before, after)
-    rows = int(before.coherence is not None) + int(bool(before.correlations))
-    fig = style.figure(2.5 * rows)
-    grid = fig.add_gridspec(rows, 2)
-    if before.coherence is not None:
-        _draw_coherence(fig.add_subplot(grid[0, :]), both)
-    for i, first in enumerate(before.correlations):
-        axes = fig.add_subplot(grid[-1, i])
-        for analysis, colour, label in both:
-            for c in analysis.correlations:
-                if c.input == first.input:
-                    lag = 1e3 * c.lag
-                    axes.plot(lag, c.correlation, color=colour, linewidth=1.1, label=label)
-                    for band in (-c.band, c.band):
-                        axes.plot(lag, band, color=colour, linewidth=0.8, linestyle='--', zorder=1)
-        tidy(axes, 'lag / ms', f'correlation with {first.input}')
-        axes.axhline(0.0, color=style.ZERO, linewidth=0.6, zorder=1)
-        axes.margins(x=0.0)
-        axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        style.note(axes, 'dashed: 99 % band of all lags')
-        if before.coherence is None:
-            style.legend(axes)
-    return fig
-
-
-def _draw_coherence(axes: Axes, both: Sequence[tuple[ResidualAnalysis, str, str]]) -> None:
-    coherences = [(a.coherence, colour, name) for a, colour, name in both if a.coherence]
+    first = before.coherence
+    if first is None:
+        raise NothingToDraw('too few samples for a coherence')
+    fig = style.figure(2.7)
+    axes = fig.subplots()
     shares = []
-    for c, colour, label in coherences:
+    for analysis, colour, label in _both(before, after):
+        c = analysis.coherence
+        if c is None:
+            continue
         value = np.where(c.tested, c.coherence, np.nan)
         axes.plot(c.frequency, value, color=colour, linewidth=0.8, label=label)
         shares.append(f'{100.0 * c.share:.1f} %')
-    first = coherences[0][0]
     axes.axhline(first.bound, color='k', linewidth=1.0, linestyle='--', label='99 % bound')
     tidy(axes, 'frequency / Hz', 'coherence with v')
     axes.set_xscale('log')
@@ -354,3 +325,4 @@ def _draw_coherence(axes: Axes, both: Sequence[tuple[ResidualAnalysis, str, str]
     style.plain_log(axes.xaxis, low, high)
     style.note(axes, f'coherent share of the residual: {" → ".join(shares)}')
     style.legend_above(axes)
+    return fig

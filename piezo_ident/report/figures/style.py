@@ -56,7 +56,6 @@ COLOURS = {
     'measured': BLACK,
     'under': '#B0B0B0',
     'model': BLUE,
-    'model held out': GREEN,
     'static': VERMILION,
     'held out': '#FFF3D6',
     'band': '#C9C9C9',

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
@@ -24,18 +24,12 @@ from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
 __all__ = ['delay_figure', 'orders_figure', 'response_figure', 'weights_figure']
 
-#: samples shown ahead of a step, and behind it
-BEFORE, AFTER = 15, 40
+#: samples shown ahead of the delay, and behind it
+BEFORE, AFTER = 10, 15
 #: an error this many times the best ends the colour scale of the orders
 WORST = 10.0
 #: at most so many modes are named in a frequency response, the least damped ones
 MODES = 4
-#: a map of one hue, light where the error is small, so that marks are seen on it
-LIGHTNESS = ListedColormap(
-    np.array([0.97, 0.98, 1.0])
-    - np.linspace(0.0, 1.0, 256)[:, None] ** 0.8 * np.array([0.94, 0.79, 0.58]),
-    'lightness',
-)
 
 
 def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) -> Figure:
@@ -55,17 +49,12 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) 
         if result.source == 'given':
             raise NothingToDraw('the delay was given, not measured')
         raise NothingToDraw('no steps and no noise segment to read a delay from')
-    panels = 2 * (step is not None) + (result.loss is not None)
     fig = style.figure(2.7)
-    axes = fig.subplots(1, panels, squeeze=False)[0]
+    axes = fig.subplots(1, (step is not None) + (result.loss is not None), squeeze=False)[0]
     if step is not None:
-        _draw_step(axes[:2], identification, step, _model_step(step, runs))
+        _draw_step(axes[0], identification, step, _model_step(step, runs))
     if result.loss is not None:
         _draw_scan(axes[-1], result.loss, result.scan, result.samples)
-    for letter, each in zip('abc', axes, strict=False):
-        each.set_title(
-            f'({letter}) {each.get_title(loc="left")}', fontsize=style.NORMAL, loc='left'
-        )
     return fig
 
 
@@ -88,43 +77,38 @@ def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> NDArray[np.float64
 
 
 def _draw_step(
-    panels: Sequence[Axes],
+    axes: Axes,
     identification: Identification,
     step: StepDelay,
     modelled: NDArray[np.float64] | None,
 ) -> None:
-    """Draw the response, and beside it the moment at which it leaves the noise."""
+    """Draw the size of the response where it leaves the noise."""
     rate, d = identification.model.sample_rate, identification.delay.samples
-    level, y = 1e9 * step.threshold, 1e9 * step.response
-    show = (step.lag >= -BEFORE) & (step.lag <= max(AFTER, 2 * d))
-    near = (step.lag >= d - 10) & (step.lag <= d + 10)
+    near = (step.lag >= d - BEFORE) & (step.lag <= d + AFTER)
     # a logarithm shows the noise and the first sample above it side by side
+    level = 1e9 * step.threshold
     floor = 0.02 * level
-    for axes, which, size in ((panels[0], show, False), (panels[1], near, True)):
-        lag, response = step.lag[which], y[which]
-        traces = [response] if modelled is None else [response, 1e9 * modelled[which]]
-        if size:
-            traces = [np.maximum(np.abs(x), floor) for x in traces]
-        low = floor if size else -level
-        axes.axhspan(low, level, color=COLOURS['band'], zorder=1, linewidth=0)
-        axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2)
-        if modelled is not None:
-            axes.plot(lag, traces[1], color=COLOURS['model'], linewidth=1.2, label='model')
-        axes.plot(lag, traces[0], 'o', color=COLOURS['measured'], markersize=2.8, label='measured')
-        axes.margins(x=0.03)
-    panels[1].set_yscale('log')
-    top = float(np.abs(y[near]).max(initial=0.0))
+    lag, y = step.lag[near], np.maximum(1e9 * np.abs(step.response[near]), floor)
+    axes.axhspan(floor, level, color=COLOURS['band'], zorder=1, linewidth=0)
+    axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2)
+    if modelled is not None:
+        y_hat = np.maximum(1e9 * np.abs(modelled[near]), floor)
+        axes.plot(lag, y_hat, color=COLOURS['model'], linewidth=1.2, label='model')
+    axes.plot(lag, y, 'o', color=COLOURS['measured'], markersize=2.8, label='measured')
+    axes.margins(x=0.03)
+    axes.set_yscale('log')
+    top = float(y.max(initial=0.0))
     if top > floor > 0.0:
-        panels[1].set_ylim(floor, 2.0 * top)
-        style.plain_log(panels[1].yaxis, floor, 2.0 * top)
+        axes.set_ylim(floor, 2.0 * top)
+        style.plain_log(axes.yaxis, floor, 2.0 * top)
     steps = 'one step' if step.repeats == 1 else f'average of {step.repeats} steps'
-    tidy(panels[0], 'samples after the step', 'response / nm V$^{-1}$', steps)
-    tidy(panels[1], 'samples after the step', '', f'its size; d = {_time(d / rate)}')
-    panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    title = f'{steps}; d = {_time(d / rate)}'
+    tidy(axes, 'samples after the step', '|response| / nm V$^{-1}$', title)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     at: dict[str, Any] = {'xycoords': ('axes fraction', 'data'), 'textcoords': 'offset points'}
     at |= {'xytext': (-2, -3), 'ha': 'right', 'va': 'top', 'fontsize': style.SMALL}
-    panels[1].annotate('noise threshold', (1.0, level), **at)
-    style.legend(panels[0], loc='best')
+    axes.annotate('noise threshold', (1.0, level), **at)
+    style.legend(axes, loc='center right')
 
 
 def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: int) -> None:
@@ -195,7 +179,13 @@ def response_figure(identification: Identification) -> Figure:
     axes[-1].set_xlabel('frequency / Hz', fontsize=style.NORMAL)
     axes[-1].set_xlim(0.9 * low, 1.05 * top)
     style.legend(axes[0], loc='lower left')
-    _mark_modes(axes, [m for m in model.dynamics.modes(rate) if low < m[0] < top])
+    for mode in sorted(model.dynamics.modes(rate), key=lambda mode: mode.damping)[:MODES]:
+        if low < mode.frequency < top and mode.damping <= 0.5:
+            for each in axes:
+                dotted: dict[str, Any] = {'linewidth': 0.8, 'linestyle': ':', 'zorder': 1}
+                each.axvline(mode.frequency, color=COLOURS['mark'], **dotted)
+            name = f'{mode.frequency:.0f} Hz'
+            style.name_above(axes[0], name, mode.frequency, color=COLOURS['mark'])
     fig.align_ylabels(axes)
     return fig
 
@@ -219,16 +209,6 @@ def _draw_measured(
     axes[2].yaxis.set_major_locator(MaxNLocator(3))
 
 
-def _mark_modes(axes: Sequence[Axes], modes: list[tuple[float, float]]) -> None:
-    lightest = sorted(sorted(modes, key=lambda mode: mode[1])[:MODES])
-    for frequency, damping in lightest:
-        if damping > 0.5:
-            continue
-        for each in axes:
-            each.axvline(frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1)
-        style.name_above(axes[0], f'{frequency:.0f} Hz', frequency, color=COLOURS['mark'])
-
-
 def orders_figure(identification: Identification) -> Figure:
     """
     Draw the held-out error of every order, with the chosen one and what the criteria prefer.
@@ -246,15 +226,15 @@ def orders_figure(identification: Identification) -> Figure:
     best = float(np.min(table.held_out))
     if best <= 0.0:
         raise NothingToDraw('the held-out error is zero')
-    ratio = np.where(np.isfinite(table.held_out), table.held_out / best, np.nan)
+    ratio = np.ma.masked_invalid(table.held_out / best)
     fig = style.figure(4.4, 5.0)
     axes = fig.subplots()
     axes.set_facecolor('#D9D9D9')
     image = axes.imshow(
-        np.ma.masked_invalid(ratio),
+        ratio,
         origin='lower',
         norm=LogNorm(1.0, WORST),
-        cmap=LIGHTNESS,
+        cmap='Blues',
         extent=(0.5, ratio.shape[1] + 0.5, 0.5, ratio.shape[0] + 0.5),
         interpolation='nearest',
         aspect='auto',
@@ -266,14 +246,13 @@ def orders_figure(identification: Identification) -> Figure:
     chosen = identification.dynamics.order
     # markers of different shape and size, so that criteria that agree are all seen
     marks = {
-        f'chosen ({chosen[0]}, {chosen[1]})': (chosen, 's', 13.0, COLOURS['static'], 2.0),
-        'least held-out error': (table.best('held_out'), 'o', 9.0, COLOURS['measured'], 1.3),
-        'least AIC': (table.best('aic'), '^', 6.0, COLOURS['measured'], 1.0),
-        'least FPE': (table.best('fpe'), 'v', 6.0, COLOURS['measured'], 1.0),
-        'least BIC': (table.best('bic'), 'x', 6.0, COLOURS['measured'], 1.5),
+        f'chosen ({chosen[0]}, {chosen[1]})': (chosen, 's', 13.0, COLOURS['static']),
+        'least held-out error': (table.best('held_out'), 'o', 9.0, COLOURS['measured']),
+        'least AIC': (table.best('aic'), '^', 6.0, COLOURS['measured']),
+        'least BIC': (table.best('bic'), 'x', 6.0, COLOURS['measured']),
     }
-    for name, ((na, nb), shape, size, colour, edge) in marks.items():
-        mark: dict[str, Any] = {'markersize': size, 'markeredgewidth': edge, 'linestyle': 'none'}
+    for name, ((na, nb), shape, size, colour) in marks.items():
+        mark: dict[str, Any] = {'markersize': size, 'markeredgewidth': 1.5, 'linestyle': 'none'}
         mark |= {'markerfacecolor': 'none', 'markeredgecolor': colour, 'clip_on': False}
         axes.plot(nb, na, shape, label=name, **mark)
     bar = fig.colorbar(image, ax=axes, extend='max', shrink=0.9)

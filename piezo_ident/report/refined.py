@@ -1,0 +1,80 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The refined model of a diagnosis against the given one: what differs, errors elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.diagnosis.results import Diagnosis, Unseen
+from piezo_ident.effects import find_effect
+from piezo_ident.model.free_run import free_run, sine_errors
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.record.record import Record
+
+__all__ = ['changes', 'validated']
+
+
+def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
+    """
+    Return a diagnosis with the errors of both models on records that took no part in it.
+
+    Raises
+    ------
+    ModelError
+        When a piece has another sampling rate than the models.
+    """
+    unseen = [_unseen(result, record) for record in records]
+    return replace(result, unseen=(*result.unseen, *unseen))
+
+
+def _unseen(result: Diagnosis, record: Record) -> Unseen:
+    models = (result.given, result.model)
+    runs = [free_run(model, record) for model in models]
+    before, after = (run.errors_after_start or run.errors for run in runs)
+    sines = zip(*(sine_errors(model, record) for model in models), strict=True)
+    return Unseen(
+        record=record.name,
+        before=before.percent,
+        after=after.percent,
+        before_centred=before.percent_without_offset,
+        after_centred=after.percent_without_offset,
+        n=after.n,
+        sines=tuple((a.frequency, a.percent, b.percent) for a, b in sines),
+    )
+
+
+def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
+    """Return how a refined model differs from the one that it came from; empty if not at all."""
+    texts = []
+    # a play without weight is none
+    old, new = (
+        np.concatenate([h.thresholds[h.weights > 0.0], h.weights[h.weights > 0.0], [h.p1, h.p2]])
+        for h in (given.hysteresis, refined.hysteresis)
+    )
+    if not np.array_equal(old, new):
+        texts.append('H refitted')
+    if given.scaling != refined.scaling:
+        texts.append('offset refitted')
+    if given.delay != refined.delay:
+        texts.append('another delay')
+    G, other = given.dynamics, refined.dynamics
+    if not (np.array_equal(G.a, other.a) and np.array_equal(G.b, other.b)):
+        texts.append('G retuned')
+    before = {e.name: _frozen(e.parameters) for e in given.effects}
+    after = {e.name: _frozen(e.parameters) for e in refined.effects}
+    texts += [_with(e) for e in refined.effects if e.name not in before]
+    texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
+    return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
+
+
+def _with(added: EffectSetting) -> str:
+    idle = find_effect(added.name).is_neutral(added.parameters)
+    return f'with {added.name}{", switched off" if idle else ""}'
+
+
+def _frozen(values: Mapping[str, object]) -> list[tuple[str, str]]:
+    return sorted((k, repr(np.asarray(x).tolist())) for k, x in values.items())
