@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.from_streams import APPLIED, MAX_MISSING, record_of_streams
+from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
 

@@ -2,39 +2,151 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Streams of blocks to columns: voltage and displacement meet on equal time stamps.
+A record from streams of blocks, whether they come live or from a bag.
 
-Blocks may be lost, come twice, or start over with a restarted clock, and the streams need not
-be cut into the same blocks.  Where a time stamp occurs more than once, the first of one stream
-belongs to the first of the other; after a loss, the two that arrived closest to each other do.
+Voltage and displacement meet on equal time stamps.  Blocks may be lost, come twice, or start over
+with a restarted clock, and the streams need not be cut into the same blocks.  Where a time stamp
+occurs more than once, the first of one stream belongs to the first of the other; after a loss, the
+two that arrived closest to each other do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.record import Fault
+from piezo_ident.record.assemble import assemble, ReadOptions
+from piezo_ident.record.clock import has_restarted
+from piezo_ident.record.ordering import at_times
+from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
 
-__all__ = ['Joined', 'join']
+__all__ = ['APPLIED', 'MAX_MISSING', 'Joined', 'join', 'record_of_streams']
 
+Vector = NDArray[np.float64]
+#: equal times of two streams: first row of the one, first row of the other, how many rows
+Matches = list[tuple[int, int, int]]
+
+#: key of what the amplifier got, which carries the quantity voltage
+APPLIED = 'applied_voltage'
+#: commanded and applied voltage may differ by this share of the range
+TOLERANCE = 1e-3
+#: most of a segment by time, or of a further channel, that may be missing before it is not used
+MAX_MISSING = 0.05
 #: rows of a stream no further apart than this are of the same run of the sample clock
 NEARBY = 300
+#: rows that are compared together
+_CHUNK = 1 << 20
+
+
+def record_of_streams(
+    streams: Mapping[str, BlockStream],
+    *,
+    name: str,
+    tolerance: float | None = None,
+    options: ReadOptions | None = None,
+    sample_rate: float | None = None,
+    faults: Iterable[Fault] = (),
+) -> Record:
+    """
+    Make a record of streams of blocks.
+
+    Parameters
+    ----------
+    streams : mapping of str to BlockStream
+        Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
+        command and applied voltage differ, the amplifier's guard was at work: the stage did not
+        get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
+        `MAX_MISSING` of the samples is left out.
+    name : str
+        What errors call the data, and the record's name.
+    tolerance : float, optional
+        Difference of command and applied voltage that counts as none [V]; a thousandth of the
+        range when absent.
+    options, sample_rate, faults
+        As for `piezo_ident.record.assemble.assemble`.
+
+    Raises
+    ------
+    DataError
+        For data that cannot be used without a guess.
+    """
+    n = min(streams['voltage'].n, streams['displacement'].n)
+    sparse = {
+        key: Fault('sparse_channel', f'{key}, {s.n} samples beside {n}', n - s.n, 'left out')
+        for key, s in streams.items()
+        if key.startswith('x_') and s.n < (1.0 - MAX_MISSING) * n
+    }
+    needed = {key: s for key, s in streams.items() if key != APPLIED and key not in sparse}
+    try:
+        joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
+    except DataError as error:
+        raise DataError(f'{name}: {error}') from None
+    met = [*faults, *sparse.values(), *joined.faults]
+    if APPLIED in joined.columns:
+        joined = _without_guarded(joined, tolerance, name, met)
+    columns = dict(joined.columns)
+    return assemble(
+        joined.t,
+        columns.pop('voltage'),
+        columns.pop('displacement'),
+        joined.segments,
+        {key[2:]: x for key, x in columns.items()},
+        name=name,
+        options=options,
+        sample_rate=sample_rate,
+        faults=met,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
     """Columns of equal length, the segments' names and starts, and what was met on the way."""
 
-    t: NDArray[np.float64]
-    columns: dict[str, NDArray[np.float64]]
+    t: Vector
+    columns: dict[str, Vector]
     segments: tuple[list[str], list[int]]
     faults: tuple[Fault, ...]
+
+
+def _without_guarded(
+    joined: Joined, tolerance: float | None, name: str, met: list[Fault]
+) -> Joined:
+    """Cut out the samples at which another voltage was applied than commanded."""
+    columns = dict(joined.columns)
+    v, applied, t = columns['voltage'], columns.pop(APPLIED), joined.t
+    wrong = np.zeros(v.size, dtype=np.bool_)
+    if not np.array_equal(v, applied):
+        unknown = np.isnan(applied)
+        if unknown.any():
+            count = int(np.count_nonzero(unknown))
+            where = at_times(t[unknown][:1])
+            met.append(Fault('applied_unknown', where, count, 'taken as commanded'))
+        if tolerance is None:
+            finite = v[np.isfinite(v)]
+            span = float(np.ptp(finite)) if finite.size else 0.0
+            tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
+        wrong = np.abs(v - applied) > tolerance  # False where either is NaN
+    if wrong.all():
+        raise DataError(
+            f'{name}: the applied voltage is nowhere the commanded one; look at the guards of the '
+            "amplifier's driver"
+        )
+    segments = joined.segments
+    if wrong.any():
+        worst = float(np.abs(v - applied)[wrong].max())
+        begins = np.flatnonzero(wrong & ~np.concatenate([[False], wrong[:-1]]))
+        where = f'{at_times(t[begins])}, by up to {worst:.3g} V'
+        count = int(np.count_nonzero(wrong))
+        met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
+        keep = np.flatnonzero(~wrong)
+        segments = segments[0], np.searchsorted(keep, segments[1]).tolist()
+        t, columns = t[keep], {key: x[keep] for key, x in columns.items()}
+    return Joined(t, columns, segments, joined.faults)
 
 
 def join(
@@ -62,176 +174,159 @@ def join(
     """
     beside = beside or {}
     first, lead = next(iter(streams.items()))
-    t = lead.times
-    laps = _in_step(t, streams, beside)
-    if laps is not None:
-        return _joined_in_step(t, streams, beside, laps)
-    arrivals = lead.arrivals
-    stamps = {name: s.times for name, s in streams.items() if name != first}
-    partner = {
-        name: _partners(t, arrivals, x, streams[name].arrivals) for name, x in stamps.items()
+    times = {name: s.times for name, s in {**streams, **beside}.items()}
+    t = times[first]
+    in_step = _in_step({**streams, **beside}, times)
+    matches = in_step or {
+        name: _matches(t, lead.arrivals, times[name], s.arrivals)
+        for name, s in {**streams, **beside}.items()
     }
-    matched = np.ones(lead.n, dtype=np.bool_)
-    for rows in partner.values():
-        matched &= rows >= 0
-    if not matched.any():
-        names = ' and '.join(streams)
+    keep = np.ones(lead.n, dtype=np.bool_)
+    for name in streams:
+        end = 0
+        for i, _, n in (*matches[name], (lead.n, 0, 0)):
+            keep[end:i] = False
+            end = i + n
+    if not keep.any():
         raise DataError(
-            f'{names} share no time stamp; a displacement row must carry the t of the voltage '
-            'sample converted on the same tick'
+            f'{" and ".join(streams)} share no time stamp; a displacement row must carry the t of '
+            'the voltage sample converted on the same tick'
         )
-    keep = np.flatnonzero(matched)
-    used = {first: keep, **{name: p[keep] for name, p in partner.items()}}
     faults: list[Fault] = []
     columns = {}
-    for name, stream in streams.items():
+    for name, stream in {**streams, **beside}.items():
         values = stream.values
-        faults.extend(_left_over(name, stamps.get(name, t), values, used[name]))
-        columns[name] = values[used[name]]
-    for name, stream in beside.items():
-        row = _partners(t, arrivals, stream.times, stream.arrivals)[keep]
-        columns[name] = np.where(row >= 0, stream.values[row] if stream.n else np.nan, np.nan)
-    return Joined(
-        t[keep], columns, _labels(lead, lambda rows: np.searchsorted(keep, rows)), tuple(faults)
-    )
+        columns[name] = _cut(values, matches[name], keep, alone=name in beside)
+        if name in streams:
+            left = np.ones(stream.n, dtype=np.bool_)
+            for i, j, n in matches[name]:
+                left[j : j + n] = ~keep[i : i + n]
+            # in step no row has a twin but among those that are left
+            rows = np.flatnonzero(left) if in_step else np.arange(left.size)
+            if left.any():
+                faults += _left_over(name, times[name][rows], values[rows], left[rows])
+    return Joined(_cut(t, matches[first], keep), columns, _labels(lead, keep), tuple(faults))
 
 
-def _labels(
-    stream: BlockStream, place: Callable[[NDArray[np.int64]], NDArray[np.int64]]
-) -> tuple[list[str], list[int]]:
-    """Return the label of each stretch and its first row, from how many rows before one stay."""
+def _cut(x: Vector, matches: Matches, keep: NDArray[np.bool_], *, alone: bool = False) -> Vector:
+    """Return the values of the rows that are kept; `alone`, NaN where the stream has none."""
+    if alone:
+        column = np.full(keep.size, np.nan)
+        for i, j, n in matches:
+            column[i : i + n] = x[j : j + n]
+        return column if keep.all() else column[keep]
+    parts = []
+    for i, j, n in matches:
+        kept = keep[i : i + n]
+        rows = np.flatnonzero(kept[1:] != kept[:-1]) + 1
+        # what stays in one go needs no copy
+        parts += [
+            x[j + a : j + b] for a, b in itertools.pairwise([0, *rows.tolist(), n]) if kept[a]
+        ]
+    column = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    column.setflags(write=False)
+    return column
+
+
+def _labels(stream: BlockStream, keep: NDArray[np.bool_]) -> tuple[list[str], list[int]]:
+    """Return the label of each stretch of the rows that are kept, and its first row."""
     names, starts = stream.labels()
-    at = place(np.append(starts, stream.n)).tolist()
+    sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else np.empty(0, np.int64)
+    at = np.cumsum(sizes) - sizes
     kept: tuple[list[str], list[int]] = ([], [])
-    for name, (begin, end) in zip(names, itertools.pairwise(at), strict=True):
-        if begin < end and kept[0][-1:] != [name]:
+    for name, begin, n in zip(names, at.tolist(), sizes.tolist(), strict=True):
+        if n and kept[0][-1:] != [name]:
             kept[0].append(name)
             kept[1].append(begin)
     return kept
 
 
-@dataclass(frozen=True, eq=False)
-class _Laps:
-    """
-    Runs of the sample clock that all streams went through together.
-
-    Attributes
-    ----------
-    starts, sizes : dict of str to ndarray of int
-        For each stream the row where each run begins, and its rows.
-    n : ndarray of int
-        Rows of each run that all streams have; they are its first ones.
-    """
-
-    starts: dict[str, NDArray[np.int64]]
-    sizes: dict[str, NDArray[np.int64]]
-    n: NDArray[np.int64]
-
-    def cut(self, name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rows that all streams have; NaN where this one lacks some."""
-        if np.array_equal(self.sizes[name], self.n):
-            return values
-        column, ends = np.full(int(self.n.sum()), np.nan), np.cumsum(self.n)
-        have = np.minimum(self.sizes[name], self.n)
-        for to, begin, n in zip(ends - self.n, self.starts[name], have, strict=True):
-            column[to : to + n] = values[begin : begin + n]
-        return column
-
-    def rest(self, name: str) -> NDArray[np.int64]:
-        """Return the rows of a stream that another one has not."""
-        begins, ends = self.starts[name] + self.n, self.starts[name] + self.sizes[name]
-        return np.concatenate([np.arange(a, b) for a, b in zip(begins, ends, strict=True)])
-
-    def place(self, name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many rows before some rows of a stream all streams have."""
-        k = np.searchsorted(self.starts[name], rows, 'right') - 1
-        inside = np.minimum(rows - self.starts[name][k], self.n[k])
-        return np.asarray(np.cumsum(self.n)[k] - self.n[k] + inside)
-
-
 def _in_step(
-    t: NDArray[np.float64], streams: Mapping[str, BlockStream], beside: Mapping[str, BlockStream]
-) -> _Laps | None:
+    streams: Mapping[str, BlockStream], times: Mapping[str, Vector]
+) -> dict[str, Matches] | None:
     """
-    Return the runs of the clock in which each stream has the stamps of the lead from its first on.
+    Return what the streams share, run by run, where all went through the same runs of the clock.
 
-    That is so wherever nothing was lost: then minutes of samples are joined without a table of
+    That is so wherever nothing came twice: hours of samples are then joined without a table of
     partners.  None where it is not so.
     """
-    first, lead = next(iter(streams.items()))
-    starts: dict[str, NDArray[np.int64]] = {}
-    sizes: dict[str, NDArray[np.int64]] = {}
-    for name, stream in {**streams, **beside}.items():
-        x = t if stream is lead else stream.times
-        begin = np.concatenate([[0], np.flatnonzero(x[1:] <= x[:-1]) + 1])
-        starts[name], sizes[name] = begin, np.diff(begin, append=x.size)
-        if not x.size or begin.size != starts[first].size:
+    begins, came = {}, {}
+    for name, t in times.items():
+        if not t.size or np.isnan(t).any():
             return None
-        same = np.minimum(sizes[name], sizes[first])
-        for a, b, n in zip(begin, starts[first], same, strict=True):
-            if not np.array_equal(x[a : a + n], t[b : b + n]):
+        begins[name] = begin = [0, *(np.flatnonzero(t[1:] <= t[:-1]) + 1).tolist()]
+        for a, b in itertools.pairwise(begin):
+            # in samples: a repeated block is no run of its own
+            if not has_restarted(float(np.searchsorted(t[a:b], t[b])), b - a, 0.0, 1.0):
                 return None
-        # runs of one clock are told apart by when they came
-        came, came_lead = stream.arrived(begin), lead.arrived(starts[first])
-        if (came[1:] <= came_lead[:-1]).any() or (came_lead[1:] <= came[:-1]).any():
+        came[name] = streams[name].arrived(np.array(begin))
+    first = next(iter(times))
+    matches: dict[str, Matches] = {}
+    for name, t in times.items():
+        one, other = came[first], came[name]
+        if one.size != other.size:
             return None
-    return _Laps(starts, sizes, np.min([sizes[name] for name in streams], axis=0))
+        # runs of one clock are told apart by when they came
+        if (other[1:] <= one[:-1]).any() or (one[1:] <= other[:-1]).any():
+            return None
+        runs = zip(
+            itertools.pairwise([*begins[first], times[first].size]),
+            itertools.pairwise([*begins[name], t.size]),
+            strict=True,
+        )
+        matches[name] = _merged(
+            (a + i, c + j, n)
+            for (a, b), (c, d) in runs
+            for i, j, n in _shared(times[first][a:b], t[c:d])
+        )
+    return matches
 
 
-def _joined_in_step(
-    t: NDArray[np.float64],
-    streams: Mapping[str, BlockStream],
-    beside: Mapping[str, BlockStream],
-    laps: _Laps,
-) -> Joined:
-    """Join streams by cutting what one of them has at the end of a run and another has not."""
-    first, lead = next(iter(streams.items()))
-    faults: list[Fault] = []
-    columns = {}
-    for name, stream in {**streams, **beside}.items():
-        values = stream.values
-        columns[name] = laps.cut(name, values)
-        rest = laps.rest(name)
-        if name in streams and rest.size:
-            stamps = t if stream is lead else stream.times
-            faults.extend(_left_over(name, stamps[rest], values[rest], rest[:0]))
-    t = laps.cut(first, t)
-    for column in (t, *columns.values()):
-        # nobody else has them, so that a record need not copy them
-        column.setflags(write=False)
-    return Joined(t, columns, _labels(lead, lambda rows: laps.place(first, rows)), tuple(faults))
+def _shared(one: Vector, other: Vector) -> Iterator[tuple[int, int, int]]:
+    """Yield where two rising columns of times go on alike."""
+    i = j = 0
+    while i < one.size and j < other.size:
+        if one[i] == other[j]:
+            n = min(one.size - i, other.size - j, _CHUNK)
+            differ = one[i : i + n] != other[j : j + n]
+            n = int(np.argmax(differ)) if differ.any() else n
+            yield i, j, n
+            i, j = i + n, j + n
+        elif one[i] < other[j]:
+            i += int(np.searchsorted(one[i:], other[j]))
+        else:
+            j += int(np.searchsorted(other[j:], one[i]))
 
 
-def _partners(
-    ta: NDArray[np.float64],
-    arrived_a: NDArray[np.int64],
-    tb: NDArray[np.float64],
-    arrived_b: NDArray[np.int64],
-) -> NDArray[np.int64]:
-    """Return for each row of a the row of b with the same time, -1 for none."""
-    partner = np.full(ta.size, -1, dtype=np.int64)
-    if not (ta.size and tb.size):
-        return partner
-    if np.all(ta[1:] > ta[:-1]) and np.all(tb[1:] > tb[:-1]):
-        at = np.minimum(np.searchsorted(tb, ta), tb.size - 1)
-        return np.where(tb[at] == ta, at, -1)
-    by_a, by_b = np.lexsort((arrived_a, ta)), np.lexsort((arrived_b, tb))
-    if np.array_equal(ta[by_a], tb[by_b]):
-        partner[by_a] = by_b
-        return partner
+def _merged(matches: Iterable[tuple[int, int, int]]) -> Matches:
+    """Return matches with those that go on where the one before ended as one."""
+    merged: Matches = []
+    for i, j, n in matches:
+        if merged and (i, j) == (merged[-1][0] + merged[-1][2], merged[-1][1] + merged[-1][2]):
+            merged[-1] = (*merged[-1][:2], merged[-1][2] + n)
+        else:
+            merged.append((i, j, n))
+    return merged
+
+
+def _matches(
+    ta: Vector, arrived_a: NDArray[np.int64], tb: Vector, arrived_b: NDArray[np.int64]
+) -> Matches:
+    """Return what two streams share, rows of the same time paired by when they came."""
     t, arrived = np.concatenate([ta, tb]), np.concatenate([arrived_a, arrived_b])
     by = np.lexsort((arrived, t))
     nearest = _nearest(t[by], arrived[by], by >= ta.size)
-    # both must be the nearest to each other: a lost row's twin of another run has its own partner
+    # both must be nearest to each other: the twin of a lost row has its own partner
     mutual = np.flatnonzero((nearest >= 0) & (nearest[nearest] == np.arange(by.size)))
     mutual = mutual[by[mutual] < ta.size]
-    partner[by[mutual]] = by[nearest[mutual]] - ta.size
-    return partner
+    order = np.argsort(by[mutual])
+    rows, partners = by[mutual][order], by[nearest[mutual]][order] - ta.size
+    cuts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(partners) != 1)) + 1
+    bounds = itertools.pairwise([0, *cuts.tolist(), rows.size])
+    return [(int(rows[a]), int(partners[a]), b - a) for a, b in bounds if a < b]
 
 
-def _nearest(
-    t: NDArray[np.float64], arrived: NDArray[np.int64], in_b: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def _nearest(t: Vector, arrived: NDArray[np.int64], in_b: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return for sorted rows of two streams the row of the other with equal time, -1 for none."""
     here = np.arange(t.size)
     best = np.full(t.size, -1)
@@ -252,15 +347,11 @@ def _nearest(
 
 def _left_over(
     name: str,
-    t: NDArray[np.float64],
-    x: NDArray[np.float64],
-    used: NDArray[np.int64],
+    t: Vector,
+    x: Vector,
+    left: NDArray[np.bool_],
 ) -> list[Fault]:
     """Say what became of the samples of a stream that found no partner."""
-    left = np.ones(t.size, dtype=np.bool_)
-    left[used] = False
-    if not left.any():
-        return []
     by = np.argsort(t, kind='stable')
     same_time = t[by][1:] == t[by][:-1]
     same_value = x[by][1:] == x[by][:-1]

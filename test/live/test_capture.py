@@ -10,7 +10,7 @@ from piezo_ident.live.capture import Capture, refuse_incomplete
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.blocks import cut_blocks, Samples
-from piezo_ident.record.from_streams import APPLIED
+from piezo_ident.record.join import APPLIED
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
@@ -237,8 +237,8 @@ def test_a_mark_holds_when_the_oldest_is_forgotten(record):
     blocks = list(blocks_of(record))
     capture = capture_of(blocks, limit=2.5)
     mark = capture.mark()
-    for key, samples in [*blocks] * 2:
-        capture.add(key, samples, 10**12)
+    for k, (key, samples) in enumerate([*blocks] * 2):
+        capture.add(key, samples, 10**12 + k)
     assert capture.seconds == pytest.approx(2.0)
     assert capture.seconds_since(mark) == pytest.approx(2.0)
     assert capture.snapshot(mark).record().n == 2 * N

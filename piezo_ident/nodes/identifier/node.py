@@ -35,7 +35,7 @@ from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message, LATCHED
-from piezo_ident.record.from_streams import APPLIED
+from piezo_ident.record.join import APPLIED
 from std_msgs.msg import Float64MultiArray, String
 
 __all__ = ['IdentifierNode', 'main']

@@ -30,7 +30,7 @@ from piezo_ident.record.bags.recover import (
     Stored,
 )
 from piezo_ident.record.blocks import decode, quantity_of, Samples
-from piezo_ident.record.from_streams import APPLIED, record_of_streams
+from piezo_ident.record.join import APPLIED, record_of_streams
 from piezo_ident.record.record import Record
 from piezo_ident.record.stream import BlockStream
 from rosbags.interfaces import Connection

@@ -13,8 +13,7 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
 from piezo_ident.record.bags.write import SAMPLE_QOS, write_bag
 from piezo_ident.record.blocks import Dimension, Samples
-from piezo_ident.record.from_streams import APPLIED
-from piezo_ident.record.join import join
+from piezo_ident.record.join import APPLIED, join
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.record.stream import BlockStream
 import pytest
