@@ -11,12 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.residual.correlation import (
-    Coherence,
-    coherence,
-    cross_correlation,
-    CrossCorrelation,
-)
+from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.dependence import Curve, curves_of
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.lines import find_lines, Line, without_lines
@@ -38,8 +33,6 @@ class ResidualAnalysis:
     floor : NoiseFloor
     lines : tuple of Line
     curves : tuple of Curve
-    correlations : tuple of CrossCorrelation
-        With v and with dv/dt.
     coherence : Coherence or None
     """
 
@@ -47,7 +40,6 @@ class ResidualAnalysis:
     floor: NoiseFloor
     lines: tuple[Line, ...]
     curves: tuple[Curve, ...]
-    correlations: tuple[CrossCorrelation, ...]
     coherence: Coherence | None
 
 
@@ -73,13 +65,11 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     lines = find_lines(clean, stretches).lines
     # a line is no noise: a model may carry it
     quiet = [without_lines(part, lines) for part in clean]
-    correlations = [cross_correlation(quiet, which) for which in ('v', 'dv/dt')]
     return ResidualAnalysis(
         parts=tuple(parts),
         floor=residual_noise_floor(quiet, stretches),
         lines=lines,
         curves=curves_of(quiet, stretches),
-        correlations=tuple(c for c in correlations if c is not None),
         coherence=coherence(clean),
     )
 
