@@ -236,7 +236,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         model = folder / 'model.yaml'
         model.write_text(_model_text())
         nodes.start('stage', parameters={'silence': 5.0})
-        nodes.start('identifier', parameters={'capture_limit': min(60.0, seconds / 4)})
+        nodes.start('identifier', parameters={'capture_limit': min(60.0, max(1.0, seconds / 4))})
         nodes.start('model', parameters={'model': str(model)})
         recorder = {'output': str(folder / 'bag'), 'max_bag_size': part}
         nodes.start('recorder', parameters=recorder)

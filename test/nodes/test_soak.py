@@ -1,8 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
-"""The whole graph for a while: nothing is lost, grows, or drifts."""
+"""The whole graph for some seconds, as `make soak` runs it for hours: nothing is lost."""
 
 from pathlib import Path
 import sys
@@ -41,16 +40,9 @@ def test_nothing_is_lost_and_the_recording_is_cut_into_parts(tmp_path, monkeypat
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with lock:
-        # a crowded machine may lose samples in real time, and says so
-        for factor in (1.0, 0.25):
-            folder = tmp_path / str(factor)
-            folder.mkdir()
-            found = soak(12.0, factor, 2_500_000, folder)
-            print('\n'.join(found.lines()))
-            if not found.lost:
-                break
-            # the nodes count it themselves
-            assert any(where.startswith(('by the', 'messages to')) for where in found.lost)
+        # slow enough for a crowded machine; `make soak` runs in real time
+        found = soak(1.0, 0.25, 400_000, tmp_path)
+    print('\n'.join(found.lines()))
     assert not found.lost
     assert found.parts >= 3
     assert set(found.recorded.values()) == {found.samples}
