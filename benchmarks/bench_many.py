@@ -5,12 +5,10 @@
 A folder of records identified on one process, on all cores, and on two workers of a cluster.
 
     .venv-bench/bin/python benchmarks/bench_many.py [--quick]
-    .venv-bench/bin/python benchmarks/bench_many.py --picture docs/images/many_records.png
 
-The whole command is timed, start-up and pictures included, since that is what one waits for.  The
+The whole command is timed, start-up included, since that is what one waits for.  The
 records are short, so that 200 of them fit into a benchmark; one of them is damaged.  The scheduler
-and the workers of dask.distributed run before the clock starts.  With --picture nothing is timed;
-the picture is kept.
+and the workers of dask.distributed run before the clock starts.
 """
 
 from __future__ import annotations
@@ -205,24 +203,11 @@ def _short(rows: Sequence[str]) -> str:
     return '; '.join(row.rstrip(',') for row in rows[:3])
 
 
-def make_picture(path: Path) -> None:
-    """Write the picture of the parameters of all records."""
-    with tempfile.TemporaryDirectory(prefix='bench_many.') as name:
-        records, out = Path(name, 'records'), Path(name, 'out')
-        make_records(records, RECORDS)
-        identify(records, out)
-        shutil.copyfile(out / 'records.png', path)
-
-
 def main() -> None:
-    """Print the section, or make the picture."""
+    """Print the section."""
     parser = argparse.ArgumentParser(description='Identifies a folder of records.')
     parser.add_argument('--quick', action='store_true', help='a few records, once')
-    parser.add_argument('--picture', type=Path, metavar='PNG', help='make this picture only')
     args = parser.parse_args()
-    if args.picture is not None:
-        make_picture(args.picture)
-        return
     for title, text in sections(args.quick):
         print(f'## {title}\n\n{text}\n')
 

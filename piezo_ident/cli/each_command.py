@@ -1,31 +1,41 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``--each``: every record on its own, with a table and a picture of them all."""
+"""``--each``: every record on its own, with a table of them all."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+import statistics
 
-import numpy as np
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.records import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.common.files import temporary_output
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.results import Settings
-from piezo_ident.many.figures import QUANTITIES, spread_figure, values_of
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, Row, unit_of, write_table
 from piezo_ident.model.files import load
-from piezo_ident.report.figures.style import NothingToDraw
 
 __all__ = ['check_each', 'diagnose_each', 'identify_each']
 
 #: failed records that are printed
 PRINTED = 10
+#: columns whose spread is printed: name, unit for people, and factor from that of the table
+SPREAD = {
+    'error_held_out': ('held-out error', '% of stroke', 1.0),
+    'error_before': ('error before', '% of stroke', 1.0),
+    'error_after': ('error after', '% of stroke', 1.0),
+    'unexplained': ('unexplained', '% of stroke', 1.0),
+    'stroke': ('stroke', 'µm', 1e6),
+    'gain': ('gain', 'µm/V', 1e6),
+    'loop_width': ('loop width', '% of stroke', 1.0),
+    'delay': ('delay', 'ms', 1e3),
+    'bandwidth': ('bandwidth', 'Hz', 1.0),
+    'resonance': ('resonance', 'Hz', 1.0),
+}
 
 
 def check_each(args: argparse.Namespace) -> None:
@@ -75,15 +85,8 @@ def _each(args: argparse.Namespace, task: Task, console: Console) -> None:
             scheduler=args.scheduler,
             progress=lambda done, of: progress('records', done / of),
         )
-    table, picture = folder / 'records.csv', folder / 'records.png'
+    table = folder / 'records.csv'
     write_table(rows, table)
-    try:
-        drawing = spread_figure(rows)
-    except NothingToDraw:
-        picture.unlink(missing_ok=True)
-    else:
-        with temporary_output(picture, overwrite=True) as target:
-            drawing.savefig(target, dpi=160)
     bad = [row for row in rows if not row.is_good]
     if len(bad) == len(rows):
         raise DataError(
@@ -91,7 +94,7 @@ def _each(args: argparse.Namespace, task: Task, console: Console) -> None:
             f'{bad[0].record}: {bad[0].reason}'
         )
     _print(rows, bad, console)
-    console.say(f'\nmodels, table and picture: {folder}')
+    console.say(f'\nmodels and table: {folder}')
     console.result(
         {
             'records': len(rows),
@@ -119,9 +122,9 @@ def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
     for verdict in sorted(set(verdicts), key=lambda v: -verdicts.count(v)):
         console.say(f'  {verdict}: {verdicts.count(verdict)}')
     console.say(f'\n{"":30s}{"lowest":>11s}{"median":>11s}{"highest":>11s}')
-    for quantity in QUANTITIES:
-        values = values_of(rows, quantity)
-        if np.isfinite(values).any():
-            numbers = (np.nanmin(values), np.nanmedian(values), np.nanmax(values))
+    for column, (name, unit, factor) in SPREAD.items():
+        values = [x for row in rows if isinstance(x := row.values.get(column), (int, float))]
+        if values:
+            numbers = (factor * f(values) for f in (min, statistics.median, max))
             cells = ''.join(f'{x:11.4g}' for x in numbers)
-            console.say(f'{f"{quantity.name} / {quantity.unit}":30s}{cells}')
+            console.say(f'{f"{name} / {unit}":30s}{cells}')

@@ -11,7 +11,7 @@ nothing but the same folders.  A record that fails is a row with a reason; it st
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field
 import json
 import os
@@ -19,18 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from piezo_ident import __version__
-from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
-from piezo_ident.common.files import write_text
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.files import unwritable, write_text
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis.diagnose import diagnose
-from piezo_ident.diagnosis.results import DiagnosisSettings
+from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Settings
-from piezo_ident.many.table import diagnosed, identified, natural, Row
-from piezo_ident.many.workers import completed, dask, processes
+from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.many.table import diagnosed, identified, natural, Row, Value
+from piezo_ident.many.workers import dask, processes
 from piezo_ident.model.files import load
 from piezo_ident.record import io as record_io
 from piezo_ident.record.assemble import ReadOptions
+from piezo_ident.record.record import Record
 
 __all__ = ['Diagnose', 'Identify', 'Task', 'run_many']
 
@@ -39,29 +40,16 @@ MARK = 'many.json'
 
 @dataclass(frozen=True)
 class Identify:
-    """
-    Identification of one record.
-
-    Attributes
-    ----------
-    settings : Settings
-    reading : ReadOptions
-    """
+    """Identification of one record: `Settings`, and `ReadOptions`."""
 
     settings: Settings = field(default_factory=Settings)
     reading: ReadOptions = field(default_factory=ReadOptions)
     verb = 'identify'
 
-    def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
-        """Identify a record, write its model and its report, and return its row."""
-        record = record_io.read(path, self.reading)
+    def __call__(self, record: Record, name: str) -> tuple[Identification, dict[str, Value]]:
+        """Return the result and the cells of its row."""
         result = identify(record, self.settings)
-        result.model.save(model_file)
-        if report is not None:
-            from piezo_ident.report import write_report
-
-            write_report(result, report)
-        return Row(name, identified(result, record))
+        return result, identified(result, record)
 
 
 @dataclass(frozen=True)
@@ -90,17 +78,11 @@ class Diagnose:
         inside = self.models / 'models'
         return (inside if inside.is_dir() else self.models) / f'{name}.yaml'
 
-    def __call__(self, path: Path, name: str, model_file: Path, report: Path | None) -> Row:
-        """Diagnose a record, write the refined model and the report, and return its row."""
+    def __call__(self, record: Record, name: str) -> tuple[Diagnosis, dict[str, Value]]:
+        """Return the result and the cells of its row."""
         given = self.model_of(name)
-        record = record_io.read(path, self.reading)
         result = diagnose(load(given), record, self.settings)
-        result.model.save(model_file)
-        if report is not None:
-            from piezo_ident.report import write_report
-
-            write_report(result, report)
-        return Row(name, {'model': given.name, **diagnosed(result, record)})
+        return result, {'model': given.name, **diagnosed(result, record)}
 
 
 Task = Identify | Diagnose
@@ -125,8 +107,8 @@ class _Job:
         return self.folder / 'models' / f'{self.name}.yaml'
 
     @property
-    def report_folder(self) -> Path | None:
-        return self.folder / 'reports' / self.name if self.report else None
+    def report_folder(self) -> Path:
+        return self.folder / 'reports' / self.name
 
     def settings(self) -> dict[str, Any]:
         """Return what the result depends on, apart from the record itself."""
@@ -142,9 +124,7 @@ class _Job:
             if isinstance(self.task, Diagnose):
                 inputs.append(self.task.model_of(self.name))
             fresh = all(file.stat().st_mtime_ns < made for file in inputs)
-            whole = self.model_file.is_file() and (
-                self.report_folder is None or self.report_folder.is_dir()
-            )
+            whole = self.model_file.is_file() and (not self.report or self.report_folder.is_dir())
             if fresh and whole and kept['settings'] == self.settings():
                 return Row(self.name, kept['values'])
         except (OSError, ValueError, KeyError, TypeError):
@@ -154,14 +134,18 @@ class _Job:
     def __call__(self, tick: Tick = lambda step, share: None) -> Row:
         self.row_file.unlink(missing_ok=True)
         try:
-            row = self.task(self.path, self.name, self.model_file, self.report_folder)
-            kept = {'settings': self.settings(), 'values': row.values}
-            write_text(self.row_file, json.dumps(kept))
+            result, values = self.task(record_io.read(self.path, self.task.reading), self.name)
+            result.model.save(self.model_file)
+            if self.report:
+                from piezo_ident.report import write_report
+
+                write_report(result, self.report_folder)
+            write_text(self.row_file, json.dumps({'settings': self.settings(), 'values': values}))
         # one record must not end the run, whatever goes wrong with it
         except Exception as error:  # noqa: BLE001
             self.model_file.unlink(missing_ok=True)
             return self.failed(error)
-        return row
+        return Row(self.name, values)
 
     def failed(self, error: BaseException) -> Row:
         if isinstance(error, PiezoIdentError):
@@ -205,7 +189,7 @@ def run_many(
     scheduler : str, optional
         Address of a dask scheduler whose workers see the same paths; `jobs` is then not used.
     progress : callable, optional
-        Called with the number of records done and of all, some times a second; may raise to stop.
+        Called with the number of records done and of all.
 
     Returns
     -------
@@ -226,17 +210,16 @@ def run_many(
     progress(len(rows), len(work))
     if todo:
         count = min(jobs or _cores(), len(todo))
-        with dask(scheduler) if scheduler else processes(count) as executor:
-            futures: dict[Future[Row], _Job] = {executor.submit(job): job for job in todo}
+        with dask(scheduler) if scheduler else processes(count) as submit:
+            futures = {submit(job): job for job in todo}
             try:
-                for future in completed(futures, lambda: progress(len(rows), len(work))):
-                    job = futures[future]
-                    error = future.exception()
+                for future in as_completed(futures):
+                    job, error = futures[future], future.exception()
                     rows[job.name] = future.result() if error is None else job.failed(error)
+                    progress(len(rows), len(work))
             finally:
                 for future in futures:
                     future.cancel()
-        progress(len(rows), len(work))
     return sorted(rows.values(), key=lambda row: natural(row.record))
 
 
@@ -262,9 +245,7 @@ def _prepare(records: Sequence[Path], folder: Path, task: Task, reports: bool) -
             (folder / part).mkdir(parents=True, exist_ok=True)
         write_text(mark, json.dumps({'verb': task.verb}))
     except OSError as error:
-        raise DataError(
-            f'{folder}: cannot be written ({error.strerror or error}); choose another folder'
-        ) from None
+        raise unwritable(folder, error) from None
     return [_Job(task, path, name, target, reports) for name, path in places.items()]
 
 

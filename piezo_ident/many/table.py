@@ -61,59 +61,49 @@ class Row:
         return not self.reason
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column: unit ('' for text and plain numbers) and content."""
-
-    unit: str
-    about: str
-
-
-#: the columns that do not depend on what was found, in their order
+#: units of the columns that do not depend on what was found, in their order; '' for text and
+#: plain numbers; docs/many_records.md tells what they hold
 COLUMNS = {
-    'record': Column('', 'name of the file or bag, without its ending'),
-    'status': Column('', 'ok or failed'),
-    'reason': Column('', 'why it failed'),
-    'model': Column('', 'model that was judged (diagnose)'),
-    'sample_rate': Column('Hz', 'of the first piece'),
-    'samples': Column('', 'in all pieces'),
-    'duration': Column('s', 'of all pieces'),
-    'voltage_low': Column('V', 'lowest voltage'),
-    'voltage_high': Column('V', 'highest voltage'),
-    'stroke': Column('m', 'largest minus smallest displacement'),
-    'method': Column('', 'three steps, or a joint fit where nothing is labelled'),
-    'verdict': Column('', 'named, class, partly_explained, unexplained or none'),
-    'effects': Column('', 'effects that were added'),
-    'alike': Column('', 'effects that these data cannot tell apart'),
-    'error_held_out': Column('% of stroke', 'free run on segments that were not fitted'),
-    'error_selection': Column('% of stroke', 'on what only chose between models'),
-    'error_fitted': Column('% of stroke', 'on what was fitted'),
-    'error_before': Column('% of stroke', 'of the model as it was given'),
-    'error_refit': Column('% of stroke', 'with H refitted, held out'),
-    'error_after': Column('% of stroke', 'of the refined model, held out'),
-    'unexplained': Column('% of stroke', 'rms of what is left beyond the noise'),
-    'noise_floor': Column('% of stroke', 'rms of the sensor noise'),
-    'smallest_detectable': Column('% of stroke', 'rms of the smallest effect that would show'),
-    'gain': Column('m/V', 'displacement over voltage between the ends of the range'),
-    'loop_width': Column('%', 'largest width of the loop over the range, of its stroke'),
-    'delay': Column('s', 'delay'),
-    'delay_samples': Column('', 'delay in samples'),
-    'delay_std': Column('', 'standard deviation of the delay in samples'),
-    'bandwidth': Column('Hz', 'frequency at which |G| has fallen by 3 dB'),
-    'resonance': Column('Hz', 'frequency of the largest |G|, if it rises by 5 %'),
-    'resonance_peak': Column('', '|G| there, over that at rest'),
-    'order_a': Column('', 'order na of G'),
-    'order_b': Column('', 'order nb of G'),
-    'p1': Column('', 'cubic coefficient of H, normalised'),
-    'p2': Column('', 'linear coefficient of H, normalised'),
-    'faults': Column('', 'faults in the data'),
-    'warnings': Column('', 'what a reader has to know'),
+    'record': '',
+    'status': '',
+    'reason': '',
+    'model': '',
+    'sample_rate': 'Hz',
+    'samples': '',
+    'duration': 's',
+    'voltage_low': 'V',
+    'voltage_high': 'V',
+    'stroke': 'm',
+    'method': '',
+    'verdict': '',
+    'effects': '',
+    'alike': '',
+    'error_held_out': '% of stroke',
+    'error_selection': '% of stroke',
+    'error_fitted': '% of stroke',
+    'error_before': '% of stroke',
+    'error_refit': '% of stroke',
+    'error_after': '% of stroke',
+    'unexplained': '% of stroke',
+    'noise_floor': '% of stroke',
+    'smallest_detectable': '% of stroke',
+    'gain': 'm/V',
+    'loop_width': '%',
+    'delay': 's',
+    'delay_samples': '',
+    'delay_std': '',
+    'bandwidth': 'Hz',
+    'resonance': 'Hz',
+    'resonance_peak': '',
+    'order_a': '',
+    'order_b': '',
+    'p1': '',
+    'p2': '',
+    'faults': '',
+    'warnings': '',
 }
-#: columns of an effect, or of a play, in their order
-FOUND = {
-    'share': Column('', 'part of what can be explained, 0 to 1'),
-    'rms': Column('% of stroke', 'rms of what the effect explains'),
-}
+#: units of the first columns of an effect, as ``creep.share``
+FOUND = {'share': '', 'rms': '% of stroke'}
 #: these stand behind whatever was found
 _LAST = ('faults', 'warnings')
 
@@ -134,10 +124,8 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a column; '' for text and plain numbers, and for those of effects."""
-    if column in COLUMNS:
-        return COLUMNS[column].unit
-    return FOUND[kind].unit if (kind := column.partition('.')[2]) in FOUND else ''
+    """Return the unit of a column; '' for text, plain numbers, and parameters of effects."""
+    return COLUMNS.get(column) or FOUND.get(column.partition('.')[2], '')
 
 
 def columns_of(rows: Iterable[Row]) -> list[str]:
@@ -190,14 +178,7 @@ def _text(value: Value) -> str:
 
 
 def write_table(rows: Sequence[Row], path: Path) -> None:
-    """
-    Write the table as a CSV file.
-
-    Raises
-    ------
-    DataError
-        When the file cannot be written.
-    """
+    """Write the table as a CSV file."""
     # file names need not be Unicode
     write_text(path, csv_text(rows).encode('utf-8', 'replace').decode('utf-8'))
 
@@ -219,19 +200,7 @@ def _number(value: float | None) -> float | None:
 
 
 def identified(result: Identification, record: Record) -> dict[str, Value]:
-    """
-    Return the cells of an identification.
-
-    Parameters
-    ----------
-    result : Identification
-    record : Record
-
-    Returns
-    -------
-    dict of str to Value
-        By the columns of `COLUMNS`; SI units, errors in % of stroke.
-    """
+    """Return the cells of an identification by their columns."""
     model = result.model
     h, stage = model.hysteresis, figures_of_merit(model)
     values: dict[str, Value] = {
@@ -261,20 +230,7 @@ def identified(result: Identification, record: Record) -> dict[str, Value]:
 
 
 def diagnosed(result: Diagnosis, record: Record) -> dict[str, Value]:
-    """
-    Return the cells of a diagnosis.
-
-    Parameters
-    ----------
-    result : Diagnosis
-    record : Record
-
-    Returns
-    -------
-    dict of str to Value
-        By the columns of `COLUMNS`, and for every effect that was added
-        ``<effect>.share``, ``<effect>.rms`` and its parameters, in the units of the catalogue.
-    """
+    """Return the cells of a diagnosis, with those of every effect that was added."""
     values: dict[str, Value] = {
         **_head(record),
         'verdict': result.verdict,

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import as_completed, Executor, Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 import os
 import threading
@@ -16,65 +16,49 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.process import Job, WorkerProcess
 
-__all__ = ['completed', 'dask', 'processes']
+__all__ = ['Submit', 'dask', 'processes']
+
+#: takes a job, and returns its result to be
+Submit = Callable[[Any], Future[Any]]
 
 WAIT_FOR_SCHEDULER = 10.0
 
 
-def completed(futures: Iterable[Future[Any]], tick: Callable[[], None]) -> Iterator[Future[Any]]:
-    """Yield futures as they complete; `tick` is called some times a second and may raise."""
-    left = set(futures)
-    while left:
-        tick()
-        try:
-            for future in as_completed(left, timeout=0.2):
-                left.discard(future)
-                yield future
-        except TimeoutError:
-            pass
-
-
-class _Processes(ThreadPoolExecutor):
-    """Threads that each drive one process, so that a dead process costs one record."""
-
-    def __init__(self, jobs: int) -> None:
-        super().__init__(jobs)
-        self._local = threading.local()
-        self._workers: list[WorkerProcess] = []
-
-    def submit(self, job: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        return super().submit(self._run, job)
-
-    def _run(self, job: Job) -> Any:
-        if not hasattr(self._local, 'worker'):
-            self._local.worker = WorkerProcess()
-            self._workers.append(self._local.worker)
-        return self._local.worker.run(job)
-
-    def end(self) -> None:
-        self.shutdown(wait=False, cancel_futures=True)
-        for worker in self._workers:
-            worker.close()
-        self.shutdown()
-
-
 @contextmanager
-def processes(jobs: int) -> Iterator[Executor]:
-    """Yield an executor of so many processes; they are gone at the end."""
+def processes(jobs: int) -> Iterator[Submit]:
+    """Yield what submits jobs to so many processes; a process that dies costs one job."""
     # the matrices are narrow: a second thread of BLAS only waits; new processes inherit this
     for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
         os.environ.setdefault(name, '1')
-    executor = _Processes(jobs)
+    local, workers = threading.local(), []
+
+    def begin() -> None:
+        local.worker = WorkerProcess()
+        workers.append(local.worker)
+
+    def run(job: Job) -> Any:
+        return local.worker.run(job)
+
+    def end() -> None:
+        for worker in workers:
+            worker.close()
+
+    # each thread drives one process
+    threads = ThreadPoolExecutor(jobs, initializer=begin)
     try:
-        yield executor
+        yield lambda job: threads.submit(run, job)
     finally:
-        executor.end()
+        threads.shutdown(wait=False, cancel_futures=True)
+        end()
+        threads.shutdown()
+        # that of a thread that had only begun
+        end()
 
 
 @contextmanager
-def dask(address: str) -> Iterator[Executor]:
+def dask(address: str) -> Iterator[Submit]:
     """
-    Yield the workers of a dask scheduler as an executor.
+    Yield what submits jobs to the workers of a dask scheduler.
 
     Raises
     ------
@@ -103,7 +87,7 @@ def dask(address: str) -> Iterator[Executor]:
                 raise ConfigError(
                     f'{worker}: has piezo_ident {version}; install {__version__} there'
                 )
-        yield client.get_executor(pure=False)
+        yield client.get_executor(pure=False).submit
     finally:
         client.close(timeout=WAIT_FOR_SCHEDULER)
 
