@@ -61,6 +61,7 @@ from std_srvs.srv import Trigger
 __all__ = ['Graph', 'Handle', 'Late', 'alive', 'best_of_three', 'in_time']
 
 ROOT = Path(__file__).resolve().parents[2]
+PROFILE = Path(__file__).with_name('prompt_discovery.xml')
 #: a question that may have been lost with a dead node is asked again after this time [s]
 AGAIN = 5.0
 #: the observer shares its interpreter with the test, and must not lose what waits for it
@@ -90,6 +91,7 @@ class Graph:
         self.domain, self._lock = take_domain()
         self.folder = Path(tempfile.mkdtemp(prefix='piezo_ident_graph_'))
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))
         self.environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(self.domain),

@@ -31,18 +31,30 @@ segments:
 """
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def lab():
     with Graph() as g:
-        for topic in ('displacement', 'applied_voltage'):
+        for topic in ('voltage', 'displacement', 'applied_voltage'):
             g.collect(topic)
         command = [sys.executable, str(EXAMPLE), '--ros-args', '-p', f'silence:={SILENCE}']
         g.follow('stage', 'stage')
         g.handles.append(Handle(g, 'stage', command, g.folder / 'driver.log'))
         g.wait(lambda: g.statuses('stage'), 'the driver')
+        g.start_all(('identifier',), ('excitation', {'program': PROGRAM, 'subscribers': 3}))
         for topic in ('displacement', 'applied_voltage'):
             g.matched(topic)
         yield g
+
+
+@pytest.fixture
+def begin(lab):
+    """Start the driver afresh, and return how many blocks came before."""
+    lab.handle('stage').stop()
+    lab.restart(lab.handle('stage'))
+    topics = ('displacement', 'applied_voltage')
+    for topic in topics:
+        lab.matched(topic)
+    return {topic: len(lab.collect(topic)) for topic in topics}
 
 
 def column(blocks: list[Samples], name: str = 'values') -> np.ndarray:
@@ -71,9 +83,6 @@ def at_rest(g: Graph) -> bool:
 
 def test_a_program_is_followed_bit_by_bit(lab):
     voltage = lab.collect('voltage')
-    lab.start('identifier')
-    # the third is the one who looks
-    lab.start('excitation', {'program': PROGRAM, 'subscribers': 3})
     n = parse_program(PROGRAM).build(FS).n
     assert lab.call('excitation/start')[0]
     lab.wait(lambda: lab.status('excitation')['state'] == 'done', 'the program')
@@ -91,42 +100,11 @@ def test_a_program_is_followed_bit_by_bit(lab):
     )
 
 
-def test_silence_and_what_comes_after_it(lab):
-    applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
-    # up by a ramp, too high, and then nothing more
-    send(lab, [9.0] * 60 + [11.0] * 20)
-    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'silence')
-    lab.wait(lambda: at_rest(lab), 'rest')
-    v = column(applied)
-    assert v.max() <= 10.0
-    # no sample is faster than the ramps allow but where the stream itself steps from 9 V to 10 V
-    steps = np.abs(np.diff(v)) * FS
-    assert np.count_nonzero(steps > 1.01 * RAMP) == 1
-    assert {b.segment for b in applied} == {'hold', 'ramp:silence'}
-    assert len(y) == 80
-    # t goes on without a gap, so that the two topics join
-    np.testing.assert_allclose(np.diff(column(applied, 't')), 1 / FS, rtol=1e-6)
-    # a new stream at 5 V is joined by a ramp
-    before = v.size
-    send(lab, [5.0] * 160)
-    joined = column(applied)[before:]
-    assert np.abs(np.diff(joined)).max() * FS <= 1.01 * RAMP
-    assert joined[:16_000][-1] == 5.0
-
-
-def test_limits_hold_from_the_moment_they_are_set(lab):
-    applied = lab.collect('applied_voltage')
-    assert not lab.set('stage', 'voltage_low', 20.0)[0]
-    assert lab.set('stage', 'voltage_high', 5.0)[0]
-    send(lab, [9.0] * 160)
-    assert column(applied).max() == 5.0
-
-
-def test_a_second_publisher_is_refused(lab):
-    y = lab.collect('displacement')
-    lab.start('excitation', {'program': PROGRAM.replace('0.4', '120'), 'subscribers': 1})
+def test_a_second_publisher_is_refused(lab, begin):
+    y, before = lab.collect('displacement'), begin['displacement']
+    assert lab.set('excitation', 'program', PROGRAM.replace('0.4', '120'))[0]
     assert lab.call('excitation/start')[0]
-    lab.wait(lambda: len(y) > 40, 'a stream')
+    lab.wait(lambda: len(y) > before + 40, 'a stream')
     for k in range(5):
         lab.publish('voltage', block(10_000_000 + 100 * k, 0.5, segment='foreign'))
     lab.wait(
@@ -135,15 +113,46 @@ def test_a_second_publisher_is_refused(lab):
     seen = len(y)
     lab.wait(lambda: len(y) > seen + 40, 'the stream going on')
     assert 'foreign' not in {b.segment for b in y}
-    assert np.all(np.diff(column(y, 't')) > 0)
+    assert np.all(np.diff(column(y[before:], 't')) > 0)
+    # from here on the tests drive alone
+    assert lab.handle('excitation').stop() == 0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_it_ends_at_rest(lab, number):
+def test_silence_and_what_comes_after_it(lab, begin):
+    applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
+    # up by a ramp, too high, and then nothing more
+    send(lab, [9.0] * 60 + [11.0] * 20)
+    assert lab.set('stage', 'silence', 0.05)[0]
+    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'silence')
+    lab.wait(lambda: at_rest(lab), 'rest')
+    new = applied[begin['applied_voltage'] :]
+    v = column(new)
+    assert v.max() <= 10.0
+    # no sample is faster than the ramps allow but where the stream itself steps from 9 V to 10 V
+    steps = np.abs(np.diff(v)) * FS
+    assert np.count_nonzero(steps > 1.01 * RAMP) == 1
+    assert {b.segment for b in new} == {'hold', 'ramp:silence'}
+    assert len(y) == begin['displacement'] + 80
+    # t goes on without a gap, so that the two topics join
+    np.testing.assert_allclose(np.diff(column(new, 't')), 1 / FS, rtol=1e-6)
+
+
+def test_a_stream_joins_by_a_ramp_within_limits_that_were_just_set(lab, begin):
+    assert not lab.set('stage', 'voltage_low', 20.0)[0]
+    assert lab.set('stage', 'voltage_high', 5.0)[0]
+    try:
+        send(lab, [9.0] * 160)
+    finally:
+        assert lab.set('stage', 'voltage_high', 10.0)[0]
+    joined = column(lab.collect('applied_voltage')[begin['applied_voltage'] :])
+    assert np.abs(np.diff(joined)).max() * FS <= 1.01 * RAMP
+    assert joined.max() == joined[:16_000][-1] == 5.0
+
+
+def test_it_ends_at_rest(lab, begin):
     send(lab, [9.0] * 100)
-    (driver,) = lab.handles
-    driver.send(number)
-    assert driver.process.wait(60.0) == 0 and driver.log == ''
+    driver = lab.handle('stage')
+    assert driver.stop(signal.SIGTERM) == 0 and driver.log == ''
     lab.wait(lambda: at_rest(lab), 'rest')
 
 

@@ -206,7 +206,7 @@ def test_a_bag_that_ends_early(graph, tmp_path):
     file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     assert graph.set('replay/player', 'bag', str(tmp_path / 'bag'))[0]
-    assert graph.set('replay/player', 'rate', 2.0)[0]
+    assert graph.set('replay/player', 'rate', 4.0)[0]
     seen = len(graph.statuses('replay/player'))
     ok, reason = graph.call('replay/player/start')
     assert ok, reason

@@ -1,9 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Graphs in namespaces side by side, and one under other names, hear only themselves."""
-
-import json
+"""A graph in a namespace and one under other names hear only themselves."""
 
 from course import column, FS, HIGH, model_of, numbers, PROGRAM, QUICK, voltage_of
 from graph import Graph
@@ -25,11 +23,10 @@ NAMES = {
 DRIVE = {
     f'excitation/{name}': f'drive/{name}' for name in ('start', 'stop', 'set_parameters', 'status')
 }
-NODES = ('excitation', 'stage', 'identifier', 'model')
-WHERE = {'a/': 'a/excitation', 'b/': 'b/excitation', '': 'drive'}
+WHERE = ('a/', '')
 
 
-def test_three_graphs_side_by_side(tmp_path):
+def test_two_graphs_side_by_side(tmp_path):
     excitation = {'subscribers': 4, 'block_size': 500}
     identifier = {**QUICK, 'program': PROGRAM}
     with Graph() as g:
@@ -41,17 +38,11 @@ def test_three_graphs_side_by_side(tmp_path):
         models = {w: g.texts(f'{w}{"learnt" if not w else "model"}') for w in WHERE}
         reports = {w: g.texts(f'{w}{"findings" if not w else "report"}') for w in WHERE}
         g.start_all(
-            *(
-                spec
-                for where, name in (('a', 'paper'), ('b', 'dense'))
-                for spec in (
-                    ('stage', {'stage': name, 'seed': 1}, where),
-                    ('excitation', excitation, where),
-                    ('identifier', identifier, where),
-                    ('model', {}, where),
-                )
-            ),
-            ('stage', {'stage': 'paper', 'seed': 1}, '', {**NAMES, '__node': 'table'}),
+            ('stage', {'seed': 1}, 'a'),
+            ('excitation', excitation, 'a'),
+            ('identifier', identifier, 'a'),
+            ('model', {}, 'a'),
+            ('stage', {'seed': 1}, '', {**NAMES, '__node': 'table'}),
             ('excitation', {**excitation, 'subscribers': 5}, '', {**NAMES, '__node': 'drive'}),
             ('identifier', identifier, '', {**NAMES, **DRIVE}),
             ('model', {}, '', NAMES),
@@ -84,28 +75,25 @@ def test_three_graphs_side_by_side(tmp_path):
         for name in NAMES:
             assert g.node.count_publishers(f'/{name}') == 0, name
 
-        # the same stage has the same model whatever it is called, another stage has another
+        # the same stage has the same model whatever it is called
         g.wait(lambda: all(models.values()) and all(reports.values()), 'models and reports')
         found = {where: numbers(model_of(models[where][-1])) for where in WHERE}
         np.testing.assert_allclose(found['a/'], found[''], rtol=1e-12)
-        assert found['a/'].tolist() != found['b/'].tolist()
-        assert len({json.loads(r[-1])['verdict'] for r in reports.values()}) == 2
         for where in WHERE:
             g.wait(
                 lambda w=where: g.status(f'{w}model')['message'] == 'with topic model',
                 'the model to be taken over',
             )
 
-        # one of them goes on, and the others are silent
+        # one of them goes on, and the other is silent
         heard = {where: len(voltage[where]) for where in WHERE}
-        foreseen = len(expected['b/'])
-        assert g.set('b/excitation', 'program', HIGH)[0]
-        assert g.call('b/excitation/start')[0]
-        g.wait(lambda: len(expected['b/']) > foreseen, 'a prediction')
-        assert g.call('b/excitation/stop')[0]
-        g.wait(lambda: g.status('b/excitation')['state'] == 'stopped', 'the stop')
-        assert {w: len(voltage[w]) for w in ('a/', '')} == {w: heard[w] for w in ('a/', '')}
-        assert not expected['a/'] and not expected['']
+        assert g.set('a/excitation', 'program', HIGH)[0]
+        assert g.call('a/excitation/start')[0]
+        g.wait(lambda: expected['a/'], 'a prediction')
+        assert g.call('a/excitation/stop')[0]
+        g.wait(lambda: g.status('a/excitation')['state'] == 'stopped', 'the stop')
+        assert len(voltage['a/']) > heard['a/'] and len(voltage['']) == heard['']
+        assert not expected['']
 
         # the bag has the names of this graph, and is played under them
         assert g.call('recorder/stop')[0]

@@ -8,14 +8,14 @@ import re
 import signal
 import time
 
-from course import HIGH, model_of, PROGRAM, QUICK
+from course import HIGH, model_of, numbers, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, in_time
 from graph_page import DIAGNOSTICS, OPERATOR, rights, SERVICES, STATES, TOPICS
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED
-from piezo_ident.record.bags.read import read_bag
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
@@ -75,8 +75,28 @@ def test_a_run_through_the_whole_graph(whole):
     whole.wait(lambda: whole.status('model')['message'] == 'with topic model', 'the model')
     assert ended(whole, 'recorder', 'recorder/stop')['state'] == 'done'
     assert whole.set('excitation', 'subscribers', 3)[0]
-    record = read_bag(whole.output / 'bag')
+    record = pi.read(whole.output / 'bag')
     assert record.n == round(3.37 * 20_000) and record.faults == ()
+
+
+def test_live_replayed_and_offline_models_are_equal(whole):
+    models = [whole.texts('model')[-1]]
+    bag = whole.output / 'bag'
+    replayed = whole.texts('replay/model')
+    players = [
+        whole.start('player', {'bag': str(bag), 'rate': 4.0}, 'replay', wait=False),
+        whole.start('identifier', QUICK, 'replay', wait=False),
+    ]
+    assert ended(whole, 'replay/player', 'replay/player/start')['state'] == 'done'
+    assert ended(whole, 'replay/identifier', 'replay/identifier/identify')['state'] == 'done'
+    whole.wait(lambda: replayed, 'the replayed model')
+    models.append(replayed[-1])
+    for handle in players:
+        assert handle.stop() == 0
+    settings = pi.Settings(max_order=6, thresholds=10, solver='swarm')
+    offline = numbers(pi.identify(pi.read(bag), settings).model)
+    for text in models:
+        np.testing.assert_allclose(numbers(model_of(text)), offline, rtol=1e-12, atol=0)
 
 
 def test_topics_are_those_of_the_table(whole):
