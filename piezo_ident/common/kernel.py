@@ -15,7 +15,7 @@ from typing import Any, cast, TypeVar
 
 from numba import njit
 
-__all__ = ['alive', 'kernel', 'ordered_kernel']
+__all__ = ['STILL', 'alive', 'kernel', 'ordered_kernel']
 
 F = TypeVar('F', bound=Callable[..., Any])
 

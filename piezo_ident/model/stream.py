@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
-from piezo_ident.operators.kernels import cascade
+from piezo_ident.operators.kernels import cascade, STRETCH
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
@@ -140,33 +140,36 @@ class _Cascade:
         self, model: StageModel, H: HysteresisOperator, G: DynamicsOperator, z: DelayOperator
     ) -> None:
         s, h = model.scaling, model.hysteresis
+        past_w, past_y = G.b.size - 1, max(G.a.size, z.delay.samples + 1)
+        # a long delay would else spend its time on moving its past
+        room = max(STRETCH, past_y)
         self._H, self._G, self._delay = H, G, z.delay
+        self._w, self._y = np.empty(past_w + room), np.empty(past_y + room)
         self._scale = np.array([s.v0, s.V, s.y0, s.Y])
         self._hysteresis = np.array(h.thresholds), np.array(h.weights), h.p1, h.p2
-        self._past_w = np.empty(G.b.size - 1)
-        self._past_y = np.empty(max(G.a.size, z.delay.samples + 1))
 
     def reset(self, u0: float) -> float:
         """Come to rest and return the displacement there [m]."""
         w0 = self._H.reset(u0, u0)
         rest = self._G.reset(u0, w0)
-        self._past_w[:], self._past_y[:] = w0, rest
+        self._w[:], self._y[:] = w0, rest
         y0, Y = self._scale[2:]
         return float(y0 + Y * rest)
 
     def run(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement [m] for the next samples, shape (n,)."""
         out = np.empty(v.size)
+        # a frozen array would be another type to the compiler
+        v = v if v.flags.carray else v.copy()
         cascade(
-            # a frozen array would be another type to the compiler
-            np.require(v, requirements=['C', 'W']),
+            v,
             self._scale,
             *self._hysteresis,
             self._H.memory,
             self._G.b,
             self._G.a,
-            self._past_w,
-            self._past_y,
+            self._w,
+            self._y,
             self._delay.samples,
             self._delay.fraction,
             out,

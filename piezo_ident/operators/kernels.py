@@ -10,23 +10,24 @@ The compiled loops of H, of G, and of both with the delay in one.
 
 of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
 
-Every sum runs from the oldest term to the newest wherever a sample stands, so the result does not
-depend on how a stream is cut.  An output of G that has died away is zero
+Every sum of G runs from the oldest term to the newest wherever a sample stands, so the result does
+not depend on how a stream is cut.  An output of G that has died away is zero
 (`piezo_ident.common.kernel.alive`): without that a stage at rest is 17 times as slow to simulate
-as one that moves.  The loops share one file because a compiled loop is kept on disk until its own
-file changes.
+as one that moves.  The test for it would delay every output, so a stretch is first filtered
+without, and again with it where an output died away.  The loops share one file because a compiled
+loop is kept on disk until its own file changes.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.kernel import alive, kernel, ordered_kernel
+from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
 __all__ = ['cascade', 'dynamics', 'held', 'hysteresis', 'plays']
 
 #: samples that pass the loops while they are in the cache
-STRETCH = 512
+STRETCH = 1024
 
 
 @ordered_kernel
@@ -93,13 +94,57 @@ def dynamics(
         Earlier outputs, and room for the new ones.
     """
     nb, na = b.size, a.size
+    for start in range(0, y.size - na, STRETCH):
+        n = min(STRETCH, y.size - na - start)
+        inputs, outputs = w[start : start + nb - 1 + n], y[start : start + na + n]
+        _forward(inputs, b, outputs[na:])
+        _backward(a, outputs)
+        if _dies_away(outputs[na:]):
+            _forward(inputs, b, outputs[na:])
+            _backward_to_rest(a, outputs)
+
+
+@ordered_kernel
+def _forward(w: NDArray[np.float64], b: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    y[:] = 0.0
+    for j in range(b.size):
+        # a slice, whose indices cannot be negative, lets the loop run in vector lanes
+        past = w[j : j + y.size]
+        for k in range(y.size):
+            y[k] += b[j] * past[k]
+
+
+@ordered_kernel
+def _backward(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    na = a.size
+    if na == 0:
+        return
+    # each output waits for the one before, which reaches it sooner in a variable
+    last = y[na - 1]
     for k in range(y.size - na):
-        x = 0.0
-        for j in range(nb):
-            x += b[j] * w[k + j]
-        for i in range(na):
-            x -= a[i] * y[k + i]
-        y[k + na] = alive(x)
+        past, x = y[k : k + na], y[k + na]
+        for i in range(na - 1):
+            x -= a[i] * past[i]
+        last = x - a[na - 1] * last
+        y[k + na] = last
+
+
+@ordered_kernel
+def _dies_away(y: NDArray[np.float64]) -> bool:
+    # counted by index, not looked for: that runs in vector lanes
+    count = 0
+    for k in range(y.size):
+        count += (abs(y[k]) < STILL) & (y[k] != 0.0)
+    return count > 0
+
+
+@ordered_kernel
+def _backward_to_rest(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    for k in range(a.size, y.size):
+        x = y[k]
+        for i in range(a.size):
+            x -= a[i] * y[k - a.size + i]
+        y[k] = alive(x)
 
 
 @ordered_kernel
@@ -113,8 +158,8 @@ def cascade(
     memory: NDArray[np.float64],
     b: NDArray[np.float64],
     a: NDArray[np.float64],
-    past_w: NDArray[np.float64],
-    past_y: NDArray[np.float64],
+    w: NDArray[np.float64],
+    y: NDArray[np.float64],
     d: int,
     fraction: float,
     out: NDArray[np.float64],
@@ -132,30 +177,30 @@ def cascade(
         As in `hysteresis`.
     b, a
         As in `dynamics`.
-    past_w : ndarray, shape (nb - 1,)
-        Last outputs of H.
-    past_y : ndarray, shape (k,), k >= na, k > d
-        Last outputs of G.
+    w : ndarray, shape (nb - 1 + k,)
+        Last outputs of H, and room for k new ones.
+    y : ndarray, shape (past + k,), past >= na, past > d
+        Last outputs of G, and the same room.
     d, fraction : int and float
         The delay [samples].
     """
     v0, V, y0, Y = scale[0], scale[1], scale[2], scale[3]
-    nw, ny = past_w.size, past_y.size
-    room = min(v.size, max(STRETCH, ny))
-    w, y = np.empty(nw + room), np.empty(ny + room)
-    w[:nw], y[:ny] = past_w, past_y
+    past_w = b.size - 1
+    room = w.size - past_w
+    past_y = y.size - room
     for start in range(0, v.size, room):
         new = out[start : start + room]
         n = new.size
         for k in range(n):
             new[k] = (v[start + k] - v0) / V
-        hysteresis(new, r, q, p1, p2, memory, w[nw : nw + n])
-        dynamics(w[: nw + n], b, a, y[ny - a.size : ny + n])
-        now = ny - d
+        hysteresis(new, r, q, p1, p2, memory, w[past_w : past_w + n])
+        dynamics(w[: past_w + n], b, a, y[past_y - a.size : past_y + n])
+        now, before = y[past_y - d :], y[past_y - d - 1 :]
         for k in range(n):
-            x = y[now + k]
-            if fraction != 0.0:
-                x = (1.0 - fraction) * x + fraction * y[now + k - 1]
+            x = now[k] if fraction == 0.0 else (1.0 - fraction) * now[k] + fraction * before[k]
             new[k] = y0 + Y * x
-        w[:nw], y[:ny] = w[n : n + nw].copy(), y[n : n + ny].copy()
-    past_w[:], past_y[:] = w[:nw], y[:ny]
+        # from front to back, so that no sample is overwritten before it has moved
+        for k in range(past_w):
+            w[k] = w[n + k]
+        for k in range(past_y):
+            y[k] = y[n + k]
