@@ -29,10 +29,9 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.results import Settings, silent
+from piezo_ident.identification.spectra import excited_band, prefilter
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
-    excited_band,
-    prefilter,
     scan_orders,
 )
 from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis

@@ -31,10 +31,9 @@ import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.output_error import output_error
+from piezo_ident.identification.spectra import excited_band, prefilter
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
-    excited_band,
-    prefilter,
     scan_orders,
     stabilised,
 )

@@ -12,27 +12,24 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.record import Piece, Record
-from scipy import signal
+from piezo_ident.residual.stretches import runs_of as true_runs
 
 __all__ = [
     'Excerpt',
     'Prepared',
     'Run',
     'common_rate',
-    'drive_creep',
     'prepare',
-    'refuse_closed_loop',
-    'refuse_undriven',
     'runs_of',
     'same_rate',
     'scaling_of',
-    'true_runs',
 ]
 
 #: share of a triangle that is one block of held-out data, and how many blocks share one
@@ -45,27 +42,6 @@ REST = 0.01
 ROW_SPAN = 2e-3
 #: samples of all records that are used, at some 60 bytes each; of longer ones the first
 MOST_SAMPLES = 40_000_000
-#: chance below which the displacement answers the voltage, and samples that it takes to tell
-CHANCE, MIN_COHERENCE = 1e-7, 256
-#: means into which a ramp is divided
-RAMP = 64
-#: a measured stage under position control stays this close to a straight line, as a share of its
-#: travel (2.4e-4), while its drive bends by 18 times as much or more
-STRAIGHT, BENT = 5e-4, 15.0
-
-
-def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """
-    Return (start, stop) of every stretch of true values.
-
-    Examples
-    --------
-    >>> true_runs(np.array([True, True, False, True]))
-    [(0, 2), (3, 4)]
-    """
-    padded = np.concatenate([[False], mask, [False]])
-    edges = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,164 +299,3 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
                 Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)
             )
     return runs
-
-
-def refuse_undriven(records: Sequence[Record]) -> None:
-    """
-    Refuse records whose displacement is no answer to the voltage.
-
-    Somewhere the spectra of voltage and displacement have to be coherent, by more than chance
-    (1e-7): for Gaussian noise ``1 - c`` raised to ``L - 1`` is the chance of a coherence c over L
-    segments, whatever the displacement does.  A line is taken out of each segment.  Kept, it
-    counts where the voltage moves by far more than its own noise: two drifts agree by chance.
-
-    Raises
-    ------
-    IdentificationError
-        When no piece shows it.
-    """
-    pieces = [piece for record in records for piece in record]
-    if any(piece.n < MIN_COHERENCE and np.ptp(piece.v) > 0.0 for piece in pieces):
-        return
-    if any(
-        _chance(piece, 'linear') < CHANCE or (_moves(piece.v) and _chance(piece) < CHANCE)
-        for piece in pieces
-        if np.ptp(piece.v) > 0.0
-    ):
-        return
-    low, high = (f([getattr(p.v, f.__name__)() for p in pieces]) for f in (min, max))
-    raise IdentificationError(
-        f'{", ".join(record.name for record in records)}: the displacement does not answer the '
-        f'voltage, which stays within {low:.4g} .. {high:.4g} V and moves as noise does; record '
-        'the stage while it is driven'
-    )
-
-
-def _moves(v: NDArray[np.float64]) -> bool:
-    """Return whether a voltage moves by far more than its noise."""
-    rows = v[: v.size // 64 * 64].reshape(64, -1)
-    noise = float(np.median(np.std(signal.detrend(rows), axis=1)))
-    return bool(np.ptp(rows.mean(axis=1)) > 10.0 * noise)
-
-
-def _chance(piece: Piece, detrend: str = 'constant') -> float:
-    """Return the chance that noise is as coherent with the displacement as the voltage is."""
-    chance = 1.0
-    for size in (piece.n // 16, 256):
-        if piece.n < 8 * size or chance < CHANCE:
-            continue
-        how = {'nperseg': size, 'detrend': detrend}
-        s_vv, s_yy = (signal.welch(x, **how)[1] for x in (piece.v, piece.y))
-        s_vy = signal.csd(piece.v, piece.y, **how)[1]
-        # what detrending leaves of a straight line is rounding
-        power = (s_vv > 1e-12 * s_vv.max(initial=0.0)) & (s_yy > 1e-12 * s_yy.max(initial=0.0))
-        if power.any():
-            coherence = np.abs(s_vy[power]) ** 2 / (s_vv[power] * s_yy[power])
-            # Hann segments that overlap by half are worth 0.6 of their number
-            left = (1.0 - min(1.0, float(coherence.max()))) ** (1.2 * piece.n / size - 1.6)
-            chance = min(chance, float(power.sum()) * left)
-    return chance
-
-
-def refuse_closed_loop(record: Record) -> None:
-    """
-    Refuse a record under position control, where the voltage is the answer.
-
-    Two signs are known: the drive moves while the position is held, and the position follows a
-    straight line more closely than the drive.  A stage under voltage control does neither: it
-    creeps, and its hysteresis bends the displacement, not the voltage.
-
-    Raises
-    ------
-    IdentificationError
-    """
-    if np.ptp(record.voltage_range) == 0.0 or record.stroke == 0.0:
-        return
-    for refuse in (_refuse_hold, _refuse_ramp):
-        for piece in record:
-            refuse(record, piece)
-
-
-def _refuse_hold(record: Record, piece: Piece) -> None:
-    span = np.ptp(record.voltage_range)
-    window = max(16, int(0.5 * piece.sample_rate))
-    if piece.n < 4 * window:
-        return
-    n = piece.n // window
-    v = piece.v[: n * window].reshape(n, window).mean(axis=1)
-    y = piece.y[: n * window].reshape(n, window).mean(axis=1)
-    for start, stop in true_runs(np.abs(np.diff(y)) < 1e-4 * record.stroke):
-        moved = abs(v[stop] - v[start]) / span
-        followed = abs(y[stop] - y[start]) / record.stroke
-        if stop - start < 4 or moved <= 0.005 or followed >= 0.05 * moved:
-            continue
-        t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
-        creep = drive_creep(piece, start * window, stop * window)
-        text = ''
-        if creep is not None:
-            text = (
-                f'; there the drive makes up for creep of {creep:.2g} V a decade of time, '
-                f'{100.0 * creep / span:.2g} % of its range'
-            )
-        cause = 'a position controller was on'
-        if np.ptp(piece.y[(start + 1) * window : stop * window]) == 0.0:
-            cause += ', or the sensor is at its stop, as it reads one value there'
-        raise IdentificationError(
-            f'{record.name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by {moved:.1%} of '
-            f'its range while the position moves by {followed:.2%} of its stroke: {cause}, so the '
-            f'position is no response to the voltage{text}; record in open loop'
-        )
-
-
-def _refuse_ramp(record: Record, piece: Piece) -> None:
-    span = np.ptp(record.voltage_range)
-    for parts in (1, 2, 4):
-        m = piece.n // parts // RAMP
-        if m < 4:
-            return
-        for start in range(0, piece.n - m * RAMP + 1, m * RAMP // 2):
-            stop = start + m * RAMP
-            v, y = (x[start:stop].reshape(RAMP, m).mean(axis=1) for x in (piece.v, piece.y))
-            if np.ptp(v) < 0.05 * span or np.ptp(y) < 0.05 * record.stroke:
-                continue
-            bend_v, bend_y = _bend(v), _bend(y)
-            if bend_y < STRAIGHT and bend_v > BENT * max(bend_y, STRAIGHT / 2.0):
-                raise IdentificationError(
-                    f'{record.name}: from {piece.t[start]:.3g} to {piece.t[stop - 1]:.3g} s the '
-                    f'position follows a straight line to {bend_y:.3%} of its travel and the '
-                    f'voltage only to {bend_v:.2%}: a position controller was on, so the position '
-                    'is no response to the voltage; record in open loop'
-                )
-
-
-def _bend(x: NDArray[np.float64]) -> float:
-    """Return the rms deviation from a straight line, as a share of the line's travel."""
-    k = np.linspace(-0.5, 0.5, x.size)
-    travel = float(k @ x / (k @ k))
-    return float(np.std(x - travel * k)) / max(abs(travel), np.finfo(float).tiny)
-
-
-def drive_creep(piece: Piece, start: int, stop: int) -> float | None:
-    """
-    Return by how much the drive moves a decade of time while the position is held [V].
-
-    Parameters
-    ----------
-    piece : Piece
-    start, stop : int
-        The hold.
-
-    Returns
-    -------
-    float or None
-        None where a straight line in time describes the drive as well: that is drift.
-    """
-    t, v = piece.t[start:stop] - piece.t[start] + 1.0 / piece.sample_rate, piece.v[start:stop]
-    left, slope = {}, {}
-    # a second, and a tenth of the whole, for what the controller does at first
-    late = t > min(1.0, 0.1 * t[-1])
-    for name, x in (('log', np.log10(t)), ('line', t)):
-        fit = np.polynomial.Polynomial.fit(x[late], v[late], 1)
-        left[name] = float(np.sum((v[late] - fit(x[late])) ** 2))
-        slope[name] = float(fit.convert().coef[-1])
-    return abs(slope['log']) if left['log'] < 0.5 * left['line'] else None

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.common.showable import Showable
 from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import StepDelay
-from piezo_ident.identification.step2_dynamics import FrequencyResponse, OrderTable
+from piezo_ident.identification.step2_dynamics import OrderTable
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
 from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes

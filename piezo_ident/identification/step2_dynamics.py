@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +23,13 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
 from piezo_ident.identification.solvers.output_error import lag_products
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
-from scipy import signal
 from scipy.linalg import solve_triangular
 
 __all__ = [
     'ArxFactor',
-    'FrequencyResponse',
     'OrderTable',
     'arx_factor',
-    'excited_band',
-    'frequency_response',
     'instrumental_variables',
-    'prefilter',
     'scan_orders',
     'stabilised',
 ]
@@ -146,9 +140,9 @@ def arx_factor(
 
     def rows() -> Iterator[NDArray[np.float64]]:
         for start in range(first, y.size, ROWS):
-            k = np.arange(start, min(start + ROWS, y.size))
-            past_y = windows_y[k - na_max][:, ::-1]
-            past_u = windows_u[k - n_lags + 1][:, ::-1]
+            stop = min(start + ROWS, y.size)
+            past_y = windows_y[start - na_max : stop - na_max, ::-1]
+            past_u = windows_u[start - n_lags + 1 : stop - n_lags + 1, ::-1]
             yield np.hstack([past_y[:, 1:], past_u, past_y[:, :1]])
 
     R = triangular_factor(rows(), p)
@@ -326,108 +320,3 @@ def instrumental_variables(
             return candidate
         model = candidate
     return model
-
-
-def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3) -> float:
-    """
-    Return the highest frequency at which the input still has power [Hz].
-
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-    sample_rate : float
-        [Hz]
-    depth : float, optional
-        Share of the largest spectral density that counts as power.
-
-    Examples
-    --------
-    >>> t = np.arange(4096) / 1000.0
-    >>> 95.0 < excited_band(np.sin(2.0 * np.pi * 100.0 * t), 1000.0) < 105.0
-    True
-    """
-    f, power = signal.welch(u, sample_rate, nperseg=min(u.size, 2048))
-    return float(f[np.flatnonzero(power >= depth * power.max())[-1]])
-
-
-def prefilter(x: NDArray[np.float64], sample_rate: float, cutoff: float) -> NDArray[np.float64]:
-    """Return x without its mean and without what lies above the cut-off; shape (n,)."""
-    centred = np.asarray(x - x.mean())
-    if cutoff >= 0.45 * sample_rate:
-        return centred
-    sos = signal.butter(4, cutoff, fs=sample_rate, output='sos')
-    return np.asarray(signal.sosfilt(sos, centred))
-
-
-@dataclass(frozen=True, eq=False)
-class FrequencyResponse:
-    """
-    Response of an output to an input.
-
-    Attributes
-    ----------
-    frequency : ndarray, shape (n,)
-        [Hz]
-    response : ndarray of complex, shape (n,)
-        ``S_uy / S_uu``.
-    coherence : ndarray, shape (n,)
-        ``|S_uy|^2 / (S_uu S_yy)``.
-    std : ndarray, shape (n,)
-        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))``.
-    averages : int
-        Number L of segments.
-    """
-
-    frequency: NDArray[np.float64]
-    response: NDArray[np.complex128]
-    coherence: NDArray[np.float64]
-    std: NDArray[np.float64]
-    averages: int
-
-
-def _straightened(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    # what `scipy.signal.detrend` does, without a least-squares problem for every segment
-    t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
-    x = x - x.mean(axis=-1, keepdims=True)
-    return np.asarray(x - (x @ t)[..., None] / max(float(t @ t), 1.0) * t)
-
-
-def frequency_response(
-    u: NDArray[np.float64], y: NDArray[np.float64], sample_rate: float, band: float | None = None
-) -> FrequencyResponse:
-    """
-    Estimate a frequency response by Welch's method.
-
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-        Input and output; linear trends are removed segment by segment.
-    sample_rate : float
-        [Hz]
-    band : float, optional
-        Highest frequency returned [Hz].
-
-    Notes
-    -----
-    Bendat and Piersol, Random Data, 4th ed. (2010), table 9.6, doi:10.1002/9781118032428.
-    """
-    segment = int(2 ** np.floor(np.log2(max(u.size // 16, 16))))
-    segment = min(segment, 8192)
-    how: dict[str, Any] = {'fs': sample_rate, 'nperseg': segment, 'detrend': _straightened}
-    f, s_uy = signal.csd(u, y, **how)
-    _, s_uu = signal.welch(u, **how)
-    _, s_yy = signal.welch(y, **how)
-    averages = max(1, 2 * u.size // segment - 1)
-    tiny = np.finfo(float).tiny
-    coherence = np.clip(np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, tiny), 0.0, 1.0)
-    std = np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages))
-    keep = f > 0.0
-    if band is not None:
-        keep &= f <= band
-    return FrequencyResponse(
-        frequency=f[keep],
-        response=(s_uy / np.maximum(s_uu, tiny))[keep],
-        coherence=coherence[keep],
-        std=std[keep],
-        averages=averages,
-    )

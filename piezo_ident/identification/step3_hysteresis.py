@@ -31,7 +31,7 @@ from piezo_ident.identification.solvers.least_squares import (
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.play import weighted_plays
+from piezo_ident.operators.play import play_columns, weighted_plays
 from scipy.optimize import Bounds, OptimizeResult
 
 __all__ = [
@@ -153,8 +153,7 @@ def factorise(
             memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
             u = Delay(delay.samples).apply(u)
             for j in range(m):
-                r, f = thresholds[j : j + 1], memory[j : j + 1]
-                play = weighted_plays(u, r, np.ones(1), 0.0, 0.0, f)[0]
+                [play] = play_columns(u, thresholds[j : j + 1], memory[j : j + 1])
                 _average(filter_arx(G.a, G.b, play), stretches, row, block[k + j])
             _average(filter_arx(G.a, G.b, u**3), stretches, row, block[k + m])
             _average(filter_arx(G.a, G.b, u), stretches, row, block[k + m + 1])

@@ -28,14 +28,12 @@ from piezo_ident.identification.solvers.output_error import (
     OutputErrorFit,
     simulation_error,
 )
+from piezo_ident.identification.spectra import excited_band, frequency_response, prefilter
 from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_steps
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     ArxFactor,
-    excited_band,
-    frequency_response,
     instrumental_variables,
-    prefilter,
     scan_orders,
     stabilised,
 )

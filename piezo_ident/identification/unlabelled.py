@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import Excerpt, Run, true_runs
+from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
@@ -26,10 +26,10 @@ from piezo_ident.identification.results import (
     Settings,
 )
 from piezo_ident.identification.solvers.output_error import output_error, OutputErrorFit
+from piezo_ident.identification.spectra import excited_band
 from piezo_ident.identification.step1_delay import delay_from_steps, find_jumps
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
-    excited_band,
     instrumental_variables,
     stabilised,
 )
@@ -166,7 +166,7 @@ def _search_order(
     n = int(use.sum())
     still = (x - w)[use]
     static_loss = float(np.mean((still - still.mean()) ** 2))
-    part = slice(*max(true_runs(use), key=lambda run: run[1] - run[0]))
+    part = slice(*max(stretch.stretches, key=lambda run: run[1] - run[0]))
     u, y = w[part] - w[part.start], x[part] - x[part.start]
     best: tuple[float, tuple[int, int], OutputErrorFit] | None = None
     orders = [settings.order] if settings.order else list(ORDERS)

@@ -15,7 +15,7 @@ from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdent
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import three_steps
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.prepare import refuse_undriven
+from piezo_ident.identification.refusals import refuse_undriven
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run

@@ -11,12 +11,11 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.signals import triangle
 from piezo_ident.identification.prepare import (
     common_rate,
-    drive_creep,
     END_HELD,
-    refuse_closed_loop,
     runs_of,
     scaling_of,
 )
+from piezo_ident.identification.refusals import drive_creep, refuse_closed_loop
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 

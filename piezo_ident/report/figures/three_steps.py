@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.identification.results import Identification
+from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
-from piezo_ident.identification.step2_dynamics import FrequencyResponse
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy

@@ -1,0 +1,159 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Spectra of an input and its output: the band that is driven, coherence, frequency response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, signal
+
+__all__ = [
+    'FrequencyResponse',
+    'cross_spectra',
+    'excited_band',
+    'frequency_response',
+    'prefilter',
+]
+
+#: samples whose segments are transformed at once
+TOGETHER = 1 << 18
+
+
+def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3) -> float:
+    """
+    Return the highest frequency at which the input still has power [Hz].
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+    sample_rate : float
+        [Hz]
+    depth : float, optional
+        Share of the largest spectral density that counts as power.
+
+    Examples
+    --------
+    >>> t = np.arange(4096) / 1000.0
+    >>> 95.0 < excited_band(np.sin(2.0 * np.pi * 100.0 * t), 1000.0) < 105.0
+    True
+    """
+    f, power = signal.welch(u, sample_rate, nperseg=min(u.size, 2048))
+    return float(f[np.flatnonzero(power >= depth * power.max())[-1]])
+
+
+def prefilter(x: NDArray[np.float64], sample_rate: float, cutoff: float) -> NDArray[np.float64]:
+    """Return x without its mean and without what lies above the cut-off; shape (n,)."""
+    centred = np.asarray(x - x.mean())
+    if cutoff >= 0.45 * sample_rate:
+        return centred
+    sos = signal.butter(4, cutoff, fs=sample_rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, centred))
+
+
+def cross_spectra(
+    u: NDArray[np.float64], y: NDArray[np.float64], size: int, *, linear: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
+    """
+    Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+    size : int
+        Length of the Hann segments, at most n; they overlap by half.
+    linear : bool, optional
+        Take a line out of each segment (default), or else its mean.
+
+    Returns
+    -------
+    tuple of ndarray, shape (size // 2 + 1,)
+        In no unit: only ratios of them tell anything.
+    """
+    window, step = signal.get_window('hann', size), size - size // 2
+    segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]
+    s_uu, s_yy = np.zeros((2, size // 2 + 1))
+    s_uy = np.zeros(size // 2 + 1, dtype=np.complex128)
+    rows = max(1, TOGETHER // size)
+    for start in range(0, len(segments[0]), rows):
+        U, Y = (fft.rfft(window * _detrended(x[start : start + rows], linear)) for x in segments)
+        s_uu += np.sum(np.abs(U) ** 2, axis=0)
+        s_yy += np.sum(np.abs(Y) ** 2, axis=0)
+        s_uy += np.sum(np.conj(U) * Y, axis=0)
+    return s_uu, s_yy, s_uy
+
+
+def _detrended(x: NDArray[np.float64], linear: bool) -> NDArray[np.float64]:
+    # as `scipy.signal.detrend`, without a least-squares problem for each segment
+    x = x - x.mean(axis=-1, keepdims=True)
+    t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
+    slope = (x @ t)[..., None] / max(float(t @ t), 1.0)
+    return np.asarray(x - slope * t) if linear else x
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """
+    Response of an output to an input.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (n,)
+        [Hz]
+    response : ndarray of complex, shape (n,)
+        ``S_uy / S_uu``.
+    coherence : ndarray, shape (n,)
+        ``|S_uy|^2 / (S_uu S_yy)``.
+    std : ndarray, shape (n,)
+        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))``.
+    averages : int
+        Number L of segments.
+    """
+
+    frequency: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    coherence: NDArray[np.float64]
+    std: NDArray[np.float64]
+    averages: int
+
+
+def frequency_response(
+    u: NDArray[np.float64], y: NDArray[np.float64], sample_rate: float, band: float | None = None
+) -> FrequencyResponse:
+    """
+    Estimate a frequency response by Welch's method.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+        Input and output; linear trends are removed segment by segment.
+    sample_rate : float
+        [Hz]
+    band : float, optional
+        Highest frequency returned [Hz].
+
+    Notes
+    -----
+    Bendat and Piersol, Random Data, 4th ed. (2010), table 9.6, doi:10.1002/9781118032428.
+    """
+    segment = int(2 ** np.floor(np.log2(max(u.size // 16, 16))))
+    segment = min(segment, 8192)
+    f = fft.rfftfreq(segment, 1.0 / sample_rate)
+    s_uu, s_yy, s_uy = cross_spectra(u, y, segment)
+    averages = max(1, 2 * u.size // segment - 1)
+    tiny = np.finfo(float).tiny
+    coherence = np.clip(np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, tiny), 0.0, 1.0)
+    std = np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages))
+    keep = f > 0.0
+    if band is not None:
+        keep &= f <= band
+    return FrequencyResponse(
+        frequency=f[keep],
+        response=(s_uy / np.maximum(s_uu, tiny))[keep],
+        coherence=coherence[keep],
+        std=std[keep],
+        averages=averages,
+    )
