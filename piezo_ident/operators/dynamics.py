@@ -102,7 +102,11 @@ class Dynamics:
     @property
     def is_stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
-        return _is_stable(self.a)
+        return self.is_within(1.0)
+
+    def is_within(self, radius: float) -> bool:
+        """Return whether every pole is smaller than a radius, without looking for the poles."""
+        return _is_stable(self.a / radius ** np.arange(1, self.a.size + 1))
 
     def memory(self, share: float) -> int:
         """Return the samples in which the slowest pole decays to a share of its start."""

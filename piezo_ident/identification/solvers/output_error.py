@@ -129,13 +129,28 @@ def lag_products(
     """
     S = np.empty((n_x, n_z))
     S[0] = _first_row(x, z, x_at, z_at, n, n_z)
-    S[:, 0] = _first_row(z, x, z_at, x_at, n, n_x)
-    j = np.arange(1, n_z)
-    for i in range(1, n_x):
-        first = x[x_at - i] * z[z_at - j]
-        last = x[x_at + n - i] * z[z_at + n - j]
-        S[i, 1:] = S[i - 1, :-1] + (first - last)
+    if x is z and x_at == z_at and n_x == n_z:
+        S[:, 0] = S[0]
+    else:
+        S[:, 0] = _first_row(z, x, z_at, x_at, n, n_x)
+    _fill_rows(S, x, z, x_at, z_at, n)
     return S
+
+
+@kernel
+def _fill_rows(
+    S: NDArray[np.float64],
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    x_at: int,
+    z_at: int,
+    n: int,
+) -> None:
+    for i in range(1, S.shape[0]):
+        for j in range(1, S.shape[1]):
+            first = x[x_at - i] * z[z_at - j]
+            last = x[x_at + n - i] * z[z_at + n - j]
+            S[i, j] = S[i - 1, j - 1] + (first - last)
 
 
 Stretches = list[tuple[int, int]]
@@ -270,7 +285,7 @@ def output_error(
         while damping < 1e8:
             step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
             trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
-            if trial.radius < RADIUS:
+            if trial.is_within(RADIUS):
                 new_errors, new_offsets = problem.errors(trial)
                 new = problem.loss(new_errors)
                 if new < loss:
