@@ -135,9 +135,9 @@ def _check_names(names: Iterable[str], path: Path) -> None:
 def read_csv(path: Path) -> RecordTable:
     """Read a CSV file with a header line; comments may stand above it."""
     try:
-        # newline='' leaves line ends to the csv module; utf-8-sig drops a byte order mark
-        with path.open(encoding='utf-8-sig', newline='') as file:
-            return _parse_csv(csv.reader(_uncommented(file), strict=True), path)
+        # utf-8-sig drops a byte order mark
+        with path.open(encoding='utf-8-sig') as file:
+            return _parse_csv(_uncommented(file), path)
     except UnicodeDecodeError:
         raise DataError(f'{path}: no text in UTF-8; save it as CSV in UTF-8') from None
     except csv.Error as error:
@@ -171,47 +171,44 @@ def _uncommented(lines: Iterable[str]) -> Iterator[str]:
     yield from rest
 
 
-def _parse_csv(reader: Any, path: Path) -> RecordTable:
-    header = _header(reader, path)
-    numeric = {name: i for i, name in enumerate(header) if _wanted(name)}
-    label = header.index('segment') if 'segment' in header else None
-    chunks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in numeric}
+def _parse_csv(lines: Iterator[str], path: Path) -> RecordTable:
+    line, header = _header(lines, path)
+    wanted = {name: i for i, name in enumerate(header) if _wanted(name)}
+    # a name may be empty
+    dtype = np.dtype([(f'{i}', float if c in wanted else object) for i, c in enumerate(header)])
+    parts: list[Any] = []
     names: list[str] = []
     starts: list[int] = []
     n = 0
-    while True:
-        line = reader.line_num + 1
-        chunk = list(itertools.islice(reader, _ROWS))
-        if not chunk:
-            break
-        try:
-            columns = list(zip(*(r for r in chunk if r), strict=True))
-            if not columns:
-                continue
-            if len(columns) != len(header):
-                raise ValueError
-            for name, i in numeric.items():
-                column = map(float, columns[i])
-                chunks[name].append(np.fromiter(column, np.float64, len(columns[i])))
-        except ValueError:
-            raise _culprit(chunk, line, header, numeric, path) from None
-        if label is not None:
-            new, at = label_runs(map(str.strip, columns[label]))
-            names += new
-            starts += [n + i for i in at]
-        n += len(columns[0])
+    while chunk := list(itertools.islice(lines, _ROWS)):
+        if any(map(str.strip, chunk)):
+            try:
+                part = np.loadtxt(
+                    chunk, dtype, delimiter=',', comments=None, quotechar='"', ndmin=1
+                )
+            except ValueError:
+                raise _culprit(chunk, line + 1, header, path) from None
+            if 'segment' in header:
+                new, at = label_runs(map(str.strip, part[f'{header.index("segment")}']))
+                names += new
+                starts += [n + i for i in at]
+            parts.append({name: part[f'{i}'].copy() for name, i in wanted.items()})
+            n += part.size
+        line += len(chunk)
     if not n:
         raise DataError(f'{path}: no rows below the header; record some samples')
     return RecordTable(
-        {name: np.concatenate(parts) for name, parts in chunks.items()},
+        {name: np.concatenate([part[name] for part in parts]) for name in wanted},
         names,
         starts,
-        tuple(c for c in header if c and c not in numeric and c != 'segment'),
+        tuple(c for c in header if c and c not in wanted and c != 'segment'),
     )
 
 
-def _header(reader: Any, path: Path) -> list[str]:
-    header = [c.strip() for c in next((r for r in reader if r), [])]
+def _header(lines: Iterator[str], path: Path) -> tuple[int, list[str]]:
+    """Return the number of the header line, and the names in it."""
+    number, text = next(((i, x) for i, x in enumerate(lines, 1) if x.strip()), (0, ''))
+    header = [c.strip() for c in next(csv.reader([text], strict=True), [])]
     if not header:
         raise DataError(f'{path}: empty file; write a header line t,v,y and the samples below it')
     for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
@@ -223,7 +220,7 @@ def _header(reader: Any, path: Path) -> list[str]:
             'the numbers'
         )
     _check_names(header, path)
-    return header
+    return number, header
 
 
 def _is_number(text: str) -> bool:
@@ -234,21 +231,21 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _culprit(
-    chunk: list[list[str]], line: int, header: list[str], numeric: Mapping[str, int], path: Path
-) -> DataError:
-    """Return the error for the first row of a chunk that cannot be read."""
-    for number, row in enumerate(chunk, start=line):
-        if row and len(row) != len(header):
+def _culprit(chunk: list[str], line: int, header: list[str], path: Path) -> DataError:
+    """Return the error for the first of some lines that cannot be read."""
+    reader = csv.reader(chunk, strict=True)
+    for row in filter(None, reader):
+        at = f'{path}: line {line + reader.line_num - 1}'
+        if len(row) != len(header):
             return DataError(
-                f'{path}: line {number} has {len(row)} columns, the header has {len(header)}; '
+                f'{at} has {len(row)} columns, the header has {len(header)}; '
                 + (_POINTS if _torn_at_commas(row, header) else 'mend or delete the line')
             )
-        for name, i in numeric.items():
-            if row and not _is_number(row[i]):
-                comma = re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', row[i])
+        for name, text in zip(header, row, strict=True):
+            if _wanted(name) and not _is_number(text):
+                comma = re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', text)
                 return DataError(
-                    f'{path}: line {number}, column {name}: {row[i][:40]!r} is no number; '
+                    f'{at}, column {name}: {text[:40]!r} is no number; '
                     + (_POINTS if comma else 'mend or delete the line')
                 )
     return DataError(f'{path}: unreadable rows from line {line}; save it again')
