@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 import math
 import reprlib
 from typing import Any
@@ -114,33 +114,64 @@ class Part:
     name: str = ''
 
 
+Maker = Callable[[Setting, Mapping[str, Any]], list[Part]]
+
+
 @dataclass(frozen=True)
 class Signal:
     """A signal of the catalogue: the kind of its segments, its options and its maker."""
 
     kind: str
     options: Mapping[str, Option]
-    make: Callable[[Setting, Mapping[str, Any]], list[Part]]
+    make: Maker
+
+
+#: every signal that a program may use
+SIGNALS: dict[str, Signal] = {}
+
+_LEVEL = Option('V')
+_SIZE = Option('V', positive=True)
+_TIME = Option('s', positive=True)
+_FREQUENCY = Option('Hz', positive=True)
+_SLOPE = Option('V/s', default=excitation.PAPER_SLOPE, positive=True)
+_COUNT = Option('1', whole=True)
+
+
+def _signal(name: str, kind: str = '', **options: Option) -> Callable[[Maker], Maker]:
+    """Enter a maker into the catalogue; `kind` is the name unless told."""
+
+    def enter(make: Maker) -> Maker:
+        SIGNALS[name] = Signal(kind or name, options, make)
+        return make
+
+    return enter
 
 
 def _periodic(v: NDArray[np.float64], name: str = '') -> list[Part]:
     return [Part(v, float(v[0]), name)]
 
 
+@_signal('idle', duration=_TIME)
 def _idle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    return _periodic(excitation.constant(s.rest, o['duration'], s.sample_rate))
+    return _periodic(excitation.staircase([s.rest], [o['duration']], s.sample_rate))
 
 
+@_signal('hold', level=_LEVEL, duration=_TIME)
 def _hold(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    v = excitation.constant(o['level'], o['duration'], s.sample_rate)
+    v = excitation.staircase([o['level']], [o['duration']], s.sample_rate)
     return _periodic(v, f'{o["level"]:g}V')
 
 
+@_signal('step', bias=_LEVEL, size=_SIZE, hold=_TIME, count=_COUNT)
 def _step(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    v = excitation.steps(o['bias'], o['size'], o['hold'], o['count'], s.sample_rate)
+    # before as many levels are listed
+    excitation.sample_count(o['hold'] * (o['count'] + 1), s.sample_rate)
+    levels = [o['bias'] + (k % 2 - 0.5) * o['size'] for k in range(o['count'] + 1)]
+    v = excitation.staircase(levels, [o['hold']] * len(levels), s.sample_rate)
     return [Part(v, float(v[-1]))]
 
 
+@_signal('staircase', levels=Option('V', many=True), hold=Option('s', many=True, positive=True))
 def _staircase(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     levels, hold = o['levels'], o['hold']
     if len(hold) == 1:
@@ -153,28 +184,37 @@ def _staircase(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     return [Part(v, float(v[-1]))]
 
 
+@_signal(
+    'settle',
+    bias=_LEVEL,
+    amplitude=_SIZE,
+    cycles=replace(_COUNT, default=20),
+    frequency=replace(_FREQUENCY, default=20.0),
+)
 def _settle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    return _periodic(
-        excitation.settling_sweep(
-            o['bias'], o['amplitude'], o['cycles'], o['frequency'], s.sample_rate
-        )
-    )
+    return _periodic(excitation.settling_sweep(**o, sample_rate=s.sample_rate))
 
 
+@_signal(
+    'noise',
+    bias=_LEVEL,
+    amplitude=_SIZE,
+    cutoff=_FREQUENCY,
+    duration=_TIME,
+    crest=Option('1', default=2.5, positive=True),
+)
 def _noise(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    v = excitation.noise(
-        o['bias'],
-        o['amplitude'],
-        o['cutoff'],
-        o['duration'],
-        s.sample_rate,
-        s.rng,
-        crest=o['crest'],
-    )
     # the noise fades to its bias, which is where it goes on
-    return [Part(v, o['bias'])]
+    return [Part(excitation.noise(**o, sample_rate=s.sample_rate, rng=s.rng), o['bias'])]
 
 
+@_signal(
+    'triangle',
+    preset=Option('', default='range', choices=('range', 'paper')),
+    peaks=Option('V', default=None, many=True),
+    base=Option('V', default=None),
+    slope=_SLOPE,
+)
 def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     low, high = s.limits
     if o['preset'] == 'paper':
@@ -194,24 +234,53 @@ def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     return _periodic(excitation.triangle(peaks, base, slope, s.sample_rate), name)
 
 
+def _about(bias: float, sizes: Iterable[float]) -> list[float]:
+    """Return corners on both sides of a bias in turn, from it and back to it."""
+    return [bias, *(x for a in sizes for x in (bias + a, bias - a)), bias]
+
+
+@_signal(
+    'decaying_triangle', 'triangle', bias=_LEVEL, amplitude=_SIZE, cycles=_COUNT, slope=_SLOPE
+)
 def _decaying_triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    v = excitation.decaying_triangle(
-        o['bias'], o['amplitude'], o['cycles'], o['slope'], s.sample_rate
-    )
-    return _periodic(v, 'decaying')
-
-
-def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     # before as many corners are listed; each leg has a sample
+    excitation.sample_count(2 * o['cycles'] / s.sample_rate, s.sample_rate)
+    sizes = (o['amplitude'] * (1.0 - k / o['cycles']) for k in range(o['cycles']))
+    levels = _about(o['bias'], sizes)
+    return _periodic(excitation.corners(levels, o['slope'], s.sample_rate), 'decaying')
+
+
+@_signal(
+    'minor_loops',
+    'triangle',
+    biases=Option('V', many=True),
+    amplitude=_SIZE,
+    cycles=_COUNT,
+    slope=_SLOPE,
+)
+def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     excitation.sample_count(2 * len(o['biases']) * o['cycles'] / s.sample_rate, s.sample_rate)
+    return [
+        part
+        for bias in o['biases']
+        for part in _periodic(
+            excitation.corners(
+                _about(bias, [o['amplitude']] * o['cycles']), o['slope'], s.sample_rate
+            ),
+            f'minor-{bias:g}V',
+        )
+    ]
 
-    def loops(bias: float) -> NDArray[np.float64]:
-        levels = [bias, *[bias + o['amplitude'], bias - o['amplitude']] * o['cycles'], bias]
-        return excitation.corners(levels, o['slope'], s.sample_rate)
 
-    return [part for b in o['biases'] for part in _periodic(loops(b), f'minor-{b:g}V')]
-
-
+@_signal(
+    'sine',
+    bias=_LEVEL,
+    amplitude=_SIZE,
+    frequency=_FREQUENCY,
+    periods=replace(_COUNT, default=None),
+    duration=replace(_TIME, default=None),
+    phase=Option('rad', default=0.0),
+)
 def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     f = o['frequency']
     if (o['periods'] is None) == (o['duration'] is None):
@@ -224,6 +293,16 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     return _periodic(v, f'{f:g}Hz')
 
 
+@_signal(
+    'multisine',
+    bias=_LEVEL,
+    amplitude=_SIZE,
+    lowest=_FREQUENCY,
+    highest=_FREQUENCY,
+    period=_TIME,
+    periods=_COUNT,
+    realisations=replace(_COUNT, default=1),
+)
 def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     period, count = o['period'], o['realisations']
     # all of it, before any is made
@@ -243,100 +322,3 @@ def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
         )
         parts += _periodic(v, str(number) if count > 1 else '')
     return parts
-
-
-_LEVEL = Option('V')
-_SIZE = Option('V', positive=True)
-_TIME = Option('s', positive=True)
-_FREQUENCY = Option('Hz', positive=True)
-_SLOPE = Option('V/s', default=excitation.PAPER_SLOPE, positive=True)
-
-
-def _count(default: Any = REQUIRED) -> Option:
-    return Option('1', default=default, whole=True)
-
-
-#: every signal that a program may use
-SIGNALS: dict[str, Signal] = {
-    'idle': Signal('idle', {'duration': _TIME}, _idle),
-    'hold': Signal('hold', {'level': _LEVEL, 'duration': _TIME}, _hold),
-    'step': Signal(
-        'step', {'bias': _LEVEL, 'size': _SIZE, 'hold': _TIME, 'count': _count()}, _step
-    ),
-    'staircase': Signal(
-        'staircase',
-        {'levels': Option('V', many=True), 'hold': Option('s', many=True, positive=True)},
-        _staircase,
-    ),
-    'settle': Signal(
-        'settle',
-        {
-            'bias': _LEVEL,
-            'amplitude': _SIZE,
-            'cycles': _count(20),
-            'frequency': Option('Hz', default=20.0, positive=True),
-        },
-        _settle,
-    ),
-    'noise': Signal(
-        'noise',
-        {
-            'bias': _LEVEL,
-            'amplitude': _SIZE,
-            'cutoff': _FREQUENCY,
-            'duration': _TIME,
-            'crest': Option('1', default=2.5, positive=True),
-        },
-        _noise,
-    ),
-    'triangle': Signal(
-        'triangle',
-        {
-            'preset': Option('', default='range', choices=('range', 'paper')),
-            'peaks': Option('V', default=None, many=True),
-            'base': Option('V', default=None),
-            'slope': _SLOPE,
-        },
-        _triangle,
-    ),
-    'decaying_triangle': Signal(
-        'triangle',
-        {'bias': _LEVEL, 'amplitude': _SIZE, 'cycles': _count(), 'slope': _SLOPE},
-        _decaying_triangle,
-    ),
-    'minor_loops': Signal(
-        'triangle',
-        {
-            'biases': Option('V', many=True),
-            'amplitude': _SIZE,
-            'cycles': _count(),
-            'slope': _SLOPE,
-        },
-        _minor_loops,
-    ),
-    'sine': Signal(
-        'sine',
-        {
-            'bias': _LEVEL,
-            'amplitude': _SIZE,
-            'frequency': _FREQUENCY,
-            'periods': _count(None),
-            'duration': Option('s', default=None, positive=True),
-            'phase': Option('rad', default=0.0),
-        },
-        _sine,
-    ),
-    'multisine': Signal(
-        'multisine',
-        {
-            'bias': _LEVEL,
-            'amplitude': _SIZE,
-            'lowest': _FREQUENCY,
-            'highest': _FREQUENCY,
-            'period': _TIME,
-            'periods': _count(),
-            'realisations': _count(1),
-        },
-        _multisine,
-    ),
-}

@@ -21,10 +21,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 __all__ = [
     'PAPER_PEAKS',
     'PAPER_SLOPE',
-    'constant',
     'corners',
-    'crest_factor',
-    'decaying_triangle',
     'multisine',
     'noise',
     'odd_lines',
@@ -33,7 +30,6 @@ __all__ = [
     'settling_sweep',
     'sine',
     'staircase',
-    'steps',
     'triangle',
 ]
 
@@ -68,16 +64,6 @@ def _below_nyquist(frequency: float, sample_rate: float) -> None:
             f'{frequency:g} Hz does not lie between 0 and half the sampling rate '
             f'({sample_rate / 2:g} Hz)'
         )
-
-
-def crest_factor(x: NDArray[np.float64]) -> float:
-    """Return the largest magnitude over the rms of a signal."""
-    return float(np.abs(x).max() / np.sqrt(np.mean(x**2)))
-
-
-def constant(level: float, duration: float, sample_rate: float) -> NDArray[np.float64]:
-    """Return a level held for a duration [s]."""
-    return np.full(sample_count(duration, sample_rate), float(level))
 
 
 def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[np.float64]:
@@ -118,22 +104,6 @@ def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDA
     n = [sample_count(t, sample_rate) for t in hold]
     sample_count(sum(n) / sample_rate, sample_rate)
     return np.repeat(np.asarray(levels, dtype=np.float64), n)
-
-
-def steps(
-    bias: float, size: float, hold: float, count: int, sample_rate: float
-) -> NDArray[np.float64]:
-    """
-    Return a train of `count` steps, up and down in turn, about a bias.
-
-    The train begins on the lower level and is held for `hold` seconds on each.
-    """
-    # before as many levels are listed
-    sample_count(hold, sample_rate)
-    sample_count(hold * (count + 1), sample_rate)
-    low, high = bias - size / 2, bias + size / 2
-    levels = [low if k % 2 == 0 else high for k in range(count + 1)]
-    return staircase(levels, [hold] * len(levels), sample_rate)
 
 
 def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np.float64]:
@@ -177,18 +147,6 @@ def triangle(
     for peak in peaks:
         levels += [peak, base]
     return corners(levels, slope, sample_rate)
-
-
-def decaying_triangle(
-    bias: float, amplitude: float, cycles: int, slope: float, sample_rate: float
-) -> NDArray[np.float64]:
-    """Return triangles about a bias whose amplitude shrinks linearly to nothing."""
-    sample_count(2 * cycles / sample_rate, sample_rate)
-    levels = [bias]
-    for k in range(cycles):
-        size = amplitude * (1.0 - k / cycles)
-        levels += [bias + size, bias - size]
-    return corners([*levels, bias], slope, sample_rate)
 
 
 def settling_sweep(
