@@ -9,11 +9,9 @@ A thread that computes would share the interpreter lock with the thread that cap
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable
 import contextlib
 import copyreg
-import io
 import multiprocessing
 from multiprocessing.connection import Connection
 import os
@@ -39,34 +37,20 @@ Job = Callable[[Tick], Any]
 EVERY, GRACE = 0.02, 0.8
 
 
-def _array(typecode: str, memory: bytes) -> array[Any]:
-    copy = array(typecode)
-    copy.frombytes(memory)
-    return copy
-
-
 def _view(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
-    # the class itself is pickled under a name that does not exist
     return MappingProxyType(mapping)
 
 
-class _Pickler(pickle.Pickler):
-    """Leaves the memory of arrays to `buffer_callback`."""
-
-    dispatch_table = {  # noqa: RUF012
-        **copyreg.dispatch_table,
-        array: lambda x: (_array, (x.typecode, pickle.PickleBuffer(x))),
-        MappingProxyType: lambda x: (_view, (dict(x),)),
-    }
+# the class itself is pickled under a name that does not exist
+copyreg.pickle(MappingProxyType, lambda x: (_view, (dict(x),)))
 
 
 def _send(channel: Connection, value: Any) -> None:
     # samples go beside the pickle: the interpreter lock is free while they are written
     buffers: list[pickle.PickleBuffer] = []
-    text = io.BytesIO()
-    _Pickler(text, protocol=5, buffer_callback=buffers.append).dump(value)
+    text = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
     channel.send(len(buffers))
-    channel.send_bytes(text.getbuffer())
+    channel.send_bytes(text)
     for buffer in buffers:
         channel.send_bytes(buffer.raw())
 

@@ -21,15 +21,15 @@ from piezo_ident.record.blocks import Samples
 
 __all__ = ['SPOOLED', 'BlockStream', 'LossCount']
 
-#: numbers in a chunk of a stream
-CHUNK = 1 << 17
+#: samples in a chunk of a stream
+CHUNK = 1 << 16
 #: samples that a spooled stream keeps in memory
 SPOOLED = 1 << 21
 
 
 class BlockStream:
     """
-    All blocks of one topic so far, in flat buffers that grow chunk by chunk.
+    All blocks of one topic so far; nothing that was added ever changes, so copies share it.
 
     Parameters
     ----------
@@ -49,35 +49,38 @@ class BlockStream:
     """
 
     def __init__(self, *, spooled: bool = False) -> None:
-        self._files: list[BinaryIO] = []
-        self._spooled = spooled
         self.n = 0
-        self._chunks = [array('d')]  # only the last one grows, so that copies share the others
-        self._sizes = array('q')
-        self._arrivals = array('q')
+        self._spooled = spooled
+        self._files: list[BinaryIO] = []
+        # rows of (t, value): of many blocks each, and the newest blocks one by one
+        self._chunks: list[NDArray[np.float64]] = []
+        self._newest: list[NDArray[np.float64]] = []
+        self._rows = 0  # in the newest blocks
+        self._sizes, self._arrivals = array('q'), array('q')
         self._segments: list[str] = []
 
     def append(self, samples: Samples, arrival: int) -> None:
         """Add a block that arrived at a time [ns] of a clock that all streams share."""
-        rows = np.column_stack([samples.t, samples.values])
-        if len(self._chunks[-1]) >= CHUNK:
-            if self._spooled and len(self._chunks) * CHUNK >= 2 * SPOOLED:
-                self._spool()
-            else:
-                self._chunks.append(array('d'))
-        self._chunks[-1].frombytes(rows.tobytes())
-        self._sizes.append(samples.t.size)
+        self._newest.append(np.column_stack([samples.t, samples.values]))
         self.n += samples.t.size
+        self._sizes.append(samples.t.size)
         self._arrivals.append(arrival)
         # one string for all blocks of a segment, not one a block
         last = self._segments[-1] if self._segments else ''
         self._segments.append(last if last == samples.segment else samples.segment)
+        self._rows += samples.t.size
+        if self._rows >= CHUNK:
+            self._chunks.append(np.concatenate(self._newest))
+            self._newest, self._rows = [], 0
+            if self._spooled and sum(map(len, self._chunks)) >= SPOOLED:
+                self._spool()
 
     def copy(self) -> BlockStream:
-        """Return the stream as it is now, without copying what no longer changes."""
+        """Return the stream as it is now."""
         other = BlockStream()
         other.n = self.n
-        other._chunks = [*self._chunks[:-1], self._chunks[-1][:]]
+        other._chunks, other._newest = self._chunks[:], self._newest[:]
+        other._rows = self._rows
         other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
         other._segments = self._segments[:]
         return other
@@ -86,11 +89,13 @@ class BlockStream:
         """Forget the oldest blocks, at least so many samples; return how many it were."""
         ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
         blocks = int(np.searchsorted(ends, n)) + 1 if n > 0 else 0
-        gone = int(ends[:blocks].max(initial=0))
-        left = 2 * gone
-        while left and len(self._chunks) > 1 and left >= len(self._chunks[0]):
-            left -= len(self._chunks.pop(0))
-        self._chunks[0] = self._chunks[0][left:]
+        gone = left = int(ends[:blocks].max(initial=0))
+        parts = [*self._chunks, *self._newest]
+        while parts and left >= len(parts[0]):
+            left -= len(parts.pop(0))
+        if left:
+            parts[0] = parts[0][left:]
+        self._chunks, self._newest, self._rows = parts, [], 0
         self.n -= gone
         del self._sizes[:blocks], self._arrivals[:blocks], self._segments[:blocks]
         return gone
@@ -114,8 +119,7 @@ class BlockStream:
         try:
             if not self._files:
                 self._files = [tempfile.TemporaryFile(prefix='piezo_ident_') for _ in range(2)]
-            for chunk in self._chunks:
-                rows = np.frombuffer(chunk).reshape(-1, 2)
+            for rows in (*self._chunks, *self._newest):
                 for file, column in zip(self._files, rows.T, strict=True):
                     file.write(np.ascontiguousarray(column).data)
                     file.flush()
@@ -124,20 +128,15 @@ class BlockStream:
                 f'no room for a long record in {tempfile.gettempdir()} ({error.strerror}); make '
                 'room, or set TMPDIR to a place with room'
             ) from None
-        self._chunks = [array('d')]
+        self._chunks, self._newest, self._rows = [], [], 0
 
     def _column(self, k: int) -> NDArray[np.float64]:
         if self._files:
-            if self._chunks[0]:
-                self._spool()
+            self._spool()
             # the map keeps the file, which has no name, until nobody holds the column
             return np.asarray(np.memmap(self._files[k], np.float64, 'r', shape=(self.n,)))
-        column, at = np.empty(self.n), 0
-        for chunk in self._chunks:
-            part = np.frombuffer(chunk, dtype=np.float64)[k::2]
-            column[at : at + part.size] = part
-            at += part.size
-        return column
+        parts = [rows[:, k] for rows in (*self._chunks, *self._newest)]
+        return np.concatenate(parts) if parts else np.empty(0)
 
     @property
     def arrivals(self) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ RATE, N = 20_000.0, 15_000
 @pytest.fixture
 def bag(tmp_path, monkeypatch):
     """Return a bag that is long beside the samples that stay in memory."""
-    monkeypatch.setattr(stream, 'CHUNK', 1000)
+    monkeypatch.setattr(stream, 'CHUNK', 500)
     monkeypatch.setattr(stream, 'SPOOLED', 2000)
     stage = SimulatedStage.load('paper').model
     pieces = []
