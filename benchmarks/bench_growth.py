@@ -24,10 +24,17 @@ from pathlib import Path
 import shutil
 import sys
 import tempfile
-import time
 
-from growth_of_bags import BAG_BYTES, BAG_MEASURES, Measure, paper, RATE, sine, SPARE
-from growth_of_fits import base_model, EFFECT, FIT_MEASURES, labelled, to_diagnose
+from growth_measures import (
+    base_model,
+    EFFECT,
+    labelled,
+    MEASURES,
+    paper,
+    RATE,
+    sine,
+    to_diagnose,
+)
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -36,49 +43,38 @@ from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders
 from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
-from side_by_side import last_line, markdown, peak_memory, seconds, take_turns, versions
+from side_by_side import last_line, markdown, peak_memory, seconds, show, take_turns, versions
 
 #: points at the large end through which the exponent is drawn
 LARGE_END = 3
 
-# -- what a child measures: (size, folder) -> seconds, number of samples -----------------------
-
-
-def predict(size: float, folder: Path) -> Measure:
-    """Predict a record that is in memory."""
-    model = paper()
-    model.predict_piece(sine(1000, model))
-    piece = sine(round(size * RATE), model)
-    runs = 5 if piece.n < 5e6 else 2
-    turn = take_turns({'': lambda k: model.predict_piece(piece)}, runs)['']
-    return turn.median, piece.n
-
-
-def stream(size: float, folder: Path) -> Measure:
-    """Predict second by second and forget what is done."""
-    model = paper()
-    v = sine(int(RATE), model).v
-    model.stream().process(v)
-    running = model.stream()
-    start = time.perf_counter()
-    for _ in range(round(size)):
-        running.process(v)
-    return time.perf_counter() - start, round(size) * v.size
-
-
-def nothing(size: float, folder: Path) -> Measure:
-    """Import all, and predict a little: the memory that is there before any record."""
-    paper().stream().process(np.zeros(10))
-    return 0.0, 0
-
-
-MEASURES: dict[str, Callable[[float, Path], Measure]] = {
-    'nothing': nothing,
-    'predict': predict,
-    'stream': stream,
-    **BAG_MEASURES,
-    **FIT_MEASURES,
+#: bytes that a second of voltage and displacement takes in a bag, and how much must stay free
+BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
+HOUR = 3600.0
+#: title, lengths [s], and those of a quick run, of each measure
+PLANS: dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]] = {
+    'stream': (
+        'Prediction second by second: constant memory',
+        (10, 60, 600, HOUR),
+        (10, 60),
+    ),
+    'predict': ('Prediction of a record in memory', (10, 30, 60, 120, 300, 600), (10, 60)),
+    'write': ('Writing a bag', (10, 60, 600, HOUR), (10, 60)),
+    'read': ('Reading a bag into a record', (10, 60, 600, HOUR), (10, 60)),
+    'convert': (
+        'Converting a bag to npz, its samples in memory maps',
+        (10, 60, 600, HOUR),
+        (10,),
+    ),
+    'predict_bag': (
+        'Predicting a bag to npz, its samples in memory maps',
+        (10, 60, 600, HOUR),
+        (10, 60),
+    ),
+    'identify': ('Identification, the three steps', (15.5, 31, 62, 124, HOUR), (15.5,)),
+    'diagnose': (f'Diagnosis, {len(catalogue())} candidates', (15, 30, 60, 120), (17,)),
 }
+OF_BAGS = ('write', 'read', 'convert', 'predict_bag')
 
 
 def measured(kind: str, size: float, folder: Path) -> tuple[float, float, float]:
@@ -86,9 +82,6 @@ def measured(kind: str, size: float, folder: Path) -> tuple[float, float, float]
     command = [sys.executable, str(Path(__file__).resolve()), '--measure', kind, f'{size:g}']
     took, n, peak = json.loads(last_line(f'{kind} of {size:g} s', [*command, str(folder)]))
     return took, n, peak
-
-
-# -- tables --------------------------------------------------------------------------------------
 
 
 def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
@@ -130,54 +123,25 @@ HEADS = ('record', 'samples', 'time', 'a sample', 'peak memory')
 
 def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
     """Return the sections over the record length."""
-    hour = 3600.0
-    plans: dict[str, tuple[str, Sequence[float]]] = {
-        'stream': (
-            'Prediction second by second: constant memory',
-            (10, 60) if quick else (10, 60, 600, hour),
-        ),
-        'predict': (
-            'Prediction of a record in memory',
-            (10, 60) if quick else (10, 30, 60, 120, 300, 600),
-        ),
-        'write': ('Writing a bag', (10, 60) if quick else (10, 60, 600, hour)),
-        'read': ('Reading a bag into a record', (10, 60) if quick else (10, 60, 600, hour)),
-        'convert': (
-            'Converting a bag to npz, its samples in memory maps',
-            (10,) if quick else (10, 60, 600, hour),
-        ),
-        'predict_bag': (
-            'Predicting a bag to npz, its samples in memory maps',
-            (10, 60) if quick else (10, 60, 600, hour),
-        ),
-        'identify': (
-            'Identification, the three steps',
-            (15.5,) if quick else (15.5, 31, 62, 124, hour),
-        ),
-        'diagnose': (
-            f'Diagnosis, {len(catalogue())} candidates',
-            (17,) if quick else (15, 30, 60, 120),
-        ),
-    }
     base = measured('nothing', 0.0, folder)[2]
-    text, said = [], []
-    for kind, (title, sizes) in plans.items():
-        if kind in BAG_MEASURES and hour in sizes:
-            # the hour as a bag takes some gigabytes for a moment, and what is made of it too
-            if shutil.disk_usage(folder).free < 4 * hour * BAG_BYTES + SPARE:
-                sizes = tuple(size for size in sizes if size < hour)
-                said.append(f'Too little room on the disk for a bag of 1 h ({title.lower()}).')
-        rows, line = along_the_record(kind, sizes, folder)
+    text, notes = [], []
+    # the hour as a bag takes some gigabytes for a moment, and what is made of it too
+    has_room = shutil.disk_usage(folder).free >= 4 * HOUR * BAG_BYTES + SPARE
+    for kind, (title, sizes, few) in PLANS.items():
+        lengths = few if quick else sizes
+        if kind in OF_BAGS and HOUR in lengths and not has_room:
+            lengths = lengths[:-1]
+            notes.append(f'Too little room on the disk for a bag of 1 h ({title.lower()}).')
+        rows, line = along_the_record(kind, lengths, folder)
         text += [f'**{title}.** {line}'.strip(), '', markdown(HEADS, rows), '']
-        if kind == 'predict_bag':
-            for path in folder.glob('bag_*'):
-                shutil.rmtree(path)
+    for path in folder.glob('bag_*'):
+        shutil.rmtree(path)
     intro = (
         f'At {RATE / 1000:g} kHz, each length in a process of its own. The exponent is the slope '
         'of log time over log length through the '
         f'{LARGE_END} longest. A process that does next to nothing peaks at {base:.0f} MiB.'
     )
-    return [('Growth with the record', '\n'.join([intro, '', *text, *said]))]
+    return [('Growth with the record', '\n'.join([intro, '', *text, *notes]))]
 
 
 def table_of(what: str, sizes: Sequence[int], columns: dict[str, list[float]]) -> str:
@@ -212,7 +176,7 @@ def of_thresholds(quick: bool) -> str:
         f'weights from {triangle.stop - triangle.start:,} samples': [],
     }
     predictions, weights = columns.values()
-    long = sine(n, model)
+    long = sine(n)
     for m in sizes:
         r = np.arange(1, m + 1) / (m + 1)
         h = Hysteresis(r, np.full(m, 1.0 / m), 0.0, 0.5)
@@ -279,16 +243,10 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     return [*found, ('Growth with thresholds, orders and candidates', '\n\n'.join(parts))]
 
 
-def main(argv: Sequence[str]) -> None:
-    """Measure one thing as JSON, or print the sections."""
-    if argv[:1] == ['--measure']:
-        kind, size, folder = argv[1:4]
+if __name__ == '__main__':
+    if sys.argv[1:2] == ['--measure']:
+        kind, size, folder = sys.argv[2:5]
         took, n = MEASURES[kind](float(size), Path(folder))
         print(json.dumps([took, n, peak_memory()]))
-        return
-    for title, text in sections('--quick' in argv):
-        print(f'## {title}\n\n{text}\n')
-
-
-if __name__ == '__main__':
-    main(sys.argv[1:])
+    else:
+        show(sections)

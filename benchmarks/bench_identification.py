@@ -20,7 +20,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable
 from pathlib import Path
-import sys
 import time
 
 import numpy as np
@@ -39,7 +38,7 @@ from piezo_ident.identification.three_steps import first_step, second_step, tria
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.record.record import Record
-from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, Turn
 
 RUNS = 5
 #: what the three steps may take [s]
@@ -161,12 +160,5 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     return [whole(record, runs), by_steps(record, runs)]
 
 
-def main() -> None:
-    """Print the tables."""
-    print(versions('numpy', 'scipy', 'numba'))
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'\n### {title}\n\n{text}')
-
-
 if __name__ == '__main__':
-    main()
+    show(sections)

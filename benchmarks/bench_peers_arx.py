@@ -23,7 +23,6 @@ import contextlib
 from dataclasses import dataclass
 from functools import cache
 import io
-import sys
 from typing import Any
 import warnings
 
@@ -40,7 +39,7 @@ from piezo_ident.identification.step2_dynamics import (
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Dynamics
 from scipy.signal import lfilter
-from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, Turn, versions
 
 #: delay of the stage [samples], which all are told
 DELAY = 3
@@ -296,5 +295,4 @@ time.
 
 
 if __name__ == '__main__':
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'## {title}\n\n{text}\n')
+    show(sections)

@@ -14,7 +14,6 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable
-import sys
 import warnings
 
 import numpy as np
@@ -22,7 +21,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
-from side_by_side import markdown, ratio, seconds, take_turns, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, versions
 
 RATE = 20_000.0
 
@@ -89,5 +88,4 @@ same recursion in C, and is all that is needed where there is no hysteresis.
 
 
 if __name__ == '__main__':
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'## {title}\n\n{text}\n')
+    show(sections)

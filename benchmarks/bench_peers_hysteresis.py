@@ -23,11 +23,9 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 import itertools
 from pathlib import Path
-import sys
 import time
 from typing import Any
 import warnings
@@ -38,10 +36,10 @@ import piezo_ident as pi
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Record
-from side_by_side import markdown, seconds, take_turns, Turn, versions
+from side_by_side import markdown, seconds, show, take_turns, versions
 
 DATA = Path(
     os.environ.get('PIEZO_IDENT_DATA', Path(__file__).resolve().parents[2] / 'shared' / 'data')
@@ -140,9 +138,7 @@ class Narx:
         """Return a free run from the first samples of averaged data."""
         return np.ravel(model.predict(X=self._inputs(data), y=data.y[:, None]))
 
-    own = run
-
-    def said(self, model: Any) -> str:
+    def text(self, model: Any) -> str:
         """Return the setting in words."""
         return (
             f'inputs {self.inputs}; degree {self.degree}, lags to {self.lag}, {self.terms} terms, '
@@ -162,14 +158,12 @@ def _slope(c, powers, y, v, s):
 
 @njit(cache=True)
 def _integrate(c, powers, v, s, dt, first, out):
+    """Integrate by the midpoint method."""
     y = out[first]
     for k in range(first, v.size - 1):
+        middle = y + 0.5 * dt * _slope(c, powers, y, v[k], s[k])
         vm, sm = 0.5 * (v[k] + v[k + 1]), 0.5 * (s[k] + s[k + 1])
-        k1 = _slope(c, powers, y, v[k], s[k])
-        k2 = _slope(c, powers, y + 0.5 * dt * k1, vm, sm)
-        k3 = _slope(c, powers, y + 0.5 * dt * k2, vm, sm)
-        k4 = _slope(c, powers, y + dt * k3, v[k + 1], s[k + 1])
-        y += dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        y += dt * _slope(c, powers, middle, vm, sm)
         if not abs(y) < AWAY:
             out[k + 1 :] = np.inf
             break
@@ -239,38 +233,14 @@ class Sindy:
         return model.fit(data.y[:, None], t=1.0 / data.rate, u=u)
 
     def run(self, model: Any, data: Motion) -> Array:
-        """Return a free run of the equation found, by Runge and Kutta's method, compiled."""
+        """Return a free run of the equation found, integrated by a compiled loop."""
         out = np.full(data.v.size, float(data.y[:START].mean()))
         speed = np.gradient(data.v) * data.rate
         coefficients = np.ravel(model.coefficients()).reshape(2, -1)
         _integrate(coefficients, self.powers, data.v, speed, 1.0 / data.rate, START // 2, out)
         return out
 
-    def own(self, model: Any, data: Motion) -> Array:
-        """Return a free run by pysindy's own simulation."""
-        first = START // 2
-        t = np.arange(data.v.size) / data.rate
-        speed = np.gradient(data.v) * data.rate
-
-        def u(at: float) -> Array:
-            s = np.interp(at, t, speed)
-            return np.array([np.interp(at, t, data.v), s, abs(s)])
-
-        y = model.simulate(
-            [data.y[:START].mean()],
-            t[first:],
-            u=u,
-            # a step that is left to grow while the stage rests would jump over a motion
-            integrator_kws={
-                'method': 'LSODA',
-                'rtol': 1e-6,
-                'atol': 1e-6,
-                'max_step': 5.0 / data.rate,
-            },
-        )
-        return np.concatenate([np.full(first, float(y[0, 0])), np.ravel(y)])
-
-    def said(self, model: Any) -> str:
+    def text(self, model: Any) -> str:
         """Return the setting in words."""
         return (
             f'degree {self.degree}, threshold {self.threshold:g}, ridge {self.alpha:g}, '
@@ -286,11 +256,6 @@ def error(y_hat: Array, y: Array) -> float:
     """Return the error of normalised signals [% of stroke], infinite when one has run away."""
     e = y_hat - y
     return 100.0 * float(np.sqrt(np.mean(e**2))) if np.all(np.abs(e) < AWAY) else float('inf')
-
-
-def at_full_rate(y: Array, r: int, n: int) -> Array:
-    """Return averaged samples as samples."""
-    return np.interp(np.arange(n), (np.arange(y.size) + 0.5) * r - 0.5, y)
 
 
 def tuned(settings: Iterator[Peer], data: Motion) -> tuple[list[Peer], float]:
@@ -322,15 +287,15 @@ def tuned(settings: Iterator[Peer], data: Motion) -> tuple[list[Peer], float]:
     return [setting for *_, setting in found], time.perf_counter() - began
 
 
-def judged(
-    setting: Peer, run: Callable[[Any, Motion], Array], model: Any, data: Motion, held: int
-) -> float:
+def judged(setting: Peer, model: Any, data: Motion, held: int) -> float:
     """Return the error over the samples from `held` on; the start lies before it."""
     first = max(0, held - START * setting.rate)
     part = data.cut(first)
     with np.errstate(all='ignore'):
-        averaged = run(model, part.averaged(setting.rate))
-    y_hat = at_full_rate(averaged, setting.rate, part.v.size)
+        averaged = setting.run(model, part.averaged(setting.rate))
+    # averaged samples as samples
+    at = (np.arange(part.v.size) + 0.5) / setting.rate - 0.5
+    y_hat = np.interp(at, np.arange(averaged.size), averaged)
     return error(y_hat[held - first :], part.y[held - first :])
 
 
@@ -344,57 +309,48 @@ class Case:
     rates: tuple[int, ...]
 
 
-def peer_rows(case: Case, quick: bool, runs: int) -> tuple[list[list[str]], list[str]]:
+def peer_rows(case: Case, quick: bool) -> tuple[list[list[str]], list[str]]:
     """Return the rows of the peers, and their settings in words."""
-    rows, said = [], []
-    few = case.rates[-1:] if quick else case.rates
+    rows, notes = [], []
+    rates, runs = (case.rates[-1:], 2) if quick else (case.rates, 5)
     for name, kind in (('SysIdentPy NARX', Narx), ('pysindy', Sindy)):
-        choices = itertools.islice(kind.settings(few), 0, None, 24 if quick else 1)
+        choices = itertools.islice(kind.settings(rates), 0, None, 24 if quick else 1)
         ranked, tuning = tuned(choices, case.fit)
-        setting = ranked[0]
-        averaged = case.fit.averaged(setting.rate)
-        fit = take_turns({'': lambda k, s=setting, a=averaged: s.fit(a)}, runs, warm=[''])['']
-        model = fit.results[-1]
-        hindsight = []
-        for other in ranked:
-            its = other.fit(case.fit.averaged(other.rate))
-            hindsight.append(judged(other, other.run, its, case.test, case.held))
-        said.append(
-            f'- {name}: {setting.said(model)}. The best of all {len(hindsight)} settings on '
-            f'the held-out data, which only hindsight finds: {min(hindsight):.3f} %.'
+        best = ranked[0]
+
+        def fit(setting: Peer = best) -> Any:
+            return setting.fit(case.fit.averaged(setting.rate))
+
+        def judge(setting: Peer = best, model: Any = None) -> float:
+            return judged(setting, model or fit(setting), case.test, case.held)
+
+        model = fit()
+        turns = take_turns(
+            {'fit': lambda k, f=fit: f(), 'predict': lambda k, j=judge, m=model: j(model=m)}, runs
         )
-        ways = {name: setting.run}
-        # by itself pysindy takes seconds for one
-        if isinstance(setting, Sindy) and not (quick and case.held == 0):
-            ways = {f'{name}, its own `simulate`': setting.own, f'{name}, compiled': setting.run}
-        for label, run in ways.items():
-            judge = partial(judged, setting, run, model, case.test, case.held)
-            try:
-                slow = run != setting.run
-                turn = take_turns({'': lambda k, j=judge: j()}, 1 if slow else runs)['']
-                percent, took = turn.results[-1], seconds(turn.median)
-                held = f'{percent:.3f}' if np.isfinite(percent) else 'runs away'
-            except ValueError as problem:
-                held, took = f'failed: {str(problem).splitlines()[0]}', ''
-            rows.append([label, held, seconds(fit.median), took, f'{tuning:.0f} s'])
-    return rows, said
+        hindsight = min(map(judge, ranked))
+        notes.append(
+            f'- {name}: {best.text(model)}. The best of all {len(ranked)} settings on the '
+            f'held-out data, which only hindsight finds: {hindsight:.3f} %.'
+        )
+        percent = turns['predict'].results[-1]
+        held = f'{percent:.3f}' if np.isfinite(percent) else 'runs away'
+        times = [seconds(turn.median) for turn in turns.values()]
+        rows.append([name, held, *times, f'{tuning:.0f} s'])
+    return rows, notes
 
 
 def our_rows(
     record: Record, settings: Settings, errors: Callable[[Any], tuple[float, float]], runs: int
 ) -> list[list[str]]:
-    """Return the rows of ten and of refined thresholds."""
+    """Return the rows of ten and of chosen thresholds; `errors` returns the error and its time."""
     rows = []
     for name, count in (('ten thresholds', 10), ('chosen thresholds', None)):
-        asked = Settings(
-            thresholds=count, hold_out=settings.hold_out, max_order=settings.max_order
-        )
-        turn: Turn = take_turns(
-            {'fit': lambda k, s=asked: identify(record, s)}, runs, warm=['fit']
-        )['fit']
-        percent, took = errors(turn.results[-1])
-        row = [f'piezo_ident, {name}', f'{percent:.3f}', seconds(turn.median), seconds(took), '']
-        rows.append(row)
+        asked = replace(settings, thresholds=count)
+        fit = take_turns({'': lambda k, s=asked: identify(record, s)}, runs, warm=[''])['']
+        percent, took = errors(fit.results[-1])
+        times = (seconds(fit.median), seconds(took))
+        rows.append([f'piezo_ident, {name}', f'{percent:.3f}', *times, ''])
     return rows
 
 
@@ -421,15 +377,13 @@ def measured(quick: bool) -> str:
     def errors(result: Any) -> tuple[float, float]:
         (held,) = [row for row in result.errors if row.data == 'held out']
         memory = next(iter(result.memories.values()), None)
-        predict = take_turns(
-            {'predict': lambda k: result.model.predict_piece(piece, memory)}, 5, warm=['predict']
-        )
-        return held.percent, predict['predict'].median
+        turn = take_turns({'': lambda k: result.model.predict_piece(piece, memory)}, 5)['']
+        return held.percent, turn.median
 
     rows = our_rows(record, Settings(hold_out=HELD), errors, 2 if quick else 5)
-    more, said = peer_rows(case, quick, 2 if quick else 5)
+    more, notes = peer_rows(case, quick)
     floor = 100.0 * float(piece.y[: round(3.0 * rate)].std()) / stroke
-    lines = '\n'.join(said)
+    lines = '\n'.join(notes)
     return f"""\
 `{MEASURED}`: {piece.n:,} samples at {rate:g} Hz, rest, a step that rings, then a 1 Hz sine of
 full size; the last {HELD} s are held out. Errors are {FORMULA}. Ours fits everything
@@ -468,17 +422,13 @@ def other_motions(quick: bool) -> str:
     case = Case(motion(piece.v[cut], piece.y[cut]), test, 0, (40, 100, 200))
 
     def errors(result: Any) -> tuple[float, float]:
-        turn = take_turns(
-            {'predict': lambda k: result.model.predict_piece(loops)}, 5, warm=['predict']
-        )['predict']
-        return 100.0 * float(
-            np.sqrt(np.mean((turn.results[-1] - loops.y) ** 2)) / stroke
-        ), turn.median
+        turn = take_turns({'': lambda k: result.model.predict_piece(loops)}, 5)['']
+        return percent_of_stroke(loops.y, turn.results[-1], stroke), turn.median
 
     settings = Settings(max_order=6 if quick else 15)
     rows = our_rows(record, settings, errors, 1 if quick else 5)
-    more, said = peer_rows(case, quick, 2 if quick else 5)
-    lines = '\n'.join(said)
+    more, notes = peer_rows(case, quick)
+    lines = '\n'.join(notes)
     return f"""\
 `stage_dense`, whose forty thresholds are none of ours. The peers fit the triangle of growing
 amplitude ({(triangle.stop - triangle.start) / rate:.1f} s), ours the whole identification record
@@ -496,13 +446,15 @@ equation in y and v alone. That is what the plays of H are for."""
 def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
     warnings.filterwarnings('ignore')
-    said = versions('sysidentpy', 'pysindy', 'scikit-learn', 'numpy', 'scipy', 'numba')
+    installed = versions('sysidentpy', 'pysindy', 'scikit-learn', 'numpy', 'scipy', 'numba')
     return [
-        ('Hysteresis: a measured loop', f'{measured(quick)}\n\n{said}.'),
-        ('Hysteresis: other motions than the fitted one', f'{other_motions(quick)}\n\n{said}.'),
+        ('Hysteresis: a measured loop', f'{measured(quick)}\n\n{installed}.'),
+        (
+            'Hysteresis: other motions than the fitted one',
+            f'{other_motions(quick)}\n\n{installed}.',
+        ),
     ]
 
 
 if __name__ == '__main__':
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'## {title}\n\n{text}\n')
+    show(sections)

@@ -22,7 +22,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from dataclasses import dataclass
 from functools import partial
 import logging
-import sys
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ from piezo_ident.identification.step3_hysteresis import (
 from piezo_ident.identification.three_steps import triangle_excerpts
 from piezo_ident.model.simulated_stage import SimulatedStage
 from scipy.optimize import Bounds, differential_evolution
-from side_by_side import markdown, ratio, seconds, take_turns, Turn, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, Turn, versions
 
 #: operators of H, that at r = 0 included
 OPERATORS = 10
@@ -257,5 +256,4 @@ The fastest swarm of pyswarms takes {ratio(turns[faster].over(turns[base]))} tim
 
 
 if __name__ == '__main__':
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'## {title}\n\n{text}\n')
+    show(sections)

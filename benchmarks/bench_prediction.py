@@ -21,7 +21,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-import sys
 
 from numba import njit
 import numpy as np
@@ -34,7 +33,7 @@ from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
-from side_by_side import markdown, ratio, take_turns, Turn, versions
+from side_by_side import markdown, ratio, show, take_turns, Turn
 
 RUNS = 7
 #: samples of a block, as they come on a topic
@@ -344,12 +343,5 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     ]
 
 
-def main() -> None:
-    """Print the tables."""
-    print(versions('numpy', 'scipy', 'numba'))
-    for title, text in sections('--quick' in sys.argv[1:]):
-        print(f'\n### {title}\n\n{text}')
-
-
 if __name__ == '__main__':
-    main()
+    show(sections)

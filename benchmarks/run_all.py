@@ -21,17 +21,18 @@ import argparse
 import ast
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-import importlib.util
+import importlib
 import json
 import os
 from pathlib import Path
-import platform
 import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+
+from side_by_side import machine
 
 HERE = Path(__file__).resolve().parent
 #: benchmarks in the order of the page; others follow by name
@@ -44,21 +45,6 @@ ORDER = (
     'peers_hysteresis',
     'growth',
     'many',
-)
-#: whose versions are told, where they are installed
-LIBRARIES = (
-    'numpy',
-    'scipy',
-    'numba',
-    'llvmlite',
-    'rosbags',
-    'sippy_unipi',
-    'sysidentpy',
-    'pysindy',
-    'pyswarms',
-    'control',
-    'dask',
-    'distributed',
 )
 #: longest that one benchmark may take [s]
 LIMIT = 7200.0
@@ -74,29 +60,23 @@ class Outcome:
     seconds: float
 
 
-def has_sections(path: Path) -> bool:
-    """Return whether a file defines a function `sections`, without running it."""
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    return any(isinstance(node, ast.FunctionDef) and node.name == 'sections' for node in tree.body)
-
-
 def benchmarks(folder: Path = HERE) -> list[Path]:
-    """Return the files that are benchmarks, in the order of the page."""
-    found = [path for path in sorted(folder.glob('bench_*.py')) if has_sections(path)]
+    """Return the files with a function `sections`, in the order of the page, without running."""
+
+    def has_sections(path: Path) -> bool:
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        return any(isinstance(n, ast.FunctionDef) and n.name == 'sections' for n in tree.body)
+
     place = {f'bench_{name}': i for i, name in enumerate(ORDER)}
+    found = filter(has_sections, folder.glob('bench_*.py'))
     return sorted(found, key=lambda path: (place.get(path.stem, len(ORDER)), path.stem))
 
 
 def work(path: Path, quick: bool, out: Path) -> None:
     """Run one benchmark in this process, and write what it returns as JSON."""
     sys.path.insert(0, str(path.parent))
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f'{path} cannot be loaded')
-    module = importlib.util.module_from_spec(spec)
     # a benchmark that starts processes of its own has to be found by its name there
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
+    module = importlib.import_module(path.stem)
     pairs = [(str(title), str(text)) for title, text in module.sections(quick=quick)]
     out.write_text(json.dumps(pairs), encoding='utf-8')
 
@@ -104,63 +84,39 @@ def work(path: Path, quick: bool, out: Path) -> None:
 def run(path: Path, quick: bool, limit: float = LIMIT) -> Outcome:
     """Run one benchmark in a process of its own."""
     began = time.perf_counter()
+    sections: tuple[tuple[str, str], ...] = ()
     with tempfile.TemporaryDirectory() as folder:
         out, log = Path(folder, 'sections.json'), Path(folder, 'log')
         command = [sys.executable, str(Path(__file__).resolve()), '--work', str(path)]
         command += ['--out', str(out), *(['--quick'] if quick else [])]
-        # one thread of BLAS for ours and for the peers
-        environment = os.environ | {'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}
-        reason = ''
         with log.open('wb') as target:
             process = subprocess.Popen(
                 command,
                 stdout=target,
                 stderr=subprocess.STDOUT,
-                env=environment,
+                # one thread of BLAS for ours and for the peers
+                env=os.environ | {'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'},
                 start_new_session=True,
             )
             try:
-                code = process.wait(limit)
+                process.wait(limit)
+                lines = log.read_text(encoding='utf-8', errors='replace').strip().splitlines()
+                reason = (lines or ['no output'])[-1] if process.returncode else ''
             except subprocess.TimeoutExpired:
-                code, reason = 1, f'it took more than {limit:g} s'
+                reason = f'it took more than {limit:g} s'
             finally:
                 if process.poll() is None:
                     # with all that it has started
                     os.killpg(process.pid, signal.SIGKILL)
                     process.wait()
-        if code:
-            said = log.read_text(encoding='utf-8', errors='replace').strip().splitlines()
-            reason = reason or (said[-1] if said else f'it ended with exit code {code}')
-            return Outcome(path.stem, (), reason, time.perf_counter() - began)
-        pairs = json.loads(out.read_text(encoding='utf-8'))
-    sections = tuple((title, text) for title, text in pairs)
-    return Outcome(path.stem, sections, '', time.perf_counter() - began)
+        if not reason:
+            sections = tuple(map(tuple, json.loads(out.read_text(encoding='utf-8'))))
+    return Outcome(path.stem, sections, reason, time.perf_counter() - began)
 
 
-def machine() -> str:
-    """Return what is being measured on."""
-    from side_by_side import versions
-
-    name, memory = platform.processor() or platform.machine(), ''
-    try:
-        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
-        name = next(
-            (s.partition(':')[2].strip() for s in lines if s.startswith('model name')), name
-        )
-        kilobytes = Path('/proc/meminfo').read_text(encoding='utf-8').split()[1]
-        memory = f', {int(kilobytes) / 2**20:.0f} GiB of memory'
-    except (OSError, ValueError, IndexError):
-        pass
-    return (
-        f'{os.cpu_count()} cores of {name}{memory}, {platform.system()} {platform.release()}; '
-        f'Python {platform.python_version()}, {versions("piezo_ident", *LIBRARIES)}.'
-    )
-
-
-def page(outcomes: Iterable[Outcome], command: str, load: float | None) -> str:
+def page(outcomes: Iterable[Outcome], command: str, load: float) -> str:
     """Return docs/benchmarks.md."""
     outcomes = list(outcomes)
-    before = '' if load is None else f' Load average before: {load:.2f}.'
     text = [
         '# Benchmarks',
         '',
@@ -168,7 +124,7 @@ def page(outcomes: Iterable[Outcome], command: str, load: float | None) -> str:
         '',
         f'    {command}',
         '',
-        f'Machine: {machine()}{before}',
+        f'Machine: {machine()}. Load average before: {load:.2f}.',
         '',
         'What is compared ran in turns in one process, with one thread of BLAS; times are medians',
         'over the turns, ratios medians of the ratios turn by turn. Only ratios mean something on',
@@ -185,14 +141,6 @@ def page(outcomes: Iterable[Outcome], command: str, load: float | None) -> str:
     return '\n'.join(text)
 
 
-def write(text: str, path: Path) -> None:
-    """Replace a file at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f'.{path.name}.tmp')
-    temporary.write_text(text, encoding='utf-8')
-    temporary.replace(path)
-
-
 def main(argv: Sequence[str] | None = None, folder: Path = HERE) -> int:
     """Run what is asked for, and return the exit code."""
     parser = argparse.ArgumentParser(description='Runs the benchmarks and writes one page.')
@@ -207,7 +155,7 @@ def main(argv: Sequence[str] | None = None, folder: Path = HERE) -> int:
     if args.work:
         work(args.work, args.quick, args.out)
         return 0
-    load = os.getloadavg()[0] if hasattr(os, 'getloadavg') else None
+    load = os.getloadavg()[0]
     names = {path.stem.removeprefix('bench_'): path for path in benchmarks(folder)}
     unknown = sorted(set(args.only or ()) - set(names))
     if unknown:
@@ -218,15 +166,15 @@ def main(argv: Sequence[str] | None = None, folder: Path = HERE) -> int:
             continue
         print(f'{name} ...', flush=True)
         outcomes.append(run(path, args.quick))
-        said = outcomes[-1].reason and f': failed: {outcomes[-1].reason}'
-        print(f'{name} {outcomes[-1].seconds:.0f} s{said}', flush=True)
+        failed = outcomes[-1].reason and f': failed: {outcomes[-1].reason}'
+        print(f'{name} {outcomes[-1].seconds:.0f} s{failed}', flush=True)
     command = shlex.join(['python', 'benchmarks/run_all.py', *given])
-    write(page(outcomes, command, load), args.out)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(page(outcomes, command, load), encoding='utf-8')
     return 1 if any(outcome.reason for outcome in outcomes) else 0
 
 
 if __name__ == '__main__':
     # ended from outside it ends what it has started
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    sys.path.insert(0, str(HERE))
     sys.exit(main())

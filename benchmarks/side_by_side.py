@@ -14,9 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+import os
 from pathlib import Path
+import platform
 import resource
 import subprocess
+import sys
 import time
 from typing import Any
 
@@ -25,14 +28,23 @@ import numpy as np
 __all__ = [
     'Turn',
     'last_line',
+    'machine',
     'markdown',
     'peak_memory',
     'ratio',
     'seconds',
+    'show',
     'take_turns',
     'version_of',
     'versions',
 ]
+
+
+#: whose versions a page names, where they are installed
+LIBRARIES = (
+    *('numpy', 'scipy', 'numba', 'llvmlite', 'rosbags', 'sippy_unipi', 'sysidentpy', 'pysindy'),
+    *('pyswarms', 'control', 'dask', 'distributed'),
+)
 
 
 @dataclass
@@ -154,3 +166,27 @@ def versions(*names: str) -> str:
     """Return the names with the versions of those that are installed."""
     found = [(name, version_of(name)) for name in names]
     return ', '.join(f'{name} {number}' for name, number in found if number)
+
+
+def machine() -> str:
+    """Return what is being measured on."""
+    name, memory = platform.processor() or platform.machine(), ''
+    try:
+        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+        name = next(
+            (s.partition(':')[2].strip() for s in lines if s.startswith('model name')), name
+        )
+        kilobytes = Path('/proc/meminfo').read_text(encoding='utf-8').split()[1]
+        memory = f', {int(kilobytes) / 2**20:.0f} GiB of memory'
+    except (OSError, ValueError, IndexError):
+        pass
+    return (
+        f'{os.cpu_count()} cores of {name}{memory}, {platform.system()} {platform.release()}; '
+        f'Python {platform.python_version()}, {versions("piezo_ident", *LIBRARIES)}'
+    )
+
+
+def show(sections: Callable[[bool], Sequence[tuple[str, str]]]) -> None:
+    """Print the sections of a benchmark, short ones with --quick."""
+    for title, text in sections('--quick' in sys.argv[1:]):
+        print(f'## {title}\n\n{text}\n')

@@ -16,35 +16,29 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import itertools
-import os
 from pathlib import Path
-import random
 import shutil
 import signal
 import sys
 import tempfile
-import threading
 import time
-from typing import Any
 
 import numpy as np
 
 HERE = Path(__file__).resolve()
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[2] / 'examples')]
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1])]
 
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.record.bags.read import opened_bag
 from rows import processors, shares, write_rows
+from running_graph import NODES, RATE, recorded_samples, RunningGraph, STREAMS
+import yaml
 
-__all__ = ['Observer', 'Soak', 'soak']
+__all__ = ['Soak', 'Stream', 'clock_drift', 'slope', 'soak']
 
-RATE, BLOCK = 20_000, 100
-STREAMS = ('voltage', 'displacement', 'applied_voltage', 'prediction', 'residual')
-NODES = ('stage', 'identifier', 'model', 'recorder', 'excitation')
-#: how often arrivals are fetched, and memory is looked at [s]
-POLL, LOOK = 0.05, 2.0
+#: how often memory is looked at [s]
+LOOK = 2.0
 #: longest program: samples of one are bounded [s]
 LONGEST = 600.0
 #: stage of the paper as a model: what matters here is that it predicts
@@ -71,53 +65,24 @@ class Stream:
         self.last = first + n - 1
 
 
-class Observer:
-    """Reads the stamps of all streams in a thread, and when they came."""
+class Streams:
+    """What passed of each topic; of each program (machine's time, samples' time) of blocks [s]."""
 
-    def __init__(self, client: Any) -> None:
-        from piezo_ident.nodes.subscriptions import message_class, RawSubscriptions
-        from rclpy.serialization import deserialize_message
-
-        self._kind = message_class('std_msgs/msg/Float64MultiArray')
-        self._read = deserialize_message
-        self._inputs = RawSubscriptions(client.node, [f'/{t}' for t in STREAMS])
-        self.streams = {topic: Stream() for topic in STREAMS}
-        #: of each program: (time of the machine [s], time of the samples [s]) of its blocks
+    def __init__(self) -> None:
+        self.of = {topic: Stream() for topic in STREAMS}
         self.clocks: list[list[tuple[float, float]]] = []
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
 
-    def _work(self) -> None:
-        looked = 0.0
-        while not self._end.wait(POLL):
-            for stamp, topic, raw in self._inputs.arrived():
-                data = np.asarray(self._read(raw, self._kind).data)
-                first, n = round(data[0] * RATE), data.size // 2
-                stream, name = self.streams[topic[1:]], topic[1:]
-                runs = stream.runs
-                stream.take(first, n)
-                if name != 'voltage':
-                    continue
-                if stream.runs > runs:
-                    self.clocks.append([])
-                # a few a second say enough
-                if first % 4000 == 0:
-                    self.clocks[-1].append((1e-9 * stamp, first / RATE))
-            if time.monotonic() - looked > 0.5:
-                looked = time.monotonic()
-                self._inputs.look()
-
-    @property
-    def unheard(self) -> int:
-        """Messages that were sent to this process and did not arrive."""
-        return self._inputs.lost
-
-    def close(self) -> None:
-        """Read no more."""
-        self._end.set()
-        self._thread.join()
-        self._inputs.close()
+    def take(self, topic: str, stamp: int, first: int, n: int) -> None:
+        """Take note of a block."""
+        stream = self.of[topic]
+        runs = stream.runs
+        stream.take(first, n)
+        if topic == 'voltage':
+            if stream.runs > runs:
+                self.clocks.append([])
+            # a few a second say enough
+            if first % 4000 == 0:
+                self.clocks[-1].append((1e-9 * stamp, first / RATE))
 
 
 def memory(pid: int) -> float:
@@ -182,10 +147,10 @@ class Soak:
     late: int
     slipped: float
     parts: int
-    recorded: dict[str, int] = field(default_factory=dict)
+    recorded: dict[str, int]
 
     def lines(self) -> Iterator[str]:
-        """Yield the story."""
+        """Yield what is printed."""
         yield f'{self.seconds:g} s, {self.samples:,} samples'
         for name, (first, last, k, error) in self.memory.items():
             yield f'{name}: {first:.1f} -> {last:.1f} MB, {k:+.2f} +- {error:.2f} MB/h'
@@ -193,14 +158,6 @@ class Soak:
         yield f'sample clock: {1e6 * self.drift:+.2f} +- {1e6 * self.drift_error:.2f} us/s'
         yield f'late blocks: {self.late}, schedule moved by {self.slipped:g} s'
         yield f'recording: {self.parts} parts, {self.recorded}'
-
-
-def sine(seconds: float) -> str:
-    """Return a program."""
-    return (
-        f'limits: [0, 10]\nsample_rate: {RATE}\nsegments:\n'
-        f'  - {{signal: sine, bias: 5, amplitude: 4.5, frequency: 7, duration: {seconds:g}}}\n'
-    )
 
 
 def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
@@ -218,97 +175,65 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
     folder : path
         For bags and logs.
     """
-    from diagnostic_msgs.msg import DiagnosticArray
-    from lab_graph import Client, Nodes
-    from piezo_ident.nodes.wire import PREVIEW
+    data = yaml.safe_load(MODEL.read_text())
+    model = folder / 'model.yaml'
+    model.write_text(yaml.safe_dump({k: data[k] for k in data if k not in ('sensor', 'seed')}))
+    parameters = {
+        'stage': {'silence': 5.0},
+        'identifier': {'capture_limit': min(60.0, max(1.0, seconds / 4))},
+        'model': {'model': str(model)},
+        'recorder': {'max_bag_size': part},
+        # the recorder and the observer listen too
+        'excitation': {'subscribers': 5, 'rate_factor': factor},
+    }
+    streams, samples, late, slipped = Streams(), 0, 0, 0.0
+    times: list[float] = []
+    sizes: dict[str, list[float]] = {name: [] for name in NODES}
 
-    told: dict[str, dict[str, str]] = {}
-    worst: dict[str, float] = {'late': 0, 'slipped': 0.0}
+    with RunningGraph(folder, streams.take, parameters) as graph:
 
-    def hear(message: DiagnosticArray) -> None:
-        for status in message.status:
-            told[status.name.strip('/')] = {p.key: p.value for p in status.values}
+        def look(_: float) -> None:
+            now = time.monotonic()
+            if not times or now - times[-1] > LOOK:
+                times.append(now)
+                for name in NODES:
+                    sizes[name].append(memory(graph.nodes.processes[name].pid))
 
-    with Nodes(folder / 'log') as nodes, Client('soak') as client:
-        client.node.create_subscription(DiagnosticArray, '/diagnostics', hear, PREVIEW)
-        for name in NODES:
-            client.follow(name)
-        model = folder / 'model.yaml'
-        model.write_text(_model_text())
-        nodes.start('stage', parameters={'silence': 5.0})
-        nodes.start('identifier', parameters={'capture_limit': min(60.0, max(1.0, seconds / 4))})
-        nodes.start('model', parameters={'model': str(model)})
-        recorder = {'output': str(folder / 'bag'), 'max_bag_size': part}
-        nodes.start('recorder', parameters=recorder)
-        # the model and the observer of this process listen too
-        nodes.start('excitation', parameters={'subscribers': 5, 'rate_factor': factor})
-        observer = Observer(client)
-        try:
-            # a node that runs for the first time compiles its kernels before it says anything
-            for name in NODES:
-                client.wait(lambda name=name: client.status(name), 120.0, name, nodes.check)
-            _ask(client, 'recorder/start')
-            _until(nodes, client, 'recorder', ('recording',), 30.0)
-            left, samples = seconds, 0
-            times: list[float] = []
-            sizes: dict[str, list[float]] = {name: [] for name in NODES}
-            while left > 0:
-                length = min(left, LONGEST)
-                _set(client, 'excitation', 'program', sine(length))
-                samples += int(_ask(client, 'excitation/start').split()[-2])
-                client.forget('excitation')
-                begin, looked = time.monotonic(), 0.0
-                while client.status('excitation').get('state') != 'done':
-                    nodes.check()
-                    now = time.monotonic()
-                    if client.status('excitation').get('state') == 'failed':
-                        raise PiezoIdentError(str(client.status('excitation')))
-                    if now - begin > 20 * length + 120:
-                        raise PiezoIdentError('the program does not end')
-                    if now - looked > LOOK:
-                        looked = now
-                        times.append(now)
-                        for name in NODES:
-                            sizes[name].append(memory(nodes.processes[name].pid))
-                    time.sleep(0.1)
-                time.sleep(1.5)
-                worst['late'] += int(told['excitation'].get('late', '0'))
-                worst['slipped'] += float(told['excitation'].get('slipped', '0'))
-                left -= length
-            _ask(client, 'recorder/stop')
-            _until(nodes, client, 'recorder', ('done',), 60.0)
-            time.sleep(1.5)
-        finally:
-            observer.close()
-        lost = {f'{t} at the observer': samples - observer.streams[t].samples for t in STREAMS}
-        lost['messages to the observer'] = observer.unheard
-        for name, key in (('stage', 'lost'), ('identifier', 'lost'), ('model', 'lost')):
-            lost[f'by the {name}'] = int(told[name][key])
-        lost['messages to the recorder'] = int(told['recorder']['lost'])
-        codes = nodes.stop()
+        graph.ask('recorder/start')
+        graph.wait('recorder', 'recording')
+        for start in np.arange(0.0, seconds, LONGEST):
+            samples += graph.play(min(LONGEST, seconds - start), look)[0]
+            late += int(graph.diagnostics['excitation'].get('late', '0'))
+            slipped += float(graph.diagnostics['excitation'].get('slipped', '0'))
+        graph.ask('recorder/stop')
+        graph.wait('recorder', 'done')
+        time.sleep(1.5)
+        told = graph.diagnostics
     # a busy machine may need the second signal
-    if any(code not in (0, -signal.SIGTERM) for code in codes.values()):
-        raise PiezoIdentError(f'not ended cleanly: {codes}')
-    parts = sorted(folder.glob('bag*'), key=lambda p: (len(p.name), p.name))
+    if any(code not in (0, -signal.SIGTERM) for code in graph.codes.values()):
+        raise PiezoIdentError(f'not ended cleanly: {graph.codes}')
+    parts = sorted(folder.glob('bag*'))
     recorded = recorded_samples(parts)
-    for topic, n in recorded.items():
-        lost[f'{topic} in the bag'] = samples - n
+    lost = {f'{topic} at the observer': samples - streams.of[topic].samples for topic in STREAMS}
+    lost['messages to the observer'] = graph.observer.lost
+    lost |= {f'by the {name}': int(told[name]['lost']) for name in NODES[:3]}
+    lost['messages to the recorder'] = int(told['recorder']['lost'])
+    lost |= {f'{topic} in the bag': samples - n for topic, n in recorded.items()}
     t = (np.array(times) - times[0]) / 3600.0
     quarter = t >= 0.25 * t[-1]
-    kept = {
-        name: (x[0], x[-1], *slope(t[quarter] * 3600.0, np.array(x)[quarter] * 3600.0))
-        for name, x in sizes.items()
-    }
-    drift, error = clock_drift(observer.clocks)
+    drift, error = clock_drift(streams.clocks)
     return Soak(
         seconds,
         samples,
         {where: n for where, n in lost.items() if n},
-        kept,
+        {
+            name: (x[0], x[-1], *slope(t[quarter] * 3600.0, np.array(x)[quarter] * 3600.0))
+            for name, x in sizes.items()
+        },
         drift,
         error,
-        int(worst['late']),
-        worst['slipped'],
+        late,
+        slipped,
         len(parts),
         recorded,
     )
@@ -336,47 +261,6 @@ def _stretches(x: np.ndarray, n: int) -> Iterator[tuple[np.ndarray, int]]:
         yield x[a:b], int(a)
 
 
-def recorded_samples(parts: list[Path]) -> dict[str, int]:
-    """Return the samples of each stream in all parts together."""
-    from piezo_ident.record.bags.read import typestore
-
-    counts = dict.fromkeys(STREAMS, 0)
-    for part in parts:
-        with opened_bag(part) as bag:
-            for connection, _, raw in bag.messages(bag.connections):
-                topic = connection.topic[1:]
-                if topic in counts:
-                    message = typestore().deserialize_cdr(raw, connection.msgtype)
-                    counts[topic] += message.layout.dim[0].size
-    return counts
-
-
-def _model_text() -> str:
-    import yaml
-
-    data = yaml.safe_load(MODEL.read_text())
-    for key in ('sensor', 'seed'):
-        data.pop(key, None)
-    return yaml.safe_dump(data)
-
-
-def _ask(client: Any, service: str) -> str:
-    done, answer = client.call(service, timeout=60.0)
-    if not done:
-        raise PiezoIdentError(f'{service} was refused: {answer}')
-    return str(answer)
-
-
-def _set(client: Any, node: str, name: str, value: object) -> None:
-    done, reason = client.set(node, name, value, timeout=60.0)
-    if not done:
-        raise PiezoIdentError(f'{node}: {name} was refused: {reason}')
-
-
-def _until(nodes, client: Any, node: str, states: tuple[str, ...], limit: float) -> None:
-    client.wait(lambda: client.status(node).get('state') in states, limit, node, nodes.check)
-
-
 def main() -> int:
     """Run it, and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
@@ -385,8 +269,9 @@ def main() -> int:
     parser.add_argument('--part', type=int, default=500_000_000, help='bytes of a part of the bag')
     parser.add_argument('--folder', type=Path, help='for the bags; a temporary one when absent')
     args = parser.parse_args()
-    os.environ.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    from lab_graph import own_domain
+
+    own_domain()
     folder = Path(tempfile.mkdtemp(prefix='piezo_ident_soak_', dir=args.folder))
     before = processors()
     try:
