@@ -38,7 +38,7 @@ from piezo_ident.identification.step3_hysteresis import (
 )
 from piezo_ident.identification.three_steps import triangle_excerpts
 from piezo_ident.model.simulated_stage import SimulatedStage
-from scipy.optimize import Bounds, differential_evolution
+from scipy.optimize import differential_evolution
 from side_by_side import markdown, ratio, seconds, show, take_turns, Turn, versions
 
 #: operators of H, that at r = 0 included
@@ -130,7 +130,8 @@ def ours(task: Problem, seed: int) -> Found:
     goal = NEAR * task.optimum
     result = particle_swarm(
         Quadratic(A.T @ A, A.T @ y, float(y @ y)),
-        Bounds(task.box[:, 0], task.box[:, 1]),
+        task.box[:, 0],
+        task.box[:, 1],
         rng=np.random.default_rng(seed),
         maxiter=MOST,
         callback=lambda intermediate_result: task.loss(intermediate_result.x) <= goal,

@@ -32,7 +32,7 @@ from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Qu
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import play_columns, weighted_plays
-from scipy.optimize import Bounds, OptimizeResult
+from scipy.optimize import OptimizeResult
 
 __all__ = [
     'HysteresisFit',
@@ -290,7 +290,8 @@ def fit_hysteresis(
         A, y = inner[:, :-1], inner[:, -1]
         swarm = particle_swarm(
             Quadratic(A.T @ A, A.T @ y, float(y @ y)),
-            Bounds(box[:, 0], box[:, 1]),
+            box[:, 0],
+            box[:, 1],
             rng=rng,
             swarm_size=swarm_size,
             maxiter=maxiter,
