@@ -41,11 +41,12 @@ from piezo_ident.identification.three_steps import (
     second_step,
     third_step,
     triangle_excerpts,
+    within,
 )
 from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.initial_memory import start_memory
-from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record, records_of
@@ -53,7 +54,12 @@ from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import ResidualPart, stretches_of
 import scipy
 
-__all__ = ['find_delay', 'find_dynamics', 'find_hysteresis', 'identify']
+__all__ = ['first_steps', 'identify']
+
+_UNLABELLED = (
+    '{}: no segments are labelled {}; drive the stage with the program identification, or '
+    'identify unlabelled data in one go'
+)
 
 
 def identify(
@@ -79,7 +85,8 @@ def identify(
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
     steps : Steps, optional
-        Steps of the three that were taken already, from `find_delay` and `find_dynamics`.
+        Steps of the three that were taken already, from `first_steps`; where they are given,
+        even empty ones, records without labelled segments are refused.
 
     Returns
     -------
@@ -101,7 +108,7 @@ def identify(
     """
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     with singular_is_ours():
-        return _identify(records, settings or Settings(), validation, progress, steps or Steps())
+        return _identify(records, settings or Settings(), validation, progress, steps)
 
 
 def _identify(
@@ -109,12 +116,14 @@ def _identify(
     settings: Settings,
     validation: Sequence[Record],
     progress: Progress,
-    steps: Steps,
+    steps: Steps | None,
 ) -> Identification:
     data = prepare(records)
     runs, scaling = data.runs, data.scaling
     if data.labelled:
-        fit = _labelled(runs, data.rate, scaling, settings, progress, steps)
+        fit = _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
+    elif steps is not None:
+        raise IdentificationError(_UNLABELLED.format('hysteresis', 'noise and triangle'))
     else:
         fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
     model, stroke = fit.model, abs(scaling.Y)
@@ -128,7 +137,7 @@ def _identify(
             *errors_of(model, runs, fit.masks, fit.memories),
             *validation_errors(model, validation),
         ),
-        noise_floor=None if floor.rms is None else 100.0 * floor.rms / stroke,
+        noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
         noise_source=floor.source,
         stroke=stroke,
         warnings=(*data.warnings, *fit.warnings),
@@ -194,10 +203,9 @@ def _labelled(
     if lowest > 0.01 or highest < 0.99:
         warnings.append(
             'the triangle does not cover the voltages of the record: it reaches '
-            f'{scaling.v0 + scaling.V * lowest:.3g} .. {scaling.v0 + scaling.V * highest:.3g} V'
+            f'{scaling.v(lowest):.3g} .. {scaling.v(highest):.3g} V'
         )
-        span = (scaling.v0 + scaling.V * lowest, scaling.v0 + scaling.V * highest)
-        model = replace(model, scaling=replace(model.scaling, range=span))
+        model = within(model, lowest, highest)
     masks = []
     for run in runs:
         kept = run.held_out()
@@ -223,50 +231,24 @@ def _either(
     return delay, dynamics, G
 
 
-def find_delay(
-    records: Sequence[Record], settings: Settings | None = None, *, progress: Progress = silent
-) -> Steps:
-    """
-    Take the first step alone.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With segments ``step`` or ``noise``.
-    settings : Settings, optional
-    progress : callable, optional
-        As for `identify`.
-
-    Raises
-    ------
-    IdentificationError
-        When the data do not tell the delay.
-    """
-    data = prepare(records)
-    if not {s.kind for p in data.pieces for s in p.segments} & {'step', 'noise'}:
-        raise IdentificationError(
-            'delay: no segment is labelled step or noise; drive the stage with the program '
-            'identification, or identify unlabelled data in one go'
-        )
-    with singular_is_ours():
-        return Steps(delay=first_step(data.runs, settings or Settings(), progress))
-
-
-def find_dynamics(
+def first_steps(
     records: Sequence[Record],
     settings: Settings | None = None,
     *,
+    which: str,
     steps: Steps | None = None,
     progress: Progress = silent,
 ) -> Steps:
     """
-    Take the second step, and the first where `steps` does not hold it.
+    Take the first step alone, or the second one and what it needs of the first.
 
     Parameters
     ----------
     records : sequence of Record
-        With segments ``noise`` and ``triangle``: the hysteresis has to be undone.
+        With segments ``step`` or ``noise`` for the delay; with ``noise`` and ``triangle`` for the
+        dynamics, since the hysteresis has to be undone.
     settings : Settings, optional
+    which : {'delay', 'dynamics'}
     steps : Steps, optional
         What was found already.
     progress : callable, optional
@@ -275,51 +257,19 @@ def find_dynamics(
     Raises
     ------
     IdentificationError
-        When the data do not carry the dynamics.
+        When the data do not carry this step.
     """
     data, settings, steps = prepare(records), settings or Settings(), steps or Steps()
-    if not data.labelled:
-        raise IdentificationError(
-            'dynamics: segments labelled noise and triangle are needed, since the hysteresis is '
-            'undone; drive the stage with the program identification'
-        )
     with singular_is_ours():
+        if which == 'delay':
+            if not data.kinds & {'step', 'noise'}:
+                raise IdentificationError(_UNLABELLED.format('delay', 'step or noise'))
+            return Steps(delay=first_step(data.runs, settings, progress))
+        if not data.labelled:
+            raise IdentificationError(_UNLABELLED.format('dynamics', 'noise and triangle'))
         delay = steps.delay or first_step(data.runs, settings, progress)
         found = second_step(data.runs, Delay(delay.samples), settings, progress)
     return replace(steps, delay=delay, dynamics=found)
-
-
-def find_hysteresis(
-    records: Sequence[Record],
-    settings: Settings | None = None,
-    *,
-    steps: Steps | None = None,
-    progress: Progress = silent,
-) -> Identification:
-    """
-    Take the third step, and those before it that `steps` does not hold.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With segments ``noise`` and ``triangle``.
-    settings : Settings, optional
-    steps : Steps, optional
-        What was found already.
-    progress : callable, optional
-        As for `identify`.
-
-    Raises
-    ------
-    IdentificationError
-        When the data do not carry a model.
-    """
-    if not prepare(records).labelled:
-        raise IdentificationError(
-            'hysteresis: segments labelled noise and triangle are needed; drive the stage with '
-            'the program identification, or identify unlabelled data in one go'
-        )
-    return identify(records, settings, steps=steps, progress=progress)
 
 
 def _provenance(result: Identification, names: list[str]) -> dict[str, Any]:

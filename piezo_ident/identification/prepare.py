@@ -176,9 +176,14 @@ class Prepared:
     warnings: list[str]
 
     @property
+    def kinds(self) -> set[str]:
+        """Kinds of segments that there are."""
+        return {s.kind for p in self.pieces for s in p.segments}
+
+    @property
     def labelled(self) -> bool:
         """Whether there are noise and a triangle, so that the three steps can be taken."""
-        return {'noise', 'triangle'} <= {s.kind for p in self.pieces for s in p.segments}
+        return {'noise', 'triangle'} <= self.kinds
 
 
 def prepare(records: Sequence[Record]) -> Prepared:

@@ -50,7 +50,7 @@ from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
 
-__all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_excerpts']
+__all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_excerpts', 'within']
 
 #: plays of the paper, where the data cannot choose their number
 PAPER_COUNT = 10
@@ -425,3 +425,9 @@ def model_of(
     """Return the model, its zero of displacement moved by the offset of the fit."""
     moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
     return StageModel(rate, moved, fit.hysteresis, G, delay)
+
+
+def within(model: StageModel, low: float, high: float) -> StageModel:
+    """Return the model as identified between two normalised voltages."""
+    span = (model.scaling.v(low), model.scaling.v(high))
+    return replace(model, scaling=replace(model.scaling, range=span))

@@ -38,7 +38,7 @@ from piezo_ident.identification.step3_hysteresis import (
     factorise,
     fit_hysteresis,
 )
-from piezo_ident.identification.three_steps import model_of, third_step
+from piezo_ident.identification.three_steps import model_of, third_step, within
 from piezo_ident.identification.warnings import warn_of_range
 from piezo_ident.model.initial_memory import fit_memory
 from piezo_ident.model.stage_model import Scaling, StageModel
@@ -347,9 +347,7 @@ def fit_unlabelled(
     whole = [Excerpt(u, x, use, joint.memory)]
     hysteresis = third_step(fit_part, late_part, joint.G, delay, settings, progress, whole)
     model = model_of(rate, scaling, hysteresis, joint.G, delay)
-    low, high = float(u.min()), float(u.max())
-    span = (scaling.v0 + scaling.V * low, scaling.v0 + scaling.V * high)
-    model = replace(model, scaling=replace(model.scaling, range=span))
+    model = within(model, float(u.min()), float(u.max()))
     # the start of these very thresholds; the rule carried over from other ones is an approximation
     memories = {key_of(run): fit_memory(model, piece.cut(0, n_fit))}
     if sum(key_of(other) == key_of(run) for other in runs) > 1:

@@ -122,10 +122,7 @@ def warn_of_range(run: Run, n_fit: int, scaling: Scaling) -> list[str]:
     fitted, held = run.u[:n_fit], run.u[n_fit:]
     if held.min() > fitted.min() - 0.01 and held.max() < fitted.max() + 0.01:
         return []
-    spans = [
-        f'{scaling.v0 + scaling.V * u.min():.3g} .. {scaling.v0 + scaling.V * u.max():.3g} V'
-        for u in (fitted, held)
-    ]
+    spans = [f'{scaling.v(u.min()):.3g} .. {scaling.v(u.max()):.3g} V' for u in (fitted, held)]
     return [
         f'the fitted part covers {spans[0]}, the held-out part {spans[1]}: its error is partly '
         'one of extrapolation'

@@ -70,6 +70,10 @@ class Scaling:
         """Return the normalised input."""
         return (np.asarray(v, dtype=np.float64) - self.v0) / self.V
 
+    def v(self, u: float) -> float:
+        """Return volts from the normalised input."""
+        return self.v0 + self.V * float(u)
+
     def y(self, x: ArrayLike) -> NDArray[np.float64]:
         """Return metres from the normalised output."""
         return self.y0 + self.Y * np.asarray(x, dtype=np.float64)

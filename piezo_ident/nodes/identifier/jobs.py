@@ -22,12 +22,7 @@ from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.identify import (
-    find_delay,
-    find_dynamics,
-    find_hysteresis,
-    identify,
-)
+from piezo_ident.identification.identify import first_steps, identify
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.live.capture import refuse_incomplete, Snapshot
 from piezo_ident.model.files import model_to_yaml
@@ -161,17 +156,12 @@ def _identify(
     tick('record', 0.01)
     refuse_incomplete(record, snapshot.sent())
     records = [record]
-    if which in ('delay', 'dynamics'):
-        if which == 'delay':
-            step = find_delay(records, settings, progress=tick)
-        else:
-            step = find_dynamics(records, settings, steps=steps, progress=tick)
+    if which == 'delay' or which == 'dynamics':
+        step = first_steps(records, settings, which=which, steps=steps, progress=tick)
         data = steps_to_json(step, record.pieces[0].sample_rate, records)
         return IdentificationOutcome(_sentence(step), json.dumps(data), len(record.faults), step)
-    if which == 'hysteresis':
-        result = find_hysteresis(records, settings, steps=steps, progress=tick)
-    else:
-        result = identify(records, settings, progress=tick)
+    known = (steps or Steps()) if which == 'hysteresis' else None
+    result = identify(records, settings, steps=known, progress=tick)
     tick('report', 0.98)
     runs = piece_runs(result.model, records, result.memories)
     tick('report', 0.99)
