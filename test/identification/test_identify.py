@@ -103,13 +103,6 @@ def test_paper_stage_is_found(paper):
     assert result.error('selection') == pytest.approx(result.noise_floor, rel=0.1)
 
 
-def test_hysteresis_alone_misses_as_in_the_paper(paper):
-    # worked out from the printed coefficients for a stage that hides nothing
-    errors = sine_errors(PAPER.model, paper[1].model.without_dynamics())
-    expected = [0.09, 0.85, 4.3, 6.8, 8.5, 10.2]
-    assert errors == pytest.approx(expected, rel=0.06)
-
-
 def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
     def first_step(*arguments):
         found = three_steps.first_step(*arguments)
@@ -152,15 +145,6 @@ def test_a_record_for_validation_is_what_the_headline_is_about():
     slow = Record((Piece(p.v, p.y, 2 * p.sample_rate),), 'slow')
     with pytest.raises(IdentificationError, match='slow'):
         identify(short(), QUICK, validation=slow)
-
-
-def test_least_squares_and_chosen_thresholds_are_the_default():
-    settings = Settings()
-    assert (settings.solver, settings.polish, settings.thresholds) == (
-        'least_squares',
-        False,
-        None,
-    )
 
 
 def test_small_signal_gain_is_the_slope_of_h(paper):
@@ -213,13 +197,6 @@ def test_dense_truth_that_no_ten_thresholds_can_hit():
         model = identify(record, Settings(thresholds=count)).model
         sines, loops = sine_errors(DENSE.model, model), loop_error(DENSE.model, model)
         assert max(*sines, loops) <= limit
-
-
-def test_dense_truth_from_a_short_program():
-    # 1.5 s of noise leave 0.09 % above 10 Hz, whatever the thresholds
-    model = identify(short(DENSE), replace(QUICK, thresholds=None)).model
-    assert max(sine_errors(DENSE.model, model)) <= 0.12
-    assert loop_error(DENSE.model, model) <= 0.05
 
 
 def test_retracting_stage():
@@ -423,6 +400,8 @@ AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
     'displacement of noise only': lambda: changed(
         lambda v, y: (v, 1e-9 * np.random.default_rng(0).standard_normal(y.size))
     ),
+    'displacement is the voltage': lambda: changed(lambda v, y: (v, 7.5e-6 * v)),
+    'saturated at both ends': lambda: changed(lambda v, y: (v, np.clip(y, 20e-6, 45e-6))),
     'one tenth of noise': lambda: short(noise=0.1),
     'starts at 5 V': lambda: Record((short().pieces[0].cut(30_000, 102_200),), 'late'),
     'triangle to 6 of 10 V': lambda: short(text=TALL.replace('step, bias: 5', 'step, bias: 9')),

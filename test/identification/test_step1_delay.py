@@ -91,11 +91,6 @@ def test_displacement_that_never_moves_is_no_delay():
         assert found.samples is None
 
 
-def test_huge_offset_does_not_matter():
-    piece = steps(3, 1e-5)
-    assert delay_from_steps([Piece(piece.v, piece.y + 1e-3, FS)]).samples == 3
-
-
 def test_jackknife_sees_repeats_that_disagree():
     # without the one early step the rest say 9
     found = delay_from_steps([steps(3, count=2), steps(9, count=8)])

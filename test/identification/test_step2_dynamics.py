@@ -7,7 +7,6 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import A, B
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.step1_delay import delay_from_loss
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     instrumental_variables,
@@ -73,12 +72,6 @@ def test_noise_free_data_give_the_truth_back(d):
     # ten lags of a smooth output are nearly dependent: six digits are left
     assert_allclose(theta, np.concatenate([A, B]), atol=1e-6)
     assert loss < 1e-20
-
-
-def test_loss_over_the_delay_points_to_it():
-    u, y = data(PAPER, 3, noise=1e-3)
-    factor = arx_factor(u, y, 8, 8 + 20)
-    assert delay_from_loss(np.array([factor.fit(8, 8, d)[1] for d in range(20)])) == 3
 
 
 def test_too_few_samples_are_refused():

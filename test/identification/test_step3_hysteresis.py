@@ -214,14 +214,6 @@ def test_merged_finds_thresholds_between_the_grid():
     assert_allclose(merged(Hysteresis([0.1, 0.2, 0.5], [0.3, 0.1, 0.2], 0, 1)), [0.125, 0.5])
 
 
-def test_inputs_are_left_alone():
-    e = excerpt(noise=1e-4)
-    copies = [a.copy() for a in (e.u, e.x, e.use, TEN)]
-    fitted(e)
-    for now, before in zip((e.u, e.x, e.use, TEN), copies, strict=True):
-        assert_array_equal(now, before)
-
-
 UNIT, NONE = Dynamics.unit(), Delay(0)
 
 

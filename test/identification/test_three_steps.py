@@ -65,11 +65,6 @@ def test_delay_from_noise_alone_has_the_doubt_of_its_band():
     assert 2 < found.std < 4
 
 
-def test_given_delay_is_taken():
-    found = first_step(runs(record()), Settings(delay=5), silent)
-    assert (found.samples, found.source, found.std) == (5, 'given', 0.0)
-
-
 def test_dynamics_are_found_with_the_hysteresis_undone():
     result, G = second_step(runs(record()), Delay(3), Settings(order=(10, 10)), silent)
     truth = PAPER.model.dynamics

@@ -135,6 +135,14 @@ def test_every_state_of_a_model_passes_a_short_gap(name):
     assert_array_equal(first.y_hat, run.pieces[0])
 
 
+def test_a_prediction_that_overflows_is_none():
+    v = sine(1.0, 1.0)
+    model = replace(linear_stage(), hysteresis=Hysteresis([], [], 0.0, 1e10))
+    huge = replace(model, scaling=replace(model.scaling, Y=1e308))
+    with np.errstate(over='ignore'), pytest.raises(ModelError, match='diverges'):
+        free_run(huge, record(v, 7.5e-6 * v))
+
+
 def test_a_free_run_shows_itself():
     model, v = linear_stage(), sine(1.0, 1.0)
     run = free_run(model, record(v, 7.5e-6 * v + 1e-8))

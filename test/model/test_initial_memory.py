@@ -68,14 +68,6 @@ def test_a_few_samples_and_no_movement_will_do():
         assert found.shape == (9,)
 
 
-def test_inputs_are_left_alone():
-    piece = started_from(None)
-    v, y = piece.v.copy(), piece.y.copy()
-    fit_memory(PAPER, piece)
-    assert_array_equal(piece.v, v)
-    assert_array_equal(piece.y, y)
-
-
 def test_forgotten_is_the_first_sweep_over_the_range():
     assert forgotten(np.array([5.0, 6, 10, 0, 7, 10])) == 3
     assert forgotten(np.array([0.0, 10, 0, 10])) == 1

@@ -78,14 +78,6 @@ def test_any_number_survives(weights, p1):
     assert again.hysteresis.p2 == -1e-300
 
 
-def test_weight_at_zero_is_folded_on_loading():
-    d = data()
-    d['hysteresis'] = {'thresholds': [0, 0.2], 'weights': [0.5, 0.1], 'p1': 0, 'p2': 0.25}
-    h = model_from_dict(d).hysteresis
-    assert h.p2 == 0.75
-    assert_array_equal(h.thresholds, [0.2])
-
-
 def test_numbers_as_people_write_them(tmp_path):
     text = (CONFIG / 'stage_paper.yaml').read_text(encoding='utf-8').split('sensor:')[0]
     # YAML 1.1 takes 75e-6 for text

@@ -10,10 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.stage_model import EffectSetting, Scaling
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record
 import pytest
 
@@ -155,27 +154,3 @@ def test_simulate_starts_from_rest_or_from_the_memory_given():
     for wrong in ([[1.0, 2.0]], [1.0, np.nan], 3.0):
         with pytest.raises(DataError, match='voltage'):
             PAPER.simulate(wrong)
-
-
-def test_unknown_effect_is_refused():
-    with pytest.raises(ModelError, match='magic'):
-        EffectSetting('magic', {})
-
-
-def test_prediction_changes_nothing_it_was_given():
-    v = long_signal(300)
-    before = v.copy()
-    memory = np.zeros(9)
-    PAPER.stream(memory).process(v)
-    assert_array_equal(v, before)
-    assert_array_equal(memory, np.zeros(9))
-
-
-def test_zero_threshold_gives_the_same_stage():
-    h = PAPER.hysteresis
-    split = Hysteresis(
-        np.concatenate([[0.0], h.thresholds]), np.concatenate([[0.3], h.weights]), h.p1, h.p2 - 0.3
-    )
-    v = long_signal(500)
-    other = StageModel(FS, PAPER.scaling, split, PAPER.dynamics, PAPER.delay)
-    assert_allclose(other.stream().process(v), PAPER.stream().process(v), atol=1e-19)

@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 from numpy.testing import assert_array_equal
-from piezo_ident.operators.chain import Block, Chain, SLOTS
+from piezo_ident.operators.chain import Block, Chain
 import pytest
 
 
@@ -38,19 +38,10 @@ def block():
     return Block(t=np.arange(3.0), v=np.ones(3), x=np.arange(3.0), channels={'T': np.zeros(3)})
 
 
-def test_slots_stand_in_the_order_of_the_signal():
-    assert SLOTS == ('input', 'hysteresis', 'hidden', 'output', 'acquisition')
-
-
 def test_chain_applies_its_operators_in_order():
     chain = Chain((Add(1.0), Double(0.0), Add(-3.0)))
     assert chain.reset(0.0, 5.0) == 9.0
     assert_array_equal(chain.process(block()).x, 2 * (np.arange(3.0) + 1) - 3)
-
-
-def test_empty_chain_is_a_wire():
-    assert Chain(()).reset(0.3, 0.4) == 0.4
-    assert_array_equal(Chain(()).process(block()).x, np.arange(3.0))
 
 
 def test_block_is_frozen_and_keeps_everything_but_the_signal():

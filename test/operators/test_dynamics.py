@@ -51,20 +51,6 @@ def test_filter_is_that_of_scipy(G, seed):
     assert_allclose(got, expected, atol=1e-9 * max(1.0, np.abs(expected).max()))
 
 
-@pytest.mark.parametrize('na', [0, 1, 2, 5])
-@pytest.mark.parametrize('nb', [1, 2, 3, 6, 7])
-def test_filter_at_every_mix_of_orders(na, nb):
-    rng = np.random.default_rng(na * 10 + nb)
-    a, b = 0.15 * rng.standard_normal(na), rng.standard_normal(nb)
-    x = rng.standard_normal(60)
-    expected = signal.lfilter(b, np.concatenate([[1.0], a]), x)
-    assert_allclose(filter_arx(a, b, x, at_rest=False), expected, atol=1e-12)
-    # an impulse through B alone shows every coefficient
-    pulse = np.zeros(20)
-    pulse[3] = 1.0
-    assert_allclose(filter_arx(np.zeros(0), b, pulse)[3 : 3 + nb], b, atol=1e-15)
-
-
 @settings(deadline=None)
 @given(stable(), st.floats(-2, 2))
 def test_equilibrium_stays_at_rest(G, level):
@@ -107,13 +93,6 @@ def test_delay_shifts_whole_samples_and_parts_of_them():
     assert_allclose(Delay(1, 0.4).apply(line)[3:], line[3:] - 1.4)
     assert Delay(3, 0.4).total == 3.4
     assert_array_equal(Delay(9).apply(x), np.ones(7))
-
-
-def test_delay_leaves_its_input_alone():
-    x = np.arange(5.0)
-    for delay in (Delay(0), Delay(2), Delay(1, 0.5)):
-        delay.apply(x)
-        assert_array_equal(x, np.arange(5.0))
 
 
 @settings(deadline=None)
@@ -160,13 +139,20 @@ def test_paper_stage():
     assert_allclose(one.response([10.0, 900.0], 2e4) * PAPER.gain, PAPER.response([10, 900], 2e4))
 
 
-def test_poles_and_stability():
-    assert Dynamics.unit().radius == 0.0
-    assert Dynamics.unit().is_stable
-    assert Dynamics.unit().gain == 1.0
-    assert not Dynamics([-1.0], [1.0]).is_stable
-    assert Dynamics([-0.999], [1.0]).is_stable
-    assert not Dynamics([-2.0], [1.0]).is_stable
+@pytest.mark.parametrize(
+    ('a', 'stable'),
+    [
+        ([], True),
+        ([-0.999], True),
+        ([-1.0], False),
+        ([-2.0], False),
+        ([0.0, 1.0], False),
+        ([-2.0, 1.0], False),
+        ([0.5, -1.5], False),
+    ],
+)
+def test_a_pole_on_the_circle_or_beyond_is_not_stable(a, stable):
+    assert Dynamics(a, [1.0]).is_stable == stable
 
 
 @pytest.mark.parametrize('seed', range(40))
@@ -178,12 +164,8 @@ def test_stability_is_that_of_the_poles(seed):
         poles = np.concatenate([poles, rng.uniform(-1, 1, n % 2)])
         G = Dynamics(np.real(np.poly(poles))[1:], [1.0])
         assert G.is_stable == (G.radius < 1.0)
+        assert G.is_within(0.9) == (G.radius < 0.9)
         assert_array_equal(G.a, np.real(np.poly(poles))[1:])
-
-
-@pytest.mark.parametrize('a', [[-1.0], [0.0, 1.0], [-2.0, 1.0], [0.5, -1.5]])
-def test_a_pole_on_the_circle_is_not_stable(a):
-    assert not Dynamics(a, [1.0]).is_stable
 
 
 @pytest.mark.parametrize('cut', [1, 2, 3, 500, 20_001])
@@ -205,15 +187,10 @@ def test_no_number_stays_no_number():
     assert np.isnan(y[1:]).all()
 
 
-@pytest.mark.parametrize('b', [[0.0], [1.0, -1.0]])
-def test_no_static_gain_cannot_be_normalised(b):
+@pytest.mark.parametrize(('a', 'b'), [([0.1], [0.0]), ([0.1], [1.0, -1.0]), ([-1.0], [1.0])])
+def test_no_static_gain_cannot_be_normalised(a, b):
     with pytest.raises(ModelError, match='cannot be scaled'):
-        Dynamics([0.1], b).normalised()
-
-
-def test_integrator_cannot_be_normalised():
-    with pytest.raises(ModelError, match='cannot be scaled'):
-        Dynamics([-1.0], [1.0]).normalised()
+        Dynamics(a, b).normalised()
 
 
 @pytest.mark.parametrize(
@@ -224,13 +201,9 @@ def test_what_is_no_filter_is_refused(a, b):
         Dynamics(a, b)
 
 
-@pytest.mark.parametrize(('samples', 'fraction'), [(-1, 0), (1.5, 0), (1, 1.0), (1, -0.1)])
+@pytest.mark.parametrize(
+    ('samples', 'fraction'), [(-1, 0), (1.5, 0), (np.nan, 0), (np.inf, 0), (1, 1.0), (1, -0.1)]
+)
 def test_what_is_no_delay_is_refused(samples, fraction):
     with pytest.raises(ModelError):
         Delay(samples, fraction)
-
-
-@pytest.mark.parametrize('samples', [float('nan'), float('inf')])
-def test_endless_delay_is_refused(samples):
-    with pytest.raises(ModelError):
-        Delay(samples)

@@ -35,12 +35,6 @@ def test_full_stroke_is_that_of_the_papers_numbers():
     assert PAPER(np.linspace(0, 1, 100))[-1] == pytest.approx(full)
 
 
-def test_without_thresholds_it_is_the_cubic():
-    H = Hysteresis([], [], 0.5, 2.0)
-    v = np.linspace(-1, 1, 11)
-    assert_allclose(H(v), 0.5 * v**3 + 2 * v, atol=1e-15)
-
-
 @pytest.mark.parametrize('bias', [0.25, 0.5, 0.8])
 @pytest.mark.parametrize('excursion', [0.05, 0.15, 0.4])
 def test_slope_is_that_of_a_settled_loop(bias, excursion):
@@ -114,10 +108,3 @@ def test_operator_starts_from_the_memory_given_every_time():
     for _ in range(2):
         assert_array_equal(through(operator, u, u[0]), PAPER(u, memory_before))
     assert_array_equal(memory, memory_before)
-
-
-def test_rest_value_is_what_a_constant_gives():
-    operator = HysteresisOperator(PAPER)
-    rest = operator.reset(0.4, 0.4)
-    x = operator.process(Block(t=np.zeros(5), v=np.full(5, 0.4), x=np.full(5, 0.4))).x
-    assert_array_equal(x, np.full(5, rest))

@@ -47,16 +47,6 @@ def test_bounded_is_that_of_scipy_on_the_samples(seed):
     assert np.all((x >= low) & (x <= high))
 
 
-def test_without_bounds_it_is_lstsq():
-    A, y = data(200, 4), data(200, 1, 7)[:, 0]
-    x, loss = bounded_least_squares(
-        triangular_factor([np.column_stack([A, y])], 5), np.full(4, -np.inf), np.full(4, np.inf)
-    )
-    expected, (rest,), *_ = np.linalg.lstsq(A, y, rcond=None)
-    assert_allclose(x, expected, rtol=1e-9)
-    assert loss == pytest.approx(rest, rel=1e-9)
-
-
 def test_column_of_zeros_is_no_obstacle():
     A = data(100, 3)
     A[:, 1] = 0

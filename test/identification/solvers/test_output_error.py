@@ -108,16 +108,6 @@ def test_covariance_is_what_repeats_scatter_by():
     assert np.all(np.abs(bias) < 3.5 * claimed / np.sqrt(n_runs))
 
 
-def test_covariance_of_a_normalised_g_knows_that_its_b_depend_on_the_gain():
-    # of one pole and one b the gain leaves b = 1 + a: what is unsure of a is so of b
-    fit = output_error([stretch(1, 1500, noise=0.1)], Dynamics([-0.9], [0.1]), maxiter=20)
-    G = fit.dynamics.normalised()
-    assert_allclose(G.b, 1.0 + G.a)
-    sigma = np.sqrt(np.diag(fit.normalised_covariance))
-    assert_allclose(sigma[1], sigma[0])
-    assert sigma[0] == pytest.approx(np.sqrt(fit.covariance[0, 0]))
-
-
 def test_covariance_of_a_normalised_g_against_finite_differences():
     fit = output_error([stretch(1, 1500, noise=0.1)], G, maxiter=20)
     na, theta = G.a.size, np.concatenate([fit.dynamics.a, fit.dynamics.b])
