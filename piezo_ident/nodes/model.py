@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The model beside the stage: prediction, residual and preview as blocks come."""
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from piezo_ident.common.files import parse_yaml
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import expected_error, Predictor, warm_up
 from piezo_ident.model.files import load, model_from_dict
+from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
@@ -232,7 +232,7 @@ class ModelNode(LabNode):
         )
 
     def _live_error(self, model: StageModel) -> float:
-        return 100.0 * self._error.rms / abs(model.scaling.Y)
+        return percent(self._error.rms, abs(model.scaling.Y))
 
     def _report_state(self) -> None:
         fresh = [p for p, at in self._problems.items() if time.monotonic() - at < REMEMBER]

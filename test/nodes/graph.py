@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 A graph of real node processes for tests, and a node in this process that looks at it.
 

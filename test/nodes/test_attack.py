@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The graph under attack: nodes stay up, say what they refuse, and the voltage is safe."""
 
 from pathlib import Path

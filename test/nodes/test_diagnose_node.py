@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 A stage lacks something that nobody tells the identifier: it finds out on the running graph.
 

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The driver of the documentation in the place of the stage, and what it guarantees."""
 
 from pathlib import Path

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The excitation node as a process, with a stage beside it where it needs one."""
 
 from course import column, FS, HIGH, SHORT

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identifier as a process: what it captures, refuses, identifies, cancels and writes."""
 
 import json

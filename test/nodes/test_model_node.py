@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The model node as a process: what it predicts, refuses, shows, and when it warns."""
 
 import time

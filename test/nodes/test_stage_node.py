@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The stage node as a process, under streams that are in order and others."""
 
 from dataclasses import replace

@@ -1,12 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A diagnosis on the graph: diagnose, request the excitation that would decide, diagnose again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import functools
 from typing import Any, Protocol
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
@@ -15,7 +15,7 @@ from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.live.capture import Capture
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome
+from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 
 __all__ = ['DiagnosisSession', 'Host']
 
@@ -52,27 +52,28 @@ class DiagnosisSession:
 
     Attributes
     ----------
-    given : StageModel or None
-        The model that is diagnosed.
+    given : StageModel, str or None
+        The model that is diagnosed, or its file.
     diagnosis : Diagnosis or None
         The last one of this model.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
         self._host, self._capture = host, capture
-        self.given: StageModel | None = None
+        self.given: StageModel | str | None = None
         self.diagnosis: Diagnosis | None = None
         # samples up to here went into the model and cannot test it
         self._used: Mapping[str, int] = {}
         self.drop()
 
-    def take(self, model: StageModel, used: Mapping[str, int]) -> None:
+    def take(self, model: StageModel | str, used: Mapping[str, int]) -> None:
         """
         Take another model to diagnose.
 
         Parameters
         ----------
-        model : StageModel
+        model : StageModel or str
+            A model, or its file.
         used : mapping
             From `Capture.mark`, when the capture up to then went into the model.
         """
@@ -127,10 +128,12 @@ class DiagnosisSession:
             return f'no more than {most} requests are allowed'
         return '' if self._host.can_excite() else 'there is no excitation and no stage'
 
-    def _diagnose(self, given: StageModel) -> None:
+    def _diagnose(self, given: StageModel | str) -> None:
         settings = DiagnosisSettings(seed=self._host.values['seed'])
         snapshot = self._capture.snapshot(self._used)
-        job = diagnose_job(snapshot, given, tuple(self._requested), settings)
+        job = functools.partial(
+            diagnose_capture, snapshot, given, tuple(self._requested), settings
+        )
         self._host.start_diagnosis(job, self.seconds)
 
     def _request(self, wanted: Experiment) -> None:

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identifier's client of the excitation: set its program, start it, follow it to the end."""
 
 from __future__ import annotations

@@ -1,18 +1,16 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The jobs of the identifier's worker process; nothing here knows of topics.
 
-Jobs are sent to another process, so each is a partial of a function of this module.
+Jobs are sent to another process: each is a function of this module whose last argument, `tick`,
+the worker adds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-import functools
 import json
 from pathlib import Path
 
@@ -25,7 +23,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import first_steps, identify
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.live.capture import refuse_incomplete, Snapshot
-from piezo_ident.model.files import model_to_yaml
+from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
@@ -35,11 +33,11 @@ from piezo_ident.report import headline, json_text, steps_to_json, write_report
 __all__ = [
     'DiagnosisOutcome',
     'IdentificationOutcome',
-    'diagnose_job',
-    'identify_job',
+    'diagnose_capture',
+    'identify_capture',
     'percent_of',
     'records_of_runs',
-    'save_job',
+    'save',
     'settings_of',
     'warm_up',
 ]
@@ -87,7 +85,7 @@ class IdentificationOutcome:
         Number of warnings in the report.
     steps : Steps or None
         Results of the steps so far.
-    identification, record : Identification and Record, or None
+    identification : Identification or None
     model : str
         YAML; empty without a model.
     """
@@ -97,7 +95,6 @@ class IdentificationOutcome:
     warnings: int = 0
     steps: Steps | None = None
     identification: Identification | None = None
-    record: Record | None = None
     model: str = ''
 
 
@@ -131,26 +128,21 @@ def percent_of(step: str, share: float) -> float:
     return 100.0 * (low + (high - low) * share)
 
 
-def identify_job(
-    snapshot: Snapshot, settings: Settings, which: str = 'all', steps: Steps | None = None
-) -> Callable[[Tick], IdentificationOutcome]:
+def identify_capture(
+    snapshot: Snapshot, settings: Settings, which: str, steps: Steps | None, tick: Tick
+) -> IdentificationOutcome:
     """
-    Return a job that makes a record of a capture and identifies it.
+    Make a record of a capture and identify it.
 
     Parameters
     ----------
     snapshot : Snapshot
     settings : Settings
     which : {'all', 'delay', 'dynamics', 'hysteresis'}
-    steps : Steps, optional
+    steps : Steps or None
         Results of earlier steps; for single steps only.
+    tick : callable
     """
-    return functools.partial(_identify, snapshot, settings, which, steps)
-
-
-def _identify(
-    snapshot: Snapshot, settings: Settings, which: str, steps: Steps | None, tick: Tick
-) -> IdentificationOutcome:
     tick('record', 0.0)
     record = snapshot.record('capture')
     tick('record', 0.01)
@@ -171,7 +163,6 @@ def _identify(
         warnings=len(result.warnings),
         steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
         identification=result,
-        record=record,
         model=model_to_yaml(result.model),
     )
 
@@ -193,8 +184,8 @@ class DiagnosisOutcome:
     ----------
     diagnosis : Diagnosis or None
         None when the capture holds no motion.
-    message, report, model : str
-        The sentence, the diagnosis as JSON, the refined model as YAML.
+    message, report, model, given : str
+        The sentence, the diagnosis as JSON, the refined model and the given one as YAML.
     wanted : Experiment or None
         The experiment that would decide what is open.
     """
@@ -203,6 +194,7 @@ class DiagnosisOutcome:
     message: str = ''
     report: str = ''
     model: str = ''
+    given: str = ''
     wanted: Experiment | None = None
 
 
@@ -223,31 +215,28 @@ def records_of_runs(record: Record) -> list[Record]:
     return [Record(tuple(pieces), f'{record.name} {i}') for i, pieces in enumerate(runs, 1)]
 
 
-def diagnose_job(
-    snapshot: Snapshot, given: StageModel, asked: tuple[Kind, ...], settings: DiagnosisSettings
-) -> Callable[[Tick], DiagnosisOutcome]:
+def diagnose_capture(
+    snapshot: Snapshot,
+    given: StageModel | str,
+    asked: tuple[Kind, ...],
+    settings: DiagnosisSettings,
+    tick: Tick,
+) -> DiagnosisOutcome:
     """
-    Return a job that makes records of a capture and diagnoses a model by them.
+    Make records of a capture and diagnose a model by them.
 
     Parameters
     ----------
     snapshot : Snapshot
         Without what the model was identified from.
-    given : StageModel
+    given : StageModel or str
+        A model, or its file.
     asked : tuple of {'sweeps', 'holds'}
         Experiments that the excitation has played already.
     settings : DiagnosisSettings
+    tick : callable
     """
-    return functools.partial(_diagnose, snapshot, given, asked, settings)
-
-
-def _diagnose(
-    snapshot: Snapshot,
-    given: StageModel,
-    asked: tuple[Kind, ...],
-    settings: DiagnosisSettings,
-    tick: Tick,
-) -> DiagnosisOutcome:
+    given = load(given) if isinstance(given, str) else given
     tick('record', 0.0)
     record = snapshot.record('capture')
     records = [r for r in records_of_runs(record) if _is_driven(given, r)]
@@ -263,6 +252,7 @@ def _diagnose(
         message=result.sentence,
         report=json_text(result),
         model=model_to_yaml(result.model),
+        given=model_to_yaml(given),
         wanted=next_experiment(result, records, asked),
     )
 
@@ -272,43 +262,22 @@ def _is_driven(model: StageModel, record: Record) -> bool:
     return bool(np.ptp(record.voltage_range) >= DRIVEN * (high - low))
 
 
-def save_job(
-    identified: tuple[Identification, Record] | None, diagnosis: Diagnosis | None, folder: str
-) -> Callable[[Tick], str]:
-    """
-    Return a job that writes models, reports and pictures.
-
-    Parameters
-    ----------
-    identified : (Identification, Record) or None
-    diagnosis : Diagnosis or None
-        Goes into a folder ``diagnosis`` inside the other.
-    folder : str
-    """
-    return functools.partial(_save, identified, diagnosis, folder)
-
-
-def _save(
-    identified: tuple[Identification, Record] | None,
-    diagnosis: Diagnosis | None,
-    folder: str,
-    tick: Tick,
+def save(
+    identified: Identification | None, diagnosis: Diagnosis | None, folder: str, tick: Tick
 ) -> str:
+    """Write models, reports and pictures, those of a diagnosis into a folder inside the other."""
     tick('drawing', 0.0)
+    pages: list[Path] = []
     share = 0.5 if identified and diagnosis else 1.0
-    written = []
-    if identified:
-        result, _ = identified
-        page = write_report(result, folder, progress=lambda step, done: tick(step, share * done))
-        written.append(str(page))
-    if diagnosis:
-        page = write_report(
-            diagnosis,
-            Path(folder, FOLDER),
-            progress=lambda step, done: tick(step, 1.0 - share + share * done),
-        )
-        written.append(str(page))
-    return ' and '.join(written)
+
+    def progress(step: str, done: float) -> None:
+        tick(step, share * (len(pages) + done))
+
+    if identified is not None:
+        pages.append(write_report(identified, folder, progress=progress))
+    if diagnosis is not None:
+        pages.append(write_report(diagnosis, Path(folder, FOLDER), progress=progress))
+    return ' and '.join(map(str, pages))
 
 
 def warm_up() -> None:

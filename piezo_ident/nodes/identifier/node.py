@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identifier node: subscriptions, services, status, and the jobs of its worker process."""
 
 from __future__ import annotations
@@ -16,18 +15,17 @@ from typing import Any
 from piezo_ident.cli.outputs import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.common.process import Tick
-from piezo_ident.identification.results import Steps
+from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
-from piezo_ident.model.files import load, model_to_yaml
-from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.files import load
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
 from piezo_ident.nodes.identifier.jobs import (
     DiagnosisOutcome,
     IdentificationOutcome,
-    identify_job,
+    identify_capture,
     percent_of,
-    save_job,
+    save,
     settings_of,
     warm_up,
 )
@@ -60,20 +58,21 @@ class IdentifierNode(LabNode):
     executable = 'identifier'
 
     def __init__(self, **kwargs: Any) -> None:
-        self._files: dict[str, StageModel] = {}
         super().__init__(**kwargs)
         self._capture = Capture(self.values['capture_limit'])
         self._worker = Worker(self.values['nice'], warm_up)
         self._outcomes: deque[Callable[[], None]] = deque()
         self._state, self._task, self._reported_at = 'idle', '', 0.0
         self._steps = Steps()
-        self._result: IdentificationOutcome | None = None
+        self._identified: Identification | None = None
         self._session = DiagnosisSession(self, self._capture)
         # what the running identification uses of the capture, and the model last published
         self._using: dict[str, int] = {}
         self._published = ''
-        if self.values['model']:
-            self._take_file(self.values['model'])
+        if path := self.values['model']:
+            # at the start nothing waits, and a bad file ends the node
+            load(path)
+            self._session.take(path, {})
         self._counted, self._counted_at = 0, time.monotonic()
         self._passed: dict[str, int] = {}
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
@@ -204,23 +203,18 @@ class IdentifierNode(LabNode):
         if name == 'model' and value:
             if self._is_busy():
                 return f'busy: {self._task}; set the model when that has ended, or call ~/cancel'
-            try:
-                self._files = {value: load(value)}
-            except PiezoIdentError as error:
-                return str(error)
+            if not Path(value).is_file():
+                return f'model: {value}: no such file'
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Apply the limit of the capture and the model; the rest is read when work begins."""
         if 'capture_limit' in changed:
             self._capture.limit = changed['capture_limit']
-        if changed.get('model'):
-            self._take_file(changed['model'])
-
-    def _take_file(self, path: str) -> None:
-        model = self._files.pop(path)
-        self._session.take(model, {})
-        self._published = model_to_yaml(model)
+        if path := changed.get('model'):
+            # the job that needs it reads it
+            self._session.take(path, {})
+            self._published = ''
 
     # services
 
@@ -254,7 +248,10 @@ class IdentifierNode(LabNode):
                 'nothing has been captured; start the excitation, call ~/run, or replay a bag'
             )
         self._using = self._capture.mark()
-        job = identify_job(self._capture.snapshot(), settings_of(self.values), which, self._steps)
+        settings = settings_of(self.values)
+        job = functools.partial(
+            identify_capture, self._capture.snapshot(), settings, which, self._steps
+        )
         self._task = 'identification' if which == 'all' else f'identification of the {which}'
         self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
         self._start(job)
@@ -265,10 +262,7 @@ class IdentifierNode(LabNode):
 
     def _save(self) -> str:
         self._refuse_when_busy()
-        outcome, folder = self._result, self.values['output']
-        identified = None
-        if outcome is not None and outcome.identification and outcome.record:
-            identified = (outcome.identification, outcome.record)
+        identified, folder = self._identified, self.values['output']
         if identified is None and self._session.diagnosis is None:
             raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
         if not folder:
@@ -276,7 +270,7 @@ class IdentifierNode(LabNode):
         check_folder(Path(folder))
         self._task = 'saving'
         self._set_state('saving', 0.0, f'writing to {folder}')
-        self._start(save_job(identified, self._session.diagnosis, folder))
+        self._start(functools.partial(save, identified, self._session.diagnosis, folder))
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
@@ -327,7 +321,7 @@ class IdentifierNode(LabNode):
     def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
         """Publish report, model and verdict."""
         self._report.publish(String(data=outcome.report))
-        if outcome.model != self._published:
+        if outcome.model != (self._published or outcome.given):
             self._publish_model(outcome.model)
         message = '; '.join([outcome.message.rstrip('.'), *notes])
         self._set_state('done', 100.0, message, WARN if notes else OK)
@@ -372,7 +366,7 @@ class IdentifierNode(LabNode):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
             if result.model and result.identification is not None:
-                self._result = result
+                self._identified = result.identification
                 self._session.take(result.identification.model, self._using)
                 self._publish_model(result.model)
             count = result.warnings

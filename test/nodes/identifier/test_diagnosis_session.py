@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A diagnosis session without a graph: diagnose, request, diagnose again, conclude."""
 
 import itertools
@@ -12,9 +11,8 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis.next_experiment import Experiment
 from piezo_ident.live.capture import Capture
 from piezo_ident.model.files import model_to_yaml
-from piezo_ident.nodes.identifier import diagnosis_session as module
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
-from piezo_ident.nodes.identifier.jobs import diagnose_job, DiagnosisOutcome, records_of_runs
+from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome, records_of_runs
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.to_json import json_text
@@ -46,7 +44,7 @@ class Lab:
         self.there, self.refusal = there, refusal
         self.capture = Capture()
         self.session = DiagnosisSession(self, self.capture)
-        self.log, self.end, self.clock = [], None, itertools.count()
+        self.log, self.end, self.clock = [], None, itertools.count(1)
         self.jobs, self.answers = [], []
 
     def can_excite(self):
@@ -58,7 +56,7 @@ class Lab:
 
     def start_diagnosis(self, job, seconds):
         self.log.append('diagnosing')
-        self.jobs.append((job, seconds))
+        self.jobs.append((job.args, seconds))
 
     def conclude(self, outcome, notes):
         self.end = (outcome, notes)
@@ -75,9 +73,7 @@ class Lab:
 
 
 @pytest.fixture
-def lab(monkeypatch):
-    """Return a lab whose jobs are the arguments of the diagnosis."""
-    monkeypatch.setattr(module, 'diagnose_job', lambda *arguments: arguments)
+def lab():
     lab = Lab()
     lab.session.take(base_model(), {})
     return lab
@@ -86,7 +82,7 @@ def lab(monkeypatch):
 def outcome_of(verdict, wanted=None):
     found = example(verdict)
     return DiagnosisOutcome(
-        found, found.sentence, json_text(found), model_to_yaml(found.model), wanted
+        found, found.sentence, json_text(found), model_to_yaml(found.model), wanted=wanted
     )
 
 
@@ -174,7 +170,7 @@ def test_a_capture_without_motion_asks_and_fails_where_nobody_can_be_asked(lab):
     (piece,) = measured()
     still = Record((Piece(np.zeros(4000), piece.y[:4000], piece.sample_rate),))
     feed(lab.capture, still)
-    found = diagnose_job(lab.capture.snapshot(), base_model(), (), None)(lambda *_: None)
+    found = diagnose_capture(lab.capture.snapshot(), base_model(), (), None, lambda *_: None)
     assert found.diagnosis is None and found.wanted.kind == 'sweeps'
     lab.session.begin()
     lab.session.take_outcome(found)
