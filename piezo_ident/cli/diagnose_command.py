@@ -6,16 +6,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict, fields
-from pathlib import Path
 
-from piezo_ident.cli.console import Console, deferred_interrupts
+from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
-from piezo_ident.cli.model_commands import check_order, check_results, print_files
-from piezo_ident.cli.outputs import check_distinct
-from piezo_ident.cli.records import expand_apart, naming, read_all
+from piezo_ident.cli.model_commands import check_order, checked, keep, print_files, read_both
+from piezo_ident.cli.records import naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -23,11 +20,9 @@ from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.report import (
     changes,
-    check_report_folder,
     diagnosis_text,
     to_json,
     validated,
-    write_report,
 )
 
 __all__ = ['diagnose_command']
@@ -42,11 +37,9 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     if args.each is not None:
         diagnose_each(args, settings, console)
         return
-    paths, further = expand_apart(args.records, args.validation, console)
-    _check_outputs(args, [args.model_file, *paths, *further])
+    paths, further = checked(args, Diagnosis, console, args.model_file)
     given = load(args.model_file)
-    everything = read_all([*paths, *further], args)
-    records, validation = everything[: len(paths)], everything[len(paths) :]
+    records, validation = read_both(paths, further, args)
     for record in validation:
         # they are predicted in the end, and must not fail there
         with naming(record.name):
@@ -58,11 +51,7 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
-    with deferred_interrupts() as check:
-        if args.report is not None:
-            write_report(diagnosis, args.report, progress=check)
-        if args.model is not None:
-            diagnosis.model.save(args.model)
+    keep(diagnosis, args)
     console.say(diagnosis_text(diagnosis))
     changed = changes(given, diagnosis.model)
     note = ', '.join(changed) or f'the same as {args.model_file}, nothing changed'
@@ -84,16 +73,3 @@ def _settings(args: argparse.Namespace) -> DiagnosisSettings:
     named = {**vars(args), 'effects': only or None, 'without': without}
     names = {f.name for f in fields(DiagnosisSettings)}
     return DiagnosisSettings(**{k: x for k, x in named.items() if k in names})
-
-
-def _check_outputs(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
-    check_results(args, inputs)
-    if args.report is None:
-        return
-    if (args.report / 'identification.json').exists():
-        raise ConfigError(
-            f'{args.report}: holds the report of an identification; choose another folder'
-        )
-    for name in ('model.yaml', 'diagnosis.json', 'report.html'):
-        check_distinct(args.report / name, inputs)
-    check_report_folder(args.report, Diagnosis)

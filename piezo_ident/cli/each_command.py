@@ -39,13 +39,7 @@ SPREAD = {
 
 
 def check_each(args: argparse.Namespace) -> None:
-    """
-    Refuse options that go only with --each, or not with it.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse options that go only with --each, or not with it."""
     if args.each is None:
         for option in ('jobs', 'scheduler', 'reports'):
             if getattr(args, option):

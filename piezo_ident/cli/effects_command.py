@@ -24,14 +24,7 @@ WIDTH = 99
 
 
 def effect_name(text: str) -> str:
-    """
-    Return the name of an effect.
-
-    Raises
-    ------
-    ConfigError
-        When there is none of that name; with one that is spelt alike.
-    """
+    """Return the name of an effect."""
     if text in catalogue():
         return text
     close = difflib.get_close_matches(text.lower().replace('-', '_'), catalogue(), n=1)
@@ -40,14 +33,7 @@ def effect_name(text: str) -> str:
 
 
 def effect_names(texts: Sequence[str]) -> tuple[str, ...]:
-    """
-    Return names of effects, given one by one or joined by commas, each once.
-
-    Raises
-    ------
-    ConfigError
-        As `effect_name`.
-    """
+    """Return names of effects, given one by one or joined by commas, each once."""
     names = [name.strip() for text in texts for name in text.split(',')]
     return tuple(dict.fromkeys(effect_name(name) for name in names if name))
 

@@ -11,12 +11,12 @@ Nothing heavy is imported before the arguments are parsed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import signal
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from piezo_ident import __version__
 from piezo_ident.common.errors import PiezoIdentError
@@ -72,7 +72,6 @@ def _unit(text: str) -> str:
 
 
 def _reading() -> _Parser:
-    """Return the options of every verb that reads records."""
     options = _Parser(add_help=False)
     group = options.add_argument_group('how to read records')
     group.add_argument(
@@ -91,25 +90,20 @@ def _reading() -> _Parser:
     )
     group.add_argument('--namespace', type=_name, help='of the topics of a bag')
     for quantity in ('voltage', 'displacement'):
-        group.add_argument(
-            f'--{quantity}-topic',
-            type=_name,
-            metavar='TOPIC',
-            help=f'topic of a bag with the {quantity}',
-        )
+        text = f'topic of a bag with the {quantity}'
+        group.add_argument(f'--{quantity}-topic', type=_name, metavar='TOPIC', help=text)
     return options
 
 
 def _each() -> _Parser:
-    """Return the options of the verbs that take many records one by one."""
     options = _Parser(add_help=False)
     group = options.add_argument_group('many records')
     group.add_argument(
         '--each',
         type=_path,
         metavar='DIR',
-        help='take every record on its own; models, a table and a picture go there. What is done '
-        'is kept: the same command goes on where it was stopped',
+        help='take every record on its own; models and a table go there. What is done is kept: '
+        'the same command goes on where it was stopped',
     )
     group.add_argument('--jobs', type=_whole, metavar='N', help='processes (default: one a core)')
     group.add_argument(
@@ -119,34 +113,69 @@ def _each() -> _Parser:
     return options
 
 
-def _json() -> _Parser:
-    option = _Parser(add_help=False)
-    option.add_argument('--json', action='store_true', help='print the result as JSON, only that')
-    return option
-
-
-def _add_output(parser: argparse.ArgumentParser) -> None:
-    formats = '.csv, .npz, .mat, .mcap, .db3, or a folder for a rosbag2 bag'
-    parser.add_argument('out', type=_path, metavar='OUT', help=formats)
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing OUT')
-    parser.add_argument(
-        '--storage', choices=('mcap', 'sqlite3'), help='of a bag folder (default: mcap)'
+def _results() -> _Parser:
+    options = _Parser(add_help=False)
+    options.add_argument(
+        'records', nargs='+', type=_path, metavar='RECORD', help='file, bag, or folder of records'
     )
-
-
-def _add_results(parser: argparse.ArgumentParser, model: str, validation: str) -> None:
-    parser.add_argument('--model', type=_path, metavar='YAML', help=f'write the {model} there')
-    parser.add_argument(
+    options.add_argument('--model', type=_path, metavar='YAML', help='write the model there')
+    options.add_argument(
         '--report', type=_path, metavar='DIR', help='write page and pictures there'
     )
-    parser.add_argument(
+    options.add_argument(
         '--validation',
         nargs='+',
         type=_path,
         default=[],
         metavar='RECORD',
-        help=f'further records: {validation}',
+        help='further records, which are predicted and take no part in the work',
     )
+    return options
+
+
+def _output() -> _Parser:
+    options = _Parser(add_help=False)
+    formats = '.csv, .npz, .mat, .mcap, .db3, or a folder for a rosbag2 bag'
+    options.add_argument('out', type=_path, metavar='OUT', help=formats)
+    options.add_argument('--overwrite', action='store_true', help='replace an existing OUT')
+    options.add_argument(
+        '--storage', choices=('mcap', 'sqlite3'), help='of a bag folder (default: mcap)'
+    )
+    return options
+
+
+def _json() -> _Parser:
+    options = _Parser(add_help=False)
+    options.add_argument('--json', action='store_true', help='print the result as JSON, only that')
+    return options
+
+
+#: options of `Settings` and `DiagnosisSettings`: type, metavar and help; an option that is absent
+#: is left to their defaults
+IDENTIFY = {
+    '--thresholds': (
+        _thresholds,
+        'N|auto',
+        'number of plays; auto, the default: by held-out error',
+    ),
+    '--order': (_order, 'NA,NB', 'of G; searched when absent'),
+    '--max-order': (_whole, 'N', 'of the search (default: 15)'),
+    '--delay': (_whole, 'SAMPLES', 'identified from the data when absent'),
+    '--hold-out': (float, 'SECONDS', 'end of an unlabelled record not fitted'),
+    '--seed': (_whole, 'N', 'of the swarm (default: 0)'),
+}
+DIAGNOSE = {
+    '--most-effects': (_whole, 'N', 'added (default: 4)'),
+    '--most-samples': (_whole, 'N', 'searched, of the beginnings of the records'),
+    '--seed': (_whole, 'N', 'of what is drawn (default: 0)'),
+}
+
+
+def _add_settings(parser: _Parser, settings: Mapping[str, tuple[Any, str, str]]) -> None:
+    for option, (kind, metavar, text) in settings.items():
+        parser.add_argument(
+            option, type=kind, default=argparse.SUPPRESS, metavar=metavar, help=text
+        )
 
 
 def _build_parser() -> _Parser:
@@ -163,67 +192,28 @@ def _build_parser() -> _Parser:
             name, help=text, description=f'{text}.', parents=[*parents], allow_abbrev=False
         )
 
-    p = verb('simulate', 'Make a record with the simulated stage', _json())
-    p.add_argument(
-        '--config', type=_name, default='stage_paper', help='stage: a file, or the name of one'
-    )
-    p.add_argument(
-        '--program',
-        type=_name,
-        default='identification',
-        help='program: a file, or the name of one',
-    )
+    p = verb('simulate', 'Make a record with the simulated stage', _output(), _json())
+    a_file = 'a file, or the name of one'
+    p.add_argument('--config', type=_name, default='stage_paper', help=f'stage: {a_file}')
+    p.add_argument('--program', type=_name, default='identification', help=f'program: {a_file}')
     p.add_argument('--seed', type=_whole, help="of the sensor noise; the stage's own when absent")
     p.add_argument('--sample-rate', type=float, metavar='HZ', help="the stage's own when absent")
-    _add_output(p)
 
-    # an option that is absent is left to the library's Settings
-    p = verb('identify', 'Learn a model from records', _reading(), _each(), _json())
-    p.add_argument(
-        'records', nargs='+', type=_path, metavar='RECORD', help='file, bag, or folder of records'
-    )
-    _add_results(p, 'model', 'predicted, not fitted')
-    absent = argparse.SUPPRESS
-    p.add_argument(
-        '--thresholds',
-        type=_thresholds,
-        default=absent,
-        metavar='N|auto',
-        help='number of plays; auto, the default, chooses it by held-out error',
-    )
+    shared = _results(), _reading(), _each(), _json()
+    p = verb('identify', 'Learn a model from records', *shared)
     p.add_argument(
         '--solver',
         choices=('least_squares', 'swarm'),
-        default=absent,
+        default=argparse.SUPPRESS,
         help='of the weights (default: least_squares)',
     )
     p.add_argument(
         '--polish',
         action='store_true',
-        default=absent,
+        default=argparse.SUPPRESS,
         help='let least squares finish what the swarm found',
     )
-    p.add_argument(
-        '--order', type=_order, default=absent, metavar='NA,NB', help='of G; searched when absent'
-    )
-    p.add_argument(
-        '--max-order', type=_whole, default=absent, metavar='N', help='of the search (default: 15)'
-    )
-    p.add_argument(
-        '--delay',
-        type=_whole,
-        default=absent,
-        metavar='SAMPLES',
-        help='identified from the data when absent',
-    )
-    p.add_argument(
-        '--hold-out',
-        type=float,
-        default=absent,
-        metavar='SECONDS',
-        help='end of an unlabelled record not fitted',
-    )
-    p.add_argument('--seed', type=_whole, default=absent, help='of the swarm (default: 0)')
+    _add_settings(p, IDENTIFY)
 
     p = verb('predict', 'Run a model over a record, or a voltage alone', _reading(), _json())
     p.add_argument('model', type=_path, metavar='MODEL', help='model file')
@@ -235,27 +225,14 @@ def _build_parser() -> _Parser:
     )
     p.add_argument('--plot', type=_path, metavar='PNG', help='picture of measured and predicted')
 
-    p = verb(
-        'diagnose',
-        'Find the effect that a model lacks, and add it',
-        _reading(),
-        _each(),
-        _json(),
-    )
-    p.add_argument(
+    given = _Parser(add_help=False)
+    given.add_argument(
         'model_file',
         type=_path,
         metavar='MODEL',
         help='model file; with --each also a folder with one of the name of every record',
     )
-    p.add_argument(
-        'records',
-        nargs='+',
-        type=_path,
-        metavar='RECORD',
-        help='file, bag, or folder of records that the model was not identified from',
-    )
-    _add_results(p, 'refined model', 'predicted before and after, with no part in the diagnosis')
+    p = verb('diagnose', 'Find the effect that a model lacks, and add it', given, *shared)
     for option, text in (
         ('--only', 'try this effect and no other'),
         ('--without', 'do not try this effect'),
@@ -268,21 +245,11 @@ def _build_parser() -> _Parser:
             metavar='NAME',
             help=f'{text}; may be given several times',
         )
-    p.add_argument(
-        '--most-effects', type=_whole, default=absent, metavar='N', help='added (default: 4)'
-    )
-    p.add_argument(
-        '--most-samples',
-        type=_whole,
-        default=absent,
-        metavar='N',
-        help='searched, of the beginnings of the records',
-    )
-    p.add_argument('--seed', type=_whole, default=absent, help='of what is drawn (default: 0)')
+    _add_settings(p, DIAGNOSE)
 
-    p = verb('convert', 'Turn a record into another format', _reading(), _json())
-    p.add_argument('record', type=_path, metavar='IN', help='file or bag')
-    _add_output(p)
+    given = _Parser(add_help=False)
+    given.add_argument('record', type=_path, metavar='IN', help='file or bag')
+    verb('convert', 'Turn a record into another format', given, _output(), _reading(), _json())
 
     p = verb('effects', 'List the effects that a model can have', _json())
     p.add_argument('name', nargs='?', type=_name, metavar='NAME', help='say more about this one')

@@ -26,6 +26,7 @@ from piezo_ident.cli.records import (
 )
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
+from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.model.files import load
@@ -34,7 +35,15 @@ from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Record
 from piezo_ident.record.tables import blocks_of, WRITERS
 
-__all__ = ['check_order', 'check_results', 'identify_command', 'predict_command', 'print_files']
+__all__ = [
+    'check_order',
+    'checked',
+    'identify_command',
+    'keep',
+    'predict_command',
+    'print_files',
+    'read_both',
+]
 
 MODEL_FILES = ('.yaml', '.yml')
 TABLE_FILES = ('.csv', '.npz')
@@ -49,25 +58,13 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     if args.each is not None:
         identify_each(args, settings, console)
         return
-    paths, further = expand_apart(args.records, args.validation, console)
     from piezo_ident import report
 
-    check_results(args, [*paths, *further])
-    if args.report is not None:
-        if (args.report / 'diagnosis.json').exists():
-            raise ConfigError(
-                f'{args.report}: holds the report of a diagnosis; choose another folder'
-            )
-        report.check_report_folder(args.report, Identification)
-    everything = read_all([*paths, *further], args)
-    records, validation = everything[: len(paths)], everything[len(paths) :]
+    paths, further = checked(args, Identification, console)
+    records, validation = read_both(paths, further, args)
     with naming(*(record.name for record in records)), console.progress() as progress:
         result = identify(records, settings, validation=validation, progress=progress)
-    with deferred_interrupts() as check:
-        if args.report is not None:
-            report.write_report(result, args.report, progress=check)
-        if args.model is not None:
-            result.model.save(args.model)
+    keep(result, args)
     console.say(report.identification_text(result))
     checks = []
     for record in validation:
@@ -84,14 +81,14 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
     console.result({**report.to_json(result), 'validation': checks, 'files': files})
 
 
-def check_results(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
-    """
-    Refuse a model file or a report folder that could not be written in the end.
+def checked(
+    args: argparse.Namespace, kind: type, console: Console, *others: Path
+) -> tuple[list[Path], list[Path]]:
+    """Return the records for the work and for validation; refuse outputs before the work."""
+    from piezo_ident.report import check_report_folder
 
-    Raises
-    ------
-    PiezoIdentError
-    """
+    paths, further = expand_apart(args.records, args.validation, console)
+    inputs = [*others, *paths, *further]
     if args.report is not None:
         check_folder(args.report)
     if args.model is not None:
@@ -100,6 +97,33 @@ def check_results(args: argparse.Namespace, inputs: Sequence[Path]) -> None:
         if args.model.parent != args.report:
             check_file(args.model, overwrite=True)
         check_distinct(args.model, inputs)
+    if args.report is not None:
+        other = 'diagnosis' if kind is Identification else 'identification'
+        if (args.report / f'{other}.json').exists():
+            raise ConfigError(f'{args.report}: holds the report of {other}; choose another folder')
+        for name in ('model.yaml', 'diagnosis.json', 'report.html'):
+            check_distinct(args.report / name, inputs)
+        check_report_folder(args.report, kind)
+    return paths, further
+
+
+def read_both(
+    paths: Sequence[Path], further: Sequence[Path], args: argparse.Namespace
+) -> tuple[list[Record], list[Record]]:
+    """Read records and those for validation as the records of one call."""
+    everything = read_all([*paths, *further], args)
+    return everything[: len(paths)], everything[len(paths) :]
+
+
+def keep(result: Identification | Diagnosis, args: argparse.Namespace) -> None:
+    """Write report and model where the arguments say."""
+    from piezo_ident.report import write_report
+
+    with deferred_interrupts() as check:
+        if args.report is not None:
+            write_report(result, args.report, progress=check)
+        if args.model is not None:
+            result.model.save(args.model)
 
 
 def print_files(args: argparse.Namespace, console: Console, note: str = '') -> dict[str, Any]:
@@ -176,13 +200,7 @@ def _write_prediction(record: Record, pieces: Sequence[NDArray[np.float64]], pat
 
 
 def check_order(model: Path, record: Path, verb: str) -> None:
-    """
-    Refuse a model and a record in the wrong order.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a model and a record in the wrong order."""
     order = f'MODEL comes first: piezo_ident {verb} model.yaml record.csv'
     if model.suffix.lower() in RECORD_FILES or model.is_dir():
         raise ConfigError(f'{model}: is a record, no model file; {order}')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks of output paths, which come before the long work."""
+"""Checks of output paths, which come before the long work; each raises a `PiezoIdentError`."""
 
 from __future__ import annotations
 
@@ -24,13 +24,7 @@ __all__ = [
 
 
 def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
-    """
-    Refuse a suffix that names no format.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a suffix that names no format."""
     known = list(suffixes)
     if path.suffix.lower() not in known:
         names = ', '.join(s or 'a folder' for s in known)
@@ -40,34 +34,14 @@ def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
 
 
 def check_link(path: Path) -> None:
-    """
-    Refuse a symbolic link that leads nowhere.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse a symbolic link that leads nowhere."""
     broken = broken_link(path)
     if broken:
         raise DataError(f'{path}: {broken}')
 
 
 def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
-    """
-    Refuse an output that could not be written in the end.
-
-    Parameters
-    ----------
-    path : path
-    overwrite : bool
-        Whether an existing one may be replaced.
-    folder_too : bool
-        Whether the output may be a folder (a bag).
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse an output that could not be written in the end; a bag may be a folder too."""
     check_link(path)
     try:
         if path.is_dir() and not folder_too:
@@ -86,13 +60,7 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
 
 
 def check_folder(path: Path) -> None:
-    """
-    Refuse a folder in which files could not be written in the end; it need not exist yet.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse a folder in which files could not be written in the end; it need not exist yet."""
     check_link(path)
     try:
         if path.exists() and not path.is_dir():
@@ -107,25 +75,13 @@ def check_folder(path: Path) -> None:
 
 
 def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
-    """
-    Refuse to write a result over what it is made of.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse to write a result over what it is made of."""
     if output.exists() and any(p.exists() and output.samefile(p) for p in inputs):
         raise DataError(f'{output}: is one of the inputs; choose another name')
 
 
 def check_apart(output: Path, record: Path) -> None:
-    """
-    Refuse to write a record over another, into the folder of it, or where that lies below.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse to write a record over another, into the folder of it, or where that lies below."""
     # pathlib has an error of its own for links in a circle
     out, given = (Path(os.path.realpath(path)) for path in (output, record))
     if out == given or out in given.parents or given in out.parents:

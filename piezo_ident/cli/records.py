@@ -88,14 +88,7 @@ def _is_record(path: Path) -> bool:
 def expand_apart(
     records: Sequence[Path], validation: Sequence[Path], console: Console
 ) -> tuple[list[Path], list[Path]]:
-    """
-    Return the records that are named for a model and for its validation.
-
-    Raises
-    ------
-    DataError
-        When one is named for both.
-    """
+    """Return the records that are named for a model and for its validation."""
     paths, further = expand(records, console), expand(validation, console)
     # pathlib has an error of its own for links in a circle
     fitted = set(map(os.path.realpath, paths))
@@ -106,13 +99,7 @@ def expand_apart(
 
 
 def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
-    """
-    Refuse options that choose topics where no record is a bag.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse options that choose topics where no record is a bag."""
     tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
         if tables and getattr(args, option) is not None:
@@ -122,14 +109,7 @@ def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
 
 
 def options_of(args: argparse.Namespace) -> ReadOptions:
-    """
-    Return how the arguments have records read.
-
-    Raises
-    ------
-    ConfigError
-        When the higher voltage limit comes first.
-    """
+    """Return how the arguments have records read."""
     limits = args.voltage_limits
     if limits is not None and not limits[0] < limits[1]:
         low, high = limits

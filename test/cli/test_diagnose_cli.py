@@ -230,7 +230,7 @@ def test_inputs_and_other_reports_are_never_overwritten(capsys, made, quick):
     refuse(capsys, made, [*argv, '--report', made], 'is one of the inputs')
     (made / 'old').mkdir()
     (made / 'old' / 'identification.json').write_text('{}')
-    refuse(capsys, made, [*argv, '--report', made / 'old'], 'report of an identification')
+    refuse(capsys, made, [*argv, '--report', made / 'old'], 'report of identification')
     (made / 'mine').mkdir()
     (made / 'mine' / 'model.yaml').write_text('')
     refuse(capsys, made, [*argv, '--report', made / 'mine'], 'of no earlier report')
