@@ -5,25 +5,26 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['AmplifierLag']
 
 
 @kernel
-def _follow(x: NDArray[np.float64], pole: float, state: float) -> NDArray[np.float64]:
+def _follow(
+    x: NDArray[np.float64], pole: float, state: NDArray[np.float64]
+) -> NDArray[np.float64]:
     out = np.empty(x.size)
-    y, share = state, 1.0 - pole
+    y, share = state[0], 1.0 - pole
     for k in range(x.size):
         y = alive(y + share * (x[k] - y))
         out[k] = y
+    state[0] = y
     return out
 
 
@@ -44,23 +45,20 @@ class AmplifierLag(Effect):
     each hold.
     """
 
-    name: ClassVar[str] = 'amplifier_lag'
-    slot: ClassVar[Slot] = 'input'
-    description: ClassVar[str] = (
-        'RC lag of amplifier and piezo before the hysteresis; corner at 0.5 .. 10 kHz'
-    )
-    needs: ClassVar[str] = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'amplifier_lag'
+    slot = 'input'
+    description = 'RC lag of amplifier and piezo before the hysteresis; corner at 0.5 .. 10 kHz'
+    needs = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
+    parameters = (
         Parameter(
             'time_constant', 's', 'time constant tau', 0.0, 0.0, 1.0, step=1e-4, scale='linear'
         ),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Compute the pole."""
         tau = self.number('time_constant')
         self._pole = float(np.exp(-1.0 / (self.sample_rate * tau))) if tau > 0.0 else 0.0
-        self._state = 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -71,13 +69,12 @@ class AmplifierLag(Effect):
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the amplifier has caught up."""
-        self._state = x0
+        self._state = np.array([x0])
         return x0
 
     def process(self, block: Block) -> Block:
         """Return the block with its signal lagged."""
-        if self._pole == 0.0 or block.x.size == 0:
+        if self._pole == 0.0:
             return block
-        y = _follow(np.ascontiguousarray(block.x), self._pole, self._state)
-        self._state = float(y[-1])
-        return block.with_signal(y)
+        x = np.ascontiguousarray(block.x)
+        return block.with_signal(_follow(x, self._pole, self._state))

@@ -5,26 +5,25 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import held
 
 __all__ = ['Backlash']
 
 
 @kernel
-def _play(x: NDArray[np.float64], width: float, state: float) -> NDArray[np.float64]:
+def _play(x: NDArray[np.float64], width: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.empty(x.size)
-    p = state
+    p = state[0]
     for k in range(x.size):
         p = held(p, x[k] - width, x[k] + width)
         out[k] = p
+    state[0] = p
     return out
 
 
@@ -44,20 +43,14 @@ class Backlash(Effect):
     gives the same loop.
     """
 
-    name: ClassVar[str] = 'backlash'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
-        'lost motion after each turn of the displacement; 0.1 .. 2 % of stroke'
-    )
-    needs: ClassVar[str] = 'sweeps with turns, both slow and near the first resonance'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'backlash'
+    slot = 'output'
+    description = 'lost motion after each turn of the displacement; 0.1 .. 2 % of stroke'
+    needs = 'sweeps with turns, both slow and near the first resonance'
+    parameters = (
         Parameter('width', '1', 'half-width rho of the play', NAN, 0.0, 2.0, scale='log'),
         Parameter('gain', '1', 'share g that hangs in it', 0.0, -100.0, 100.0, step=0.1),
     )
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._state = 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -69,14 +62,11 @@ class Backlash(Effect):
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest in the middle of the play."""
-        self._state = x0
+        self._state = np.array([x0])
         return x0
 
     def process(self, block: Block) -> Block:
         """Return the block with its motion lost in part."""
         gain = self.number('gain')
-        if block.x.size == 0:
-            return block
         p = _play(np.ascontiguousarray(block.x), self.number('width'), self._state)
-        self._state = float(p[-1])
         return block.with_signal(p if gain == 1.0 else block.x + gain * (p - block.x))

@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['ChangedDynamics']
 
@@ -36,22 +34,22 @@ class ChangedDynamics(Effect):
     "Discrete-Time Signal Processing".
     """
 
-    name: ClassVar[str] = 'changed_dynamics'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
+    name = 'changed_dynamics'
+    slot = 'output'
+    description = (
         'a resonance added or moved since G was identified, as by a load; linear, the static gain '
         'stays'
     )
-    needs: ClassVar[str] = 'a multisine or noise, or steps, across the resonance'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'a multisine or noise, or steps, across the resonance'
+    parameters = (
         Parameter('frequency', 'Hz', 'frequency of mode m', NAN, 1e-3, 1e6, True, scale='log'),
         Parameter('damping', '1', 'damping ratio zeta_m', NAN, 1e-4, 10.0, True, scale='log'),
         Parameter('gain', '1', 'share g_m', 0.0, -100.0, 100.0, True, step=1e-3),
         Parameter('rate_gain', '1', 'share k_m of the rate', 0.0, -100.0, 100.0, True, step=1e-3),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Build the modes."""
         columns = zip(*(self.array(p.name).tolist() for p in self.parameters), strict=True)
         self._sections = [
             SecondOrderSection(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns

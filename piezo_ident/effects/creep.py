@@ -5,14 +5,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['Creep']
 
@@ -55,13 +53,13 @@ class Creep(Effect):
     doi:10.1049/ip-cta:20010375.
     """
 
-    name: ClassVar[str] = 'creep'
-    slot: ClassVar[Slot] = 'hidden'
-    description: ClassVar[str] = (
+    name = 'creep'
+    slot = 'hidden'
+    description = (
         'slow motion after each change of the voltage; 1 .. 2 % a decade of time, 1 .. 5 % in all'
     )
-    needs: ClassVar[str] = 'a hold of at least 2 s after a step'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'a hold of at least 2 s after a step'
+    parameters = (
         Parameter(
             'gain', '1', 'share c_i of each element', 0.0, -1.0, 1.0, vector=True, step=1e-3
         ),
@@ -70,12 +68,11 @@ class Creep(Effect):
         ),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Leave out elements without a share."""
         seen = np.flatnonzero(self.array('gain'))
         self._c = self.array('gain')[seen]
         self._share = -np.expm1(-1.0 / (self.sample_rate * self.array('time_constant')[seen]))
-        self._state = np.zeros(seen.size)
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection, slope_of_mode
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['CrossCoupling']
 
@@ -31,13 +29,11 @@ class CrossCoupling(Effect):
     Control of Nanopositioning Systems", Springer, 2014, doi:10.1007/978-3-319-06617-2.
     """
 
-    name: ClassVar[str] = 'cross_coupling'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
-        "motion that follows another axis's voltage; 0.5 .. 3 % of that axis's stroke"
-    )
-    needs: ClassVar[str] = "a further channel with the other axis's voltage while that axis moves"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'cross_coupling'
+    slot = 'output'
+    description = "motion that follows another axis's voltage; 0.5 .. 3 % of that axis's stroke"
+    needs = "a further channel with the other axis's voltage while that axis moves"
+    parameters = (
         Parameter(
             'channel',
             'name',
@@ -57,8 +53,8 @@ class CrossCoupling(Effect):
         ),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Build the filter of the channel."""
         frequency, gain = self.number('frequency'), self.number('gain')
         # g M + g' s M = g + g (M - 1) + g' (s/S) R; s/S as it is at low frequencies, where the
         # rate is that of the channel whatever the prewarping

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['DelayChange']
 
@@ -32,16 +32,14 @@ class DelayChange(Effect):
     unit delay", IEEE Signal Process. Mag. 13(1), 1996, pp. 30-60.
     """
 
-    name: ClassVar[str] = 'delay_change'
-    slot: ClassVar[Slot] = 'acquisition'
-    description: ClassVar[str] = (
+    name = 'delay_change'
+    slot = 'acquisition'
+    description = (
         'a delay other than the one identified; a sample at 20 kHz is 1.3 % of stroke at 120 Hz'
     )
-    needs: ClassVar[str] = 'fast sines, a multisine or steps'
-    in_delay_line: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter('samples', 'samples', 'added delay delta', 0.0, -1e5, 1e5, step=0.1),
-    )
+    needs = 'fast sines, a multisine or steps'
+    in_delay_line = True
+    parameters = (Parameter('samples', 'samples', 'added delay delta', 0.0, -1e5, 1e5, step=0.1),)
 
     @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
@@ -53,10 +51,6 @@ class DelayChange(Effect):
         """Return a fraction of a sample, about 1e-3 of the span at the speeds seen."""
         step = min(0.5, max(0.01, 1e-3 * view.sample_rate / view.speed))
         return (cls.trial({}, steps={'samples': step}),)
-
-    def reset(self, v0: float, x0: float) -> float:
-        """Come to rest."""
-        return x0
 
     def process(self, block: Block) -> Block:
         """Return the block as it is: the model's delay line does the work."""

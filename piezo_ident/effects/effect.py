@@ -78,6 +78,10 @@ class Parameter:
         """Whether the effect is proportional to it near its neutral value."""
         return self.step > 0.0
 
+    def neutral_like(self, value: Value) -> Value:
+        """Return the neutral value, as a list where the value is one."""
+        return np.full(np.size(value), self.neutral) if self.vector else self.neutral
+
     def clip(self, value: Any) -> Any:
         """Return a value, or a list of them, moved into the bounds."""
         return value if self.kind == 'text' else np.clip(value, self.lower, self.upper)
@@ -173,6 +177,10 @@ class Effect:
         self.values = self.check(values)
         self.hysteresis = hysteresis or Hysteresis([], [], 0.0, 1.0)  # type: ignore[arg-type]
         self.inner: Operator = inner or HysteresisOperator(self.hysteresis)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compute once what follows from the parameters alone."""
 
     @classmethod
     def check(cls, values: Mapping[str, Any]) -> dict[str, Value]:
@@ -220,9 +228,7 @@ class Effect:
         checked = cls.check(values)
         for p in cls.parameters:
             if not np.isnan(p.neutral):
-                old = checked[p.name]
-                new = np.full(old.size, p.neutral) if isinstance(old, np.ndarray) else p.neutral
-                checked[p.name] = new
+                checked[p.name] = p.neutral_like(checked[p.name])
         return checked
 
     @classmethod
@@ -291,42 +297,28 @@ class Effect:
         values = cls.check({name: known[name].clip(x) for name, x in shape.items()})
         for p in cls.parameters:
             if p.is_amplitude and p.name not in shape:
-                old = values[p.name]
-                values[p.name] = (
-                    np.full(old.size, p.neutral) if isinstance(old, np.ndarray) else p.neutral
-                )
-        moves: list[tuple[str, int | None]] = []
-        for p in cls.parameters:
-            if p.is_amplitude and (moved is None or p.name in moved):
-                start = values[p.name]
-                if isinstance(start, np.ndarray):
-                    moves += [(p.name, i) for i in range(start.size)]
-                else:
-                    moves.append((p.name, None))
+                values[p.name] = p.neutral_like(values[p.name])
+        moves = tuple(
+            (p.name, i)
+            for p in cls.parameters
+            if p.is_amplitude and (moved is None or p.name in moved)
+            for i in (range(np.size(values[p.name])) if p.vector else (None,))
+        )
         own = steps or {}
         far = tuple(float(own.get(name, known[name].step)) for name, _ in moves)
-        return Trial(values, tuple(moves), far)
+        return Trial(values, moves, far)
 
     def number(self, name: str) -> float:
         """Return a scalar parameter."""
-        value = self.values[name]
-        if not isinstance(value, float):
-            raise ModelError(f'effect {self.name}: {name} is not one number')
-        return value
+        return float(self.values[name])
 
     def array(self, name: str) -> NDArray[np.float64]:
         """Return a parameter as a vector."""
-        value = self.values[name]
-        if isinstance(value, str):
-            raise ModelError(f'effect {self.name}: {name} is a text')
-        return np.atleast_1d(np.asarray(value, dtype=np.float64))
+        return np.atleast_1d(np.asarray(self.values[name], dtype=np.float64))
 
     def text(self, name: str) -> str:
         """Return a text parameter."""
-        value = self.values[name]
-        if not isinstance(value, str):
-            raise ModelError(f'effect {self.name}: {name} is not a text')
-        return value
+        return str(self.values[name])
 
     @property
     def core(self) -> Operator:
@@ -337,8 +329,8 @@ class Effect:
         return operator
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest; see `piezo_ident.operators.chain.Operator`."""
-        raise NotImplementedError
+        """Come to rest; what has no memory, and adds nothing at rest, passes its signal on."""
+        return x0
 
     def process(self, block: Block) -> Block:
         """Apply the effect; see `piezo_ident.operators.chain.Operator`."""

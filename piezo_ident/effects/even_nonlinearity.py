@@ -5,12 +5,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['EvenNonlinearity']
 
@@ -31,13 +29,11 @@ class EvenNonlinearity(Effect):
     Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, eqs. 3 and 6.
     """
 
-    name: ClassVar[str] = 'even_nonlinearity'
-    slot: ClassVar[Slot] = 'hysteresis'
-    description: ClassVar[str] = (
-        'even powers of the voltage in the static curve; 0.1 .. 2 % of stroke'
-    )
-    needs: ClassVar[str] = 'slow sweeps over the full range with minor loops at several biases'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'even_nonlinearity'
+    slot = 'hysteresis'
+    description = 'even powers of the voltage in the static curve; 0.1 .. 2 % of stroke'
+    needs = 'slow sweeps over the full range with minor loops at several biases'
+    parameters = (
         Parameter('square', '1', 'coefficient p0 of v^2', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('fourth', '1', 'coefficient p4 of v^4', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -10.0, 10.0, step=1e-3),

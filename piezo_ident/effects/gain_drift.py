@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['GainDrift']
 
@@ -32,21 +32,17 @@ class GainDrift(Effect):
     first degree: C. de Boor, "A Practical Guide to Splines", Springer, 1978.
     """
 
-    name: ClassVar[str] = 'gain_drift'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = 'a gain that wanders during the record with temperature or age'
-    needs: ClassVar[str] = 'the same motion at the start and at the end of a long record'
-    time_driven: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'gain_drift'
+    slot = 'output'
+    description = 'a gain that wanders during the record with temperature or age'
+    needs = 'the same motion at the start and at the end of a long record'
+    time_driven = True
+    parameters = (
         Parameter(
             'time', 's', 'time of each knot, ascending', NAN, -1e9, 1e9, True, scale='fixed'
         ),
         Parameter('gain', '1', 'change a of the gain there', 0.0, -1.0, 10.0, True, step=1e-3),
     )
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._time, self._gain = self.array('time'), self.array('gain')
 
     @classmethod
     def agree(cls, values: Mapping[str, Value]) -> None:
@@ -77,10 +73,11 @@ class GainDrift(Effect):
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the gain as it is before the first knot."""
-        return x0 * (1.0 + float(self._gain[0]))
+        return x0 * (1.0 + float(self.array('gain')[0]))
 
     def process(self, block: Block) -> Block:
         """Return the block with the gain of each moment."""
-        if not self._gain.any():
+        time, gain = self.array('time'), self.array('gain')
+        if not gain.any():
             return block
-        return block.with_signal(block.x * (1.0 + np.interp(block.t, self._time, self._gain)))
+        return block.with_signal(block.x * (1.0 + np.interp(block.t, time, gain)))

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['InputFeedthrough']
 
@@ -28,20 +26,14 @@ class InputFeedthrough(Effect):
     v: H. W. Ott, "Electromagnetic Compatibility Engineering", Wiley, 2009, chapters 2 and 3.
     """
 
-    name: ClassVar[str] = 'input_feedthrough'
-    slot: ClassVar[Slot] = 'acquisition'
-    description: ClassVar[str] = (
-        'the drive leaks into the reading, ahead of the motion; up to 0.5 % of stroke'
-    )
-    needs: ClassVar[str] = 'steps, or wide-band noise, sampled faster than the delay'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'input_feedthrough'
+    slot = 'acquisition'
+    description = 'the drive leaks into the reading, ahead of the motion; up to 0.5 % of stroke'
+    needs = 'steps, or wide-band noise, sampled faster than the delay'
+    parameters = (
         Parameter('gain', '1', 'share k0 of the command', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('rate_gain', 's', 'share k1 of its rate', 0.0, -1.0, 1.0, step=1e-6),
     )
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._last = 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

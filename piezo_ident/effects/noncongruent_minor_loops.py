@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import held
 from piezo_ident.operators.play import initial_memory
@@ -65,13 +64,11 @@ class NoncongruentMinorLoops(Effect):
     Springer, 1991, doi:10.1007/978-1-4612-3028-1.
     """
 
-    name: ClassVar[str] = 'noncongruent_minor_loops'
-    slot: ClassVar[Slot] = 'hysteresis'
-    description: ClassVar[str] = (
-        'minor loops of one width that differ with the bias; 0.3 .. 2 % of stroke'
-    )
-    needs: ClassVar[str] = 'equal minor loops at three biases'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'noncongruent_minor_loops'
+    slot = 'hysteresis'
+    description = 'minor loops of one width that differ with the bias; 0.3 .. 2 % of stroke'
+    needs = 'equal minor loops at three biases'
+    parameters = (
         Parameter(
             'threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='fixed'
         ),
@@ -82,11 +79,10 @@ class NoncongruentMinorLoops(Effect):
         ),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Unpack the lists."""
         self._r = self.array('threshold')
         self._slope, self._bend = self.array('slope'), self.array('bend')
-        self._memory = initial_memory(0.0, self._r)
 
     @classmethod
     def agree(cls, values: Mapping[str, Value]) -> None:

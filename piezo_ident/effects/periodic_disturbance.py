@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['PeriodicDisturbance']
 
@@ -28,14 +26,12 @@ class PeriodicDisturbance(Effect):
     125, 1929, doi:10.1098/rspa.1929.0151.
     """
 
-    name: ClassVar[str] = 'periodic_disturbance'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
-        'lines in the displacement, from the mains or a machine; 0.01 .. 0.2 % of stroke'
-    )
-    needs: ClassVar[str] = 'an idle stretch of 2 s, or motion at frequencies other than the lines'
-    time_driven: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'periodic_disturbance'
+    slot = 'output'
+    description = 'lines in the displacement, from the mains or a machine; 0.01 .. 0.2 % of stroke'
+    needs = 'an idle stretch of 2 s, or motion at frequencies other than the lines'
+    time_driven = True
+    parameters = (
         # found as a line, far more sharply than a fit of neighbouring columns could move it
         Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='fixed'),
         Parameter('harmonic', '1', 'multiple m_i of f', NAN, 1.0, 1e3, True, scale='fixed'),
@@ -44,10 +40,6 @@ class PeriodicDisturbance(Effect):
             'phase', 'rad', 'phase phi_i of each', NAN, -1e3, 1e3, True, default=0.0, scale='fixed'
         ),
     )
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._lines = [self.array(name) for name in ('harmonic', 'amplitude', 'phase')]
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -64,15 +56,12 @@ class PeriodicDisturbance(Effect):
                 trials.append(cls.trial(shape))
         return tuple(trials)
 
-    def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: the mean of the disturbance is zero."""
-        return x0
-
     def process(self, block: Block) -> Block:
         """Return the block with the lines added."""
         y = block.x.copy()
         turn = 2 * np.pi * self.number('frequency')
-        for m, amplitude, phase in zip(*self._lines, strict=True):
+        lines = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
+        for m, amplitude, phase in zip(*lines, strict=True):
             if amplitude != 0.0:
                 y += amplitude * np.sin(turn * m * block.t + phase)
         return block.with_signal(y)

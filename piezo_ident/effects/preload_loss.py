@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['PreloadLoss']
 
@@ -29,15 +27,13 @@ class PreloadLoss(Effect):
     two stiffnesses joined at theta are the piecewise linear spring of a contact.
     """
 
-    name: ClassVar[str] = 'preload_loss'
-    slot: ClassVar[Slot] = 'hidden'
-    description: ClassVar[str] = (
+    name = 'preload_loss'
+    slot = 'hidden'
+    description = (
         'another slope below the voltage at which the preload runs out; 0.1 .. 2 % of stroke'
     )
-    needs: ClassVar[str] = (
-        'slow sweeps over the full range and minor loops on both sides of the kink'
-    )
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'slow sweeps over the full range and minor loops on both sides of the kink'
+    parameters = (
         Parameter('gain', '1', 'loss k of slope below theta', 0.0, -10.0, 10.0, step=3e-3),
         Parameter('threshold', '1', 'voltage theta of the kink', NAN, -10.0, 10.0),
     )

@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import held
 
@@ -90,13 +88,11 @@ class RateDependentHysteresis(Effect):
     applications", Applications of Mathematics, 2023, doi:10.21136/AM.2023.0231-22.
     """
 
-    name: ClassVar[str] = 'rate_dependent_hysteresis'
-    slot: ClassVar[Slot] = 'hysteresis'
-    description: ClassVar[str] = (
-        'loops that widen with speed; 10 .. 30 % a decade of frequency above 10 .. 50 Hz'
-    )
-    needs: ClassVar[str] = 'two amplitudes at one fast frequency, and a slow sweep'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'rate_dependent_hysteresis'
+    slot = 'hysteresis'
+    description = 'loops that widen with speed; 10 .. 30 % a decade of frequency above 10 .. 50 Hz'
+    needs = 'two amplitudes at one fast frequency, and a slow sweep'
+    parameters = (
         Parameter('gain', 's^eps', 'growth beta of all thresholds', 0.0, -1.0, 1.0, step=1e-5),
         Parameter('exponent', '1', 'power eps of the speed', NAN, 0.05, 2.0, scale='log'),
         Parameter(
@@ -116,12 +112,9 @@ class RateDependentHysteresis(Effect):
         ),
     )
 
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+    def prepare(self) -> None:
+        """Compute the pole of the low-pass."""
         self._pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
-        self._memory = self.hysteresis.initial_memory(0.0)
-        self._still = self._memory.copy()
-        self._speed = np.zeros(2)
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import exp, inf, log1p
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['Saturation']
 
@@ -59,13 +58,13 @@ class Saturation(Effect):
     doi:10.1007/978-3-319-06617-2.
     """
 
-    name: ClassVar[str] = 'saturation'
-    slot: ClassVar[Slot] = 'input'
-    description: ClassVar[str] = (
+    name = 'saturation'
+    slot = 'input'
+    description = (
         'the amplifier goes flat at the ends of its range; nothing elsewhere, large there'
     )
-    needs: ClassVar[str] = 'a slow sweep over the full range, out to both of its ends'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'a slow sweep over the full range, out to both of its ends'
+    parameters = (
         Parameter('low', '1', 'lower end', -inf, -inf, inf, default=-inf),
         Parameter('high', '1', 'upper end', inf, -inf, inf, default=inf),
         Parameter('knee', '1', 'width k of the rounding', NAN, 0.0, 10.0, default=0.0),

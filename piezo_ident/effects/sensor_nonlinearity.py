@@ -5,12 +5,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['SensorNonlinearity']
 
@@ -31,13 +29,13 @@ class SensorNonlinearity(Effect):
     curve is a mapping from displacement to reading, and what calibration leaves of it the error.
     """
 
-    name: ClassVar[str] = 'sensor_nonlinearity'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
+    name = 'sensor_nonlinearity'
+    slot = 'output'
+    description = (
         'a curved characteristic of the sensor; strain gauge 0.1 .. 1 %, capacitive 0.01 .. 0.1 %'
     )
-    needs: ClassVar[str] = 'the full range both slowly and near the first resonance'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'the full range both slowly and near the first resonance'
+    parameters = (
         Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('fourth', '1', 'coefficient c4 of x^4', 0.0, -10.0, 10.0, step=1e-3),

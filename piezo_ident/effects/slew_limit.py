@@ -5,22 +5,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['SlewLimit']
 
 
 @kernel
-def _limit(x: NDArray[np.float64], most: float, state: float) -> NDArray[np.float64]:
+def _limit(x: NDArray[np.float64], most: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.empty(x.size)
-    y = state
+    y = state[0]
     for k in range(x.size):
         d = x[k] - y
         if d > most:
@@ -30,6 +28,7 @@ def _limit(x: NDArray[np.float64], most: float, state: float) -> NDArray[np.floa
         else:
             y = x[k]
         out[k] = y
+    state[0] = y
     return out
 
 
@@ -47,14 +46,14 @@ class SlewLimit(Effect):
     doi:10.1007/978-3-319-06617-2.
     """
 
-    name: ClassVar[str] = 'slew_limit'
-    slot: ClassVar[Slot] = 'input'
-    description: ClassVar[str] = (
+    name = 'slew_limit'
+    slot = 'input'
+    description = (
         'the amplifier charges the piezo no faster than its current allows; acts on jumps and on '
         'fast, large motion alone'
     )
-    needs: ClassVar[str] = 'steps, or sines fast and large enough to pass the limit'
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    needs = 'steps, or sines fast and large enough to pass the limit'
+    parameters = (
         Parameter(
             'limit',
             '1/s',
@@ -66,11 +65,6 @@ class SlewLimit(Effect):
             scale='log',
         ),
     )
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self._most = self.number('limit') / self.sample_rate
-        self._state = 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -87,13 +81,12 @@ class SlewLimit(Effect):
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: nothing is left to catch up."""
-        self._state = x0
+        self._state = np.array([x0])
         return x0
 
     def process(self, block: Block) -> Block:
         """Return the block with its signal limited in speed."""
-        if np.isinf(self._most) or block.x.size == 0:
+        most = self.number('limit') / self.sample_rate
+        if np.isinf(most):
             return block
-        y = _limit(np.ascontiguousarray(block.x), self._most, self._state)
-        self._state = float(y[-1])
-        return block.with_signal(y)
+        return block.with_signal(_limit(np.ascontiguousarray(block.x), most, self._state))

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.operators.chain import Block, Slot
+from piezo_ident.operators.chain import Block
 
 __all__ = ['ThermalDrift']
 
@@ -30,14 +28,12 @@ class ThermalDrift(Effect):
     First-order exchange of heat with the surroundings is Newton's law of cooling.
     """
 
-    name: ClassVar[str] = 'thermal_drift'
-    slot: ClassVar[Slot] = 'output'
-    description: ClassVar[str] = (
-        'displacement that grows with time whatever the voltage does; 1 .. 100 nm/min'
-    )
-    needs: ClassVar[str] = 'idle stretches at one voltage at the start and at the end'
-    time_driven: ClassVar[bool] = True
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    name = 'thermal_drift'
+    slot = 'output'
+    description = 'displacement that grows with time whatever the voltage does; 1 .. 100 nm/min'
+    needs = 'idle stretches at one voltage at the start and at the end'
+    time_driven = True
+    parameters = (
         Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0, step=1e-4),
         Parameter('amplitude', '1', 'final size c of the approach', 0.0, -1.0, 1.0, step=1e-3),
         Parameter(
@@ -55,10 +51,6 @@ class ThermalDrift(Effect):
             for share in (0.1, 1 / 3, 1.0):
                 trials.append(cls.trial({'time_constant': share * long}, moved, steps))
         return tuple(trials)
-
-    def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: nothing has drifted yet."""
-        return x0
 
     def process(self, block: Block) -> Block:
         """Return the block with the drift added."""
