@@ -95,14 +95,9 @@ def with_columns(
 
 def solve(A: Array, b: Array, prior: Array) -> Array:
     """
-    Return the coefficients of a ridge regression.
+    Return the coefficients of a ridge regression; b has shape (p,) or (p, k).
 
-    Parameters
-    ----------
-    A : ndarray, shape (p, p)
-    b : ndarray, shape (p,) or (p, k)
-    prior : ndarray, shape (p,)
-        Added to the diagonal, besides `RIDGE` of the column's own energy.
+    The prior, shape (p,), is added to the diagonal, besides `RIDGE` of the column's own energy.
 
     Raises
     ------
@@ -129,16 +124,7 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
     """
     Return the sum of squares of every block, each predicted from the blocks of other sets.
 
-    Parameters
-    ----------
-    sets : ndarray of int, shape (blocks,)
-        Blocks of one set are left out together.
-    prior : ndarray, shape (p,)
-        As in `solve`.
-
-    Returns
-    -------
-    ndarray, shape (blocks,)
+    Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
     """
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
     errors = np.empty(equations.s.size)
@@ -154,21 +140,9 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
 
 def held_out_sums(A: Array, b: Array, s: Array, sets: NDArray[np.int64], prior: Array) -> Array:
     """
-    Return the sum of the held-out squares of many residuals at once.
+    Return the sum of the held-out squares of k residuals at once, shape (k,).
 
-    Parameters
-    ----------
-    A : ndarray, shape (blocks, p, p)
-    b : ndarray, shape (blocks, p, k)
-        Products of the columns with k residuals.
-    s : ndarray, shape (k,)
-        Their sums of squares.
-    sets, prior
-        As in `held_out_errors`.
-
-    Returns
-    -------
-    ndarray, shape (k,)
+    Their products with the columns are b, shape (blocks, p, k), their sums of squares s.
     """
     total_A, total_b = A.sum(axis=0), b.sum(axis=0)
     errors = s.copy()
@@ -186,16 +160,9 @@ def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
     """
     Return the residual of every row, predicted with parameters fitted to other blocks.
 
-    Near the optimum the model is linear in its parameters, so leaving a set of blocks out moves
-    them by one Gauss-Newton step.
-
-    Parameters
-    ----------
-    M : ndarray, shape (n, p)
-        Derivatives of the prediction.
-    e : ndarray, shape (n,)
-        Residual of the fit to all rows.
-    prior : ndarray, shape (p,)
+    M are the derivatives of the prediction and e is the residual of the fit to all rows.  Near the
+    optimum the model is linear in its parameters, so leaving a set of blocks out moves them by one
+    Gauss-Newton step.
     """
     equations = normal_equations(rows, M, e)
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
@@ -217,8 +184,6 @@ def standard_errors(difference: Array) -> float:
     Blocks count as independent.  Errors of two models on the same blocks are compared block by
     block, so what makes a block hard for both cancels.
 
-    Examples
-    --------
     >>> round(standard_errors(np.array([3.0, 1.0, 2.0, 2.0])), 2)
     4.9
     """
@@ -237,12 +202,8 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     were fitted; a kind of excitation that was left out as a whole shows whether H is better.  An
     offset of each record is no merit of the refit.
 
-    Parameters
-    ----------
-    given : ndarray, shape (n,)
-        Residual of the model as given, normalised.
-    transfer : ndarray, shape (blocks,)
-        Sums of squares of the refit, whole kinds held out.
+    `given` is the residual of the model as given, shape (n,), and `transfer` the sum of squares of
+    each block by the refit, whole kinds held out.
     """
     squares = centred(given, rows.of_record) ** 2
     before = np.bincount(rows.block, squares, minlength=rows.group.size)

@@ -7,7 +7,8 @@ From a model and measured data to the effect that the model lacks.
 1. Faults of the data are found and left out.
 2. The base model is refitted by free-run error, so that no effect is blamed for a weight of H.
 3. The lines and the noise floor of what is left give what there is to explain.
-4. Effects are added one after another as long as data that were not fitted gain (`search`).
+4. Effects are added one after another as long as data that were not fitted gain
+   (`forward_selection`, of rounds of `search`).
 5. The verdict is given (`verdict`), and the model is refined by what holds (`refined_model`).
 """
 
@@ -19,8 +20,11 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.errors import errors_of, row_noise
-from piezo_ident.diagnosis.forward_selection import ForwardSelection
+from piezo_ident.diagnosis.forward_selection import (
+    ForwardSelection,
+    Selected,
+    smallest_detectable,
+)
 from piezo_ident.diagnosis.joint_fit import (
     base_thresholds,
     fit_base,
@@ -38,16 +42,8 @@ from piezo_ident.diagnosis.results import (
     Residual,
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, Rows
-from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.verdict import (
-    candidates_of,
-    Findings,
-    judge,
-    percent,
-    smallest_detectable,
-    untestable_of,
-)
+from piezo_ident.diagnosis.verdict import candidates_of, judge, untestable_of
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
@@ -56,6 +52,8 @@ from piezo_ident.residual import (
     all_stretches,
     find_faults,
     find_lines,
+    LineSearch,
+    NoiseFloor,
     residual_noise_floor,
     ResidualPart,
     without_lines,
@@ -177,6 +175,7 @@ def _diagnosed(
     progress: Progress,
 ) -> Diagnosis:
     progress('residual', 0.0)
+    # 1. faults of the data
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     faults = find_faults(_parts(Simulator(model, rows), given))
@@ -185,70 +184,63 @@ def _diagnosed(
         rows = make_rows(model, records, few)
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
+    # 2. the base model refitted
     base = _base(simulator, given)
-    _check_related(rows, base)
-    parts = _parts(simulator, base.state)
-    found = find_lines(parts, all_stretches(parts))
-    # hum is no noise: it can be explained
-    resting = _parts(simulator, base.state, whole=True)
-    floor = residual_noise_floor(
-        [without_lines(part, found.lines) for part in resting], all_stretches(resting)
-    )
-    span = abs(model.scaling.Y)
-    noise = row_noise(floor, faults, rows.m, span)
+    # 3. lines and noise of what it leaves
+    lines, floor = _lines_and_floor(simulator, base.state)
+    noise, single = _noise(floor, faults.quantum, rows.m, abs(model.scaling.Y))
     progress('residual', 1.0)
-    lines = [line.frequency for line in found.lines]
-    selected = ForwardSelection(simulator, lines, noise, settings, progress).run(base)
-    rounds, taken = selected.rounds, selected.taken
-    fitted = selected.fitted if taken else base
-    findings = judge(rows, base, fitted, taken, noise, selected.left_out, selected.bent)
+    # 4. effects, one after another
+    frequencies = [line.frequency for line in lines.lines]
+    selected = ForwardSelection(simulator, frequencies, noise, settings, progress).run(base)
+    # 5. the verdict, and what holds
     progress('verdict', 0.0)
-    rms = None if not floor.known else max(floor.rms or 0.0, faults.quantum / np.sqrt(12.0))
+    findings = judge(rows, base, selected, noise)
     # what single samples have more of noise than rows
-    lost = 0.0 if rms is None else max((rms / span) ** 2 - noise, 0.0)
+    lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
-        errors_of(rows, e, lost)
+        rows.errors(e, lost)
         for e in (
             rows.x - simulator.run(given),
             base.held_out_residual(rows),
-            fitted.held_out_residual(rows),
+            selected.fitted.held_out_residual(rows),
         )
     )
-    refined = refine(simulator, given, base, fitted, findings, before, refit)
+    refined = refine(simulator, given, base, selected.fitted, findings, before, refit)
     if refined.is_given:
         after = before
-    smallest = smallest_detectable(rows, base, fitted, rounds, taken, noise)
+    smallest = smallest_detectable(rows, base, selected, noise)
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
-    explainable = max(base.mean_square - noise, 1e-300)
-    bent = (base.mean_square - rounds[0].before.mean_square) / explainable
     tested = {setting.name for setting in model.effects}
-    if found.searched:
+    if lines.searched:
         # where no line stands out there is nothing to fit
         tested.add(HUM)
+    explainable = max(base.mean_square - noise, 1e-300)
+    bent = (base.mean_square - selected.rounds[0].before.mean_square) / explainable
     progress('verdict', 1.0)
     return Diagnosis(
         verdict=findings.verdict,
         sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
         given=model,
         model=refined.model,
-        effects=_effects(rows, base, fitted, taken, findings, explainable),
+        effects=_effects(rows, base, selected, explainable),
         group=findings.group,
         unexplained=rest,
-        candidates=candidates_of(rows, rounds, findings, noise),
+        candidates=candidates_of(rows, selected.rounds, findings, noise),
         before=before,
         refit=refit,
         after=after,
-        noise_floor=None if rms is None else 100.0 * rms / (rows.stroke * span),
+        noise_floor=None if single is None else rows.percent(single),
         noise_source=floor.source,
         smallest_detectable=smallest,
-        untestable=untestable_of(rounds[0], settings, tested),
+        untestable=untestable_of(selected.rounds[0], settings, tested),
         faults=faults.faults,
         residuals=_residuals(simulator, given, base, refined),
         records=rows.names,
         blocks=int(rows.fold.size),
         warnings=(
             *warnings_of(model, refined, findings, floor, bent),
-            *(warning for one in rounds for warning in one.warnings),
+            *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,
     )
@@ -268,8 +260,34 @@ def _base(simulator: Simulator, given: State) -> Fitted:
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     if swing == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
-    state, columns = fit_base(simulator, given, base_thresholds(swing))
-    return fit_jointly(simulator, state, columns)
+    base = fit_jointly(simulator, *fit_base(simulator, given, base_thresholds(swing)))
+    _check_related(simulator.rows, base)
+    return base
+
+
+def _lines_and_floor(simulator: Simulator, state: State) -> tuple[LineSearch, NoiseFloor]:
+    """Return the lines in the residual of a state, and the noise floor beside them."""
+    parts = _parts(simulator, state)
+    found = find_lines(parts, all_stretches(parts))
+    # hum is no noise: it can be explained
+    resting = _parts(simulator, state, whole=True)
+    quiet = [without_lines(part, found.lines) for part in resting]
+    return found, residual_noise_floor(quiet, all_stretches(resting))
+
+
+def _noise(floor: NoiseFloor, quantum: float, m: int, span: float) -> tuple[float, float | None]:
+    """
+    Return the mean squares of the noise in a row of m samples and in one, normalised by a span.
+
+    That of one is None where the floor is unknown.
+    """
+
+    def square(rms: float, m: int) -> float:
+        # a reading that rests on one step of the converter hides its rounding
+        return float(max(rms, quantum / np.sqrt(12.0 * m)) / span) ** 2
+
+    single = None if floor.rms is None else square(floor.rms, 1)
+    return square(floor.at(m) or 0.0, m), single
 
 
 def _check_related(rows: Rows, base: Fitted) -> None:
@@ -302,40 +320,37 @@ def _residuals(
 
 
 def _effects(
-    rows: Rows,
-    base: Fitted,
-    fitted: Fitted,
-    taken: Sequence[Round],
-    findings: Findings,
-    explainable: float,
+    rows: Rows, base: Fitted, selected: Selected, explainable: float
 ) -> tuple[FoundEffect, ...]:
     """Return the effects that were added, with parameters as in the record with most rows."""
-    if not findings.effects:
+    if not selected.taken:
         return ()
+    fitted = selected.fitted
     std = standard_deviations(rows, fitted)
-    steps = [this.contenders[0].fitted.mean_square for this in taken[:-1]]
+    steps = [this.contenders[0].fitted.mean_square for this in selected.taken[:-1]]
     levels = [base.mean_square, *steps, fitted.mean_square]
     found = []
-    for i, name in enumerate(findings.effects):
-        gain = max(levels[i] - levels[i + 1], 0.0)
-        added = fitted.state.effects[i]
+    for i, (added, level, left) in enumerate(
+        zip(fitted.state.effects, levels[:-1], levels[1:], strict=True)
+    ):
+        gain = max(level - left, 0.0)
+        values = added.values[rows.longest]
         parameters = {}
         for p in added.effect.parameters:
-            value = added.values[rows.longest][p.name]
-            keys = [(i, p.name, k) for k in range(np.size(value) if p.vector else 1)]
+            keys = [(i, p.name, k) for k in range(np.size(values[p.name]) if p.vector else 1)]
             spread = tuple(std.get(key, 0.0) for key in keys)
             known = any(key in std for key in keys)
             parameters[p.name] = FoundParameter(
-                value=_plain(value),
+                value=_plain(values[p.name]),
                 unit=p.unit,
                 std=None if not known else spread if p.vector else spread[0],
             )
         found.append(
             FoundEffect(
-                name=name,
+                name=added.name,
                 slot=added.effect.slot,
                 share=float(np.clip(gain / explainable, 0.0, 1.0)),
-                rms_percent=percent(rows, gain),
+                rms_percent=rows.percent(gain),
                 parameters=parameters,
             )
         )

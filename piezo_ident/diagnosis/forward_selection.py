@@ -12,21 +12,24 @@ what that explains.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.free_parameters import RETUNING
-from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted, RETUNING
 from piezo_ident.diagnosis.results import DiagnosisSettings
-from piezo_ident.diagnosis.search import drop_needless, polished, Round, search_round
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.search import Round, score_trials, search_round, started, STARTS
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.verdict import takes
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.identification.results import Progress
 
-__all__ = ['ForwardSelection', 'Selected']
+__all__ = ['ForwardSelection', 'Selected', 'smallest_detectable', 'takes']
+
+#: passes with fresh columns at the end, at most, and the gain that makes another worth it
+POLISHING, POLISH = 6, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class Selected:
     bent : Round or None
         What an effect that bent G would leave, where a linear change was preferred.
     left_out : frozenset of str
-        Effects that nobody can find, since they are not tried.
+        Effects that were not tried.
     """
 
     rounds: tuple[Round, ...]
@@ -76,7 +79,8 @@ class ForwardSelection:
         self._count = 0
 
     def run(self, base: Fitted) -> Selected:
-        """Select, from the base model refitted."""
+        """Select, from the base model refitted; where nothing is taken the base is the fit."""
+        self._base = base
         state = replace(base.state, retuning=(0.0,) * len(RETUNING))
         retuned = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
@@ -129,7 +133,7 @@ class ForwardSelection:
         explainable = self._beyond_noise(start)
         while self._takes(this, explainable, first=not taken):
             taken.append(this)
-            fitted, dropped = drop_needless(
+            fitted, dropped = _without_needless(
                 self._simulator, this.contenders[0].fitted, self._least
             )
             for i in dropped:
@@ -139,10 +143,137 @@ class ForwardSelection:
             this = self._round(fitted)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
-            fitted = polished(
+            fitted = _polished(
                 self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
             )
         self._progress('candidates', 1.0)
         tried = self._have | {effect.name for effect in self._candidates}
         left_out = frozenset(catalogue()) - tried
+        if not taken:
+            fitted = self._base
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
+
+
+# -- is it an effect? ----------------------------------------------------------------------------
+
+
+def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: bool) -> bool:
+    """
+    Return whether the best contender of a round is an effect, the `first` one or a further one.
+
+    `noise` is the mean square of the noise of a row, `explainable` what there was to be explained
+    before anything was added.
+    """
+    if not this.contenders:
+        return False
+    best = this.contenders[0]
+    before, after = this.before.mean_square, best.fitted.mean_square
+    gain, left = before - after, max(before - noise, 1e-300)
+    if rows.percent(gain) < criteria.SMALLEST_EFFECT or gain < criteria.LEAST_GAIN * explainable:
+        return False
+    # what follows time alone fits a shifted residual as well; its lines and trends have tests
+    # of their own
+    chance = 0.0 if best.effect.time_driven else this.chance.get(best.name, 0.0)
+    if gain < criteria.BEYOND_CHANCE * chance:
+        return False
+    if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
+        return False
+    return not _harms(rows, this.before, best.fitted, noise)
+
+
+def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
+    """Return whether the error of a kind of excitation grows, where it was no trifle."""
+    kinds = np.unique(rows.group)
+    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
+    one = np.bincount(rows.group, before.errors) / counts
+    other = np.bincount(rows.group, after.errors) / counts
+    trifle = noise + (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2
+    return bool(np.any(other > criteria.HARM**2 * one + trifle))
+
+
+def smallest_detectable(
+    rows: Rows, base: Fitted, selected: Selected, noise: float
+) -> float | None:
+    """
+    Return the size that a further effect must have to be taken, rms in % of stroke.
+
+    None where the range was passed so rarely that none is taken.
+    """
+    if rows.passes < criteria.PASSES:
+        return None
+    # what follows time alone fits any slow residual
+    last = selected.rounds[-1].chance
+    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
+    share = criteria.FURTHER if selected.taken else criteria.ADDED
+    least = max(
+        criteria.BEYOND_CHANCE * chance,
+        criteria.LEAST_GAIN * (base.mean_square - noise),
+        share * (selected.fitted.mean_square - noise),
+    )
+    return max(criteria.SMALLEST_EFFECT, rows.percent(least))
+
+
+# -- effects that are there already --------------------------------------------------------------
+
+
+def _without_needless(
+    simulator: Simulator, fitted: Fitted, least: float
+) -> tuple[Fitted, tuple[int, ...]]:
+    """
+    Take out effects that the last one, which stays, has made needless.
+
+    Each must be worth a mean square of `least`.  Places of those that went come along, falling.
+    """
+    dropped: list[int] = []
+    for i in range(len(fitted.state.effects) - 2, -1, -1):
+        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
+        if without.mean_square - fitted.mean_square < least:
+            fitted = without
+            dropped.append(i)
+    return fitted, tuple(dropped)
+
+
+def _polished(
+    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
+) -> Fitted:
+    """
+    Fit several effects again, each from fresh starts now that the others are known.
+
+    An effect that was found beside others not yet in the model took a law that made up for them.
+    """
+    for i in range(len(fitted.state.effects)):
+        for fresh in _afresh(simulator, fitted, i, lines, tick):
+            if fresh.mean_square < fitted.mean_square:
+                fitted = fresh
+    for _ in range(POLISHING):
+        state = fitted.state
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
+        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted
+
+
+def _afresh(
+    simulator: Simulator,
+    fitted: Fitted,
+    i: int,
+    lines: Sequence[float],
+    tick: Callable[[], None],
+) -> Iterator[Fitted]:
+    """Yield fits in which effect i starts anew, from its best trials beside the others."""
+    rows, own = simulator.rows, fitted.state.effects[i]
+    others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+    state = replace(fitted.state, effects=others)
+    rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
+    scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
+    trials = sorted((s for s in scored if s.is_possible), key=lambda s: s.error)
+    for start in trials[:STARTS]:
+        effects = (*others[:i], started(rows, start), *others[i:])
+        state = replace(rest.state, effects=effects)
+        try:
+            yield fit_jointly(simulator, state, fitted.base, tick=tick)
+        except (ModelError, IdentificationError):
+            # the fit that is there already stays
+            continue

@@ -22,16 +22,16 @@ from piezo_ident.diagnosis.cross_validation import (
     held_out_residual,
     normal_equations,
 )
-from piezo_ident.diagnosis.free_parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
 __all__ = [
-    'ITERATIONS',
+    'RETUNING',
     'BaseColumns',
     'Fitted',
+    'FreeParameter',
     'base_at',
     'base_thresholds',
     'fit_base',
@@ -42,21 +42,95 @@ __all__ = [
 Array = NDArray[np.float64]
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
-#: finite difference of a weight of H, normalised
-WEIGHT_STEP = 1e-3
+#: finite differences of a weight of H, normalised, and of the logarithm of a parameter
+WEIGHT_STEP, LOG_STEP = 1e-3, 1e-2
+#: how far G may be retuned: about samples of delay, their squares, and two relaxations
+RETUNING = (20.0, 800.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class FreeParameter:
+    """
+    One number that the fit may move, in one record or (None) in all.
+
+    It belongs to an effect, by its place in the state, or (None) to the retuning of G.
+    """
+
+    effect: int | None
+    record: int | None
+    name: str
+    index: int | None
+    logarithmic: bool
+    step: float
+    lower: float
+    upper: float
+
+    def get(self, state: State) -> float:
+        """Return its value."""
+        if self.effect is None:
+            return state.retuning[self.index or 0]
+        value = state.effects[self.effect].values[self.record or 0][self.name]
+        return float(value if self.index is None else value[self.index])
+
+    def moved(self, state: State, delta: float) -> State:
+        """Return the state after a step within the bounds; relative if logarithmic."""
+        value = self.get(state)
+        if self.logarithmic:
+            value *= float(np.exp(np.clip(delta, -1.0, 1.0)))
+        else:
+            value += delta
+        value = float(np.clip(value, self.lower, self.upper))
+        if self.effect is None:
+            retuning = list(state.retuning)
+            retuning[self.index or 0] = value
+            return replace(state, retuning=tuple(retuning))
+        effects = list(state.effects)
+        effects[self.effect] = effects[self.effect].changed(
+            self.record, self.name, self.index, value
+        )
+        return replace(state, effects=tuple(effects))
+
+    def room(self, state: State) -> tuple[float, float]:
+        """Return the largest steps down and up."""
+        value = self.get(state)
+        if self.logarithmic:
+            down = max(-1.0, np.log(max(self.lower, 1e-300) / value))
+            return min(down, 0.0), max(min(1.0, np.log(self.upper / value)), 0.0)
+        return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
+
+
+def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
+    """Return every number of G's retuning and of the effects that the fit may move."""
+    found = [
+        FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
+        for i, size in enumerate(RETUNING[: len(state.retuning)])
+    ]
+    for i, added in enumerate(state.effects):
+        effect = added.effect
+        for p in effect.parameters:
+            value = added.values[0][p.name]
+            if p.scale == 'fixed' or p.kind == 'text':
+                continue
+            is_log = p.scale == 'log'
+            step = LOG_STEP if is_log else (p.step or 1e-3)
+            # the amplitude of what follows time is another one in each record
+            per_record = effect.time_driven and p.step > 0.0
+            for k in range(records) if per_record else (None,):
+                for index in range(np.size(value)) if p.vector else (None,):
+                    number = float(value if index is None else value[index])
+                    if np.isfinite(number) and not (is_log and number <= 0.0):
+                        found.append(
+                            FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)
+                        )
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
 class BaseColumns:
     """
-    Columns of a refit of the base model, and their products.
+    Columns of a refit of the base model, shape (n, m + 2 + records), and ``columns' columns``.
 
-    Attributes
-    ----------
-    columns : ndarray, shape (n, m + 2 + records)
-        Filtered plays, v^3, v and the offset of each record.
-    total : ndarray, shape (m + 2 + records, m + 2 + records)
-        ``columns' columns``.
+    They are the filtered plays, v^3, v, and the offset of each record.
     """
 
     columns: Array
@@ -154,16 +228,9 @@ def fit_jointly(
     tick: Callable[[], None] = lambda: None,
 ) -> Fitted:
     """
-    Fit everything that a state holds by the free-run error.
+    Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
-    Parameters
-    ----------
-    state : State
-        Where to start; its thresholds stay.
-    base : BaseColumns
-        Of its thresholds.
-    tick : callable, optional
-        Called between the steps; may raise `piezo_ident.common.errors.Cancelled`.
+    `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
 
     Raises
     ------
@@ -231,9 +298,8 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     """
     Return the standard deviations of the free parameters, in the record that has most rows.
 
-    The sandwich estimator over blocks: the gradient of a block is one observation, since
-    neighbouring residuals are alike.  Keys are the effect's place, the parameter's name, and the
-    place in a vector (0 for a number).
+    The sandwich estimator over blocks, each one observation.  Keys are the effect's place, the
+    parameter's name, and the place in a vector (0 for a number).
     """
     M = fitted.J[:, fitted.free]
     size = np.linalg.norm(M, axis=0)

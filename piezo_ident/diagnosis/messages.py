@@ -11,7 +11,7 @@ import numpy as np
 from piezo_ident.diagnosis.criteria import WORTH_REFIT_IN_DOUBT
 from piezo_ident.diagnosis.refined_model import lasting, Refined
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
-from piezo_ident.diagnosis.simulator import Added, State
+from piezo_ident.diagnosis.simulator import Added
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
@@ -53,10 +53,7 @@ def warnings_of(
     """
     Return what a user of the refined model must know.
 
-    Parameters
-    ----------
-    bent : float
-        Share of the explainable part that goes with a retuned G alone.
+    `bent` is the share of the explainable part that goes with a retuned G alone.
     """
     state, stays = refined.state, lasting(findings.effects)
     found = []
@@ -68,7 +65,7 @@ def warnings_of(
             'of what the model missed goes with that alone: the effect bent them at the '
             'identification, or they have changed since'
         )
-    found += [_of_time_driven(added, bool(stays)) for added in _time_driven(state)]
+    found += [_of_time_driven(a, bool(stays)) for a in state.effects if a.effect.time_driven]
     (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
     if low > least or high < most:
         found.append(
@@ -76,10 +73,6 @@ def warnings_of(
             f'holds there; the given one holds in {least:g} .. {most:g} V'
         )
     return found
-
-
-def _time_driven(state: State) -> list[Added]:
-    return [added for added in state.effects if added.effect.time_driven]
 
 
 def _of_time_driven(added: Added, beside_lasting: bool) -> str:
@@ -105,14 +98,8 @@ def sentence(
     """
     Return the verdict as a sentence.
 
-    Parameters
-    ----------
-    errors : (Errors, Errors, Errors)
-        Before, with the base model refitted, and after.
-    smallest : float or None
-        Smallest detectable effect, rms in % of stroke.
-    is_given : bool
-        Whether the model stays as it was given.
+    The errors are before, with the base refitted, and after; `smallest` is the smallest detectable
+    effect [% of stroke], and `is_given` says whether the model stays as it was given.
     """
     before, refit, after = (e.overall for e in errors)
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'

@@ -24,17 +24,7 @@ NOTHING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """
-    The refined model.
-
-    Attributes
-    ----------
-    model : StageModel
-    state : State
-        The fit that it comes from.
-    is_given : bool
-        Whether the model stays as it was given.
-    """
+    """The refined model, the fit that it comes from, and whether it stays as it was given."""
 
     model: StageModel
     state: State
@@ -56,16 +46,9 @@ def refine(
     refit: Errors,
 ) -> Refined:
     """
-    Return the model that the user gets.
+    Return the model that the user gets, from the base refitted without and with what was found.
 
-    Parameters
-    ----------
-    given : State
-        The model as it was given.
-    base, fitted : Fitted
-        Refitted without and with what was found.
-    before, refit : Errors
-        Of the model as given, and of the base model refitted.
+    `before` and `refit` are the errors of the model as given and of the base refitted.
     """
     rows, model = simulator.rows, simulator.model
     in_doubt = findings.verdict == 'unexplained'

@@ -16,15 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.model.initial_memory import fit_memory, is_at_rest
-from piezo_ident.model.metrics import strokes
+from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
 
-__all__ = ['Rows', 'centred', 'make_rows']
+__all__ = ['Rows', 'centred', 'make_rows', 'means']
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -126,6 +128,33 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.block, prepend=-1))
         return np.append(starts, self.n)
 
+    def percent(self, mean_square: float) -> float:
+        """Return a mean square, normalised, as rms in % of stroke."""
+        return percent(np.sqrt(max(mean_square, 0.0)), self.stroke)
+
+    def errors(self, e: Array, noise: float = 0.0) -> Errors:
+        """
+        Return the errors of a residual of the rows, shape (n,), normalised.
+
+        `noise` is the mean square that averaging took out of rows, and that single samples have.
+        """
+
+        def error(part: Array) -> float:
+            return self.percent(float(np.mean(part**2)) + noise)
+
+        by_segment: dict[str, float] = {}
+        of_frequency: dict[float, list[Array]] = {}
+        for label in dict.fromkeys(self.label):
+            part = e[np.array([x == label for x in self.label])[self.block]]
+            by_segment[label] = error(part)
+            frequency = sine_frequency(label)
+            if frequency is not None:
+                of_frequency.setdefault(frequency, []).append(part)
+        by_frequency = {
+            f'{f:g}': error(np.concatenate(of_frequency[f])) for f in sorted(of_frequency)
+        }
+        return Errors(error(e), by_segment, by_frequency)
+
     def of(self, signals: Sequence[Array]) -> Array:
         """Return the rows, shape (n,), of signals given at the full rate, one a run."""
         parts = [means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
@@ -151,14 +180,9 @@ def make_rows(
     bad: Sequence[Mask | None] | None = None,
 ) -> Rows:
     """
-    Cut records into rows and blocks.
+    Cut records into rows and blocks, by the scaling and sampling rate of a model.
 
-    Parameters
-    ----------
-    model : StageModel
-        Its scaling and sampling rate hold.
-    bad : sequence of (ndarray of bool or None), optional
-        For each run, samples that are not used.
+    `bad` are for each run samples that are not used, or None.
 
     Raises
     ------
@@ -173,10 +197,8 @@ def make_rows(
             f'{", ".join(f"{r:g}" for r in rates)} Hz); record at that rate, or identify again'
         )
     names = tuple(dict.fromkeys(run.record for run in runs))
-    use = [
-        run.known if out is None else run.known & ~out
-        for run, out in zip(runs, bad or [None] * len(runs), strict=True)
-    ]
+    bad = bad or [None] * len(runs)
+    use = [_without(run.known, out) for run, out in zip(runs, bad, strict=True)]
     samples = sum(int(known.sum()) for known in use)
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
     keep = tuple(np.all(known[: known.size // m * m].reshape(-1, m), axis=1) for known in use)
@@ -227,7 +249,13 @@ def make_rows(
         group=group,
         label=tuple(labels),
         labels=group_labels,
-        stroke=_stroke(runs, bad),
+        # of a record, its faults left out
+        stroke=max(
+            strokes(
+                (run.record, run.x[_without(run.use, out)])
+                for run, out in zip(runs, bad, strict=True)
+            ).values()
+        ),
     )
 
 
@@ -237,13 +265,8 @@ def _has_clock(model: StageModel) -> bool:
     return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
-def _stroke(runs: Sequence[Run], bad: Sequence[Mask | None] | None) -> float:
-    """Return the largest stroke of a record, its faults left out."""
-    used = (
-        (run.record, run.x[run.use if out is None else run.use & ~out])
-        for run, out in zip(runs, bad or [None] * len(runs), strict=True)
-    )
-    return max(strokes(used).values())
+def _without(mask: Mask, out: Mask | None) -> Mask:
+    return mask if out is None else mask & ~out
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:

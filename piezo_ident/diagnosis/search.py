@@ -4,44 +4,93 @@
 """
 One round of the search: which candidate lowers the error on data that were not fitted.
 
-A round scores every candidate on the residual and fits the most promising ones together with
-everything else.  What candidates gain on circular-shift surrogates of the residual is what chance
-gains.
+Every candidate is tried by finite differences of the whole model, the effect switched slightly
+on.  Its columns are scored by what they gain on held-out blocks beside everything that is in the
+model already, against what chance gains on circular-shift surrogates of the residual.  The most
+promising ones are fitted together with everything else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
-from piezo_ident.diagnosis.candidates import score_trials, Scored, started, Tick
-from piezo_ident.diagnosis.criteria import JOINT_FITS, SIMPLER, SURROGATES, WORTH_FIT
+from piezo_ident.diagnosis.criteria import (
+    JOINT_FITS,
+    ON_AMPLITUDE,
+    SIMPLER,
+    SURROGATES,
+    WORTH_FIT,
+)
+from piezo_ident.diagnosis.cross_validation import (
+    block_products,
+    held_out_errors,
+    held_out_sums,
+    normal_equations,
+    NormalEquations,
+    solve,
+    with_columns,
+)
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.effects import Effect
+from piezo_ident.diagnosis.rows import means, Rows
+from piezo_ident.diagnosis.simulator import Added, Simulator
+from piezo_ident.effects import Effect, Trial, View
 
-__all__ = ['Contender', 'Round', 'drop_needless', 'polished', 'search_round']
+__all__ = ['STARTS', 'Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
+
+Array = NDArray[np.float64]
+
+#: called with the share of the work that is done; may raise `Cancelled`
+Tick = Callable[[float], None]
 
 #: iterations of the first joint fit of a candidate, and how many are fitted to the end
 FIRST, FINAL = 3, 2
 #: trials of a candidate that a fit starts from
 STARTS = 2
-#: passes with fresh columns at the end, at most, and the gain that makes another worth it
-POLISHING, POLISH = 6, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """
+    One trial of a candidate and what it would gain.
+
+    Attributes
+    ----------
+    effect, trial
+    coefficients : ndarray, shape (c,)
+        Steps of its columns that fit best.
+    errors : ndarray, shape (blocks,)
+        Sum of squares of each block, held out in spread sets.
+    chance : float
+        Largest gain in the sum of squares of a surrogate.
+    visible : float
+        Share of its columns that everything else in the model cannot make up for.
+    is_possible : bool
+        False where the data speak against it: an effect without amplitudes that should come out
+        of the fit about once, and does not.
+    """
+
+    effect: type[Effect]
+    trial: Trial
+    coefficients: Array
+    errors: Array
+    chance: float
+    visible: float
+    is_possible: bool = True
+
+    @property
+    def error(self) -> float:
+        """Sum of the held-out squares."""
+        return float(self.errors.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """
-    A candidate that was fitted together with everything else.
-
-    Attributes
-    ----------
-    effect : type of Effect
-    fitted : Fitted
-    """
+    """A candidate that was fitted together with everything else."""
 
     effect: type[Effect]
     fitted: Fitted
@@ -93,16 +142,8 @@ def search_round(
     """
     Score all candidates and fit the best of them jointly.
 
-    Parameters
-    ----------
-    effects : sequence of type of Effect
-        Candidates.
-    lines : sequence of float
-        Lines in the residual [Hz].
-    noise : float
-        Mean square of the noise of a row.
-    rng : numpy.random.Generator
-        Draws the shifts of the surrogates.
+    `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
+    `rng` draws the shifts of the surrogates.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, SURROGATES)
@@ -119,12 +160,13 @@ def search_round(
             chance[name] = max(chance.get(name, 0.0), scored.chance / n)
             trials.setdefault(name, []).append(scored)
     for scores in trials.values():
-        scores.sort(key=_error)
+        scores.sort(key=lambda s: s.error)
     best = {name: scores[0] for name, scores in trials.items()}
     total = float(before.errors.sum())
     least = WORTH_FIT * max(total - noise * n, 1e-300)
-    promising = [s for s in sorted(best.values(), key=_error) if total - s.errors.sum() > least]
-    contenders, warnings = _contenders(simulator, before, promising[:JOINT_FITS], trials, tick)
+    promising = [scores for scores in trials.values() if total - scores[0].error > least]
+    promising.sort(key=lambda scores: scores[0].error)
+    contenders, warnings = _contenders(simulator, before, promising[:JOINT_FITS], tick)
     tick(1.0)
     return Round(
         before=before,
@@ -136,15 +178,10 @@ def search_round(
     )
 
 
-def _error(scored: Scored) -> float:
-    return float(scored.errors.sum())
-
-
 def _contenders(
     simulator: Simulator,
     before: Fitted,
-    promising: Sequence[Scored],
-    trials: dict[str, list[Scored]],
+    promising: Sequence[Sequence[Scored]],
     tick: Tick,
 ) -> tuple[list[Contender], list[str]]:
     """Return the promising candidates fitted jointly, best first, and the fits that failed."""
@@ -154,12 +191,12 @@ def _contenders(
     def alive() -> None:
         tick(at)
 
-    for i, scored in enumerate(promising):
+    for i, scores in enumerate(promising):
         at = 0.5 + 0.5 * i / len(promising)
         alive()
-        fits, failure = [], ''
+        effect, fits, failure = scores[0].effect, [], ''
         # a law that looks best while it is small need not be the one that fits best
-        for start in trials[scored.effect.name][:STARTS]:
+        for start in scores[:STARTS]:
             state = before.state.with_effect(started(simulator.rows, start))
             try:
                 fits.append(
@@ -169,10 +206,9 @@ def _contenders(
                 # the law cannot run with these parameters
                 continue
             except IdentificationError as error:
-                failure = f'{scored.effect.name} was not judged: {error}'
+                failure = f'{effect.name} was not judged: {error}'
         if fits:
-            fitted = min(fits, key=lambda f: f.mean_square)
-            contenders.append(Contender(scored.effect, fitted))
+            contenders.append(Contender(effect, min(fits, key=lambda f: f.mean_square)))
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.fitted.mean_square)
@@ -198,74 +234,140 @@ def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender
     return [simplest, *(c for c in contenders if c is not simplest)]
 
 
-def drop_needless(
-    simulator: Simulator, fitted: Fitted, least: float
-) -> tuple[Fitted, tuple[int, ...]]:
-    """
-    Take out effects that the last one has made needless.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        Whose last effect stays.
-    least : float
-        Mean square that an effect must be worth.
-
-    Returns
-    -------
-    dropped : tuple of int
-        Places of the effects that went, falling.
-    """
-    dropped: list[int] = []
-    for i in range(len(fitted.state.effects) - 2, -1, -1):
-        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
-        if without.mean_square - fitted.mean_square < least:
-            fitted = without
-            dropped.append(i)
-    return fitted, tuple(dropped)
+# -- scores of trials ----------------------------------------------------------------------------
 
 
-def polished(
-    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
-) -> Fitted:
-    """
-    Fit several effects again, each from fresh starts now that the others are known.
-
-    An effect that was found beside others not yet in the model took a law that made up for them.
-    """
-    for i in range(len(fitted.state.effects)):
-        for fresh in _afresh(simulator, fitted, i, lines, tick):
-            if fresh.mean_square < fitted.mean_square:
-                fitted = fresh
-    for _ in range(POLISHING):
-        state = fitted.state
-        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
-            break
-        fitted = fresh
-    return fitted
-
-
-def _afresh(
+def score_trials(
     simulator: Simulator,
     fitted: Fitted,
-    i: int,
+    effects: Sequence[type[Effect]],
     lines: Sequence[float],
-    tick: Callable[[], None],
-) -> Iterator[Fitted]:
-    """Yield fits in which effect i starts anew, from its best trials beside the others."""
-    rows, own = simulator.rows, fitted.state.effects[i]
-    others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-    state = replace(fitted.state, effects=others)
-    rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
-    scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
-    trials = sorted((s for s in scored if s.is_possible), key=_error)
-    for start in trials[:STARTS]:
-        effects = (*others[:i], started(rows, start), *others[i:])
-        state = replace(rest.state, effects=effects)
+    surrogates: Array,
+    tick: Tick = lambda share: None,
+) -> Iterator[Scored]:
+    """Score every trial of every effect on the residual of a fit; surrogates (n, k)."""
+    rows = simulator.rows
+    now = simulator.remember(fitted.state)
+    M, e, prior = fitted.J[:, fitted.free], fitted.e, fitted.prior[fitted.free]
+    equations = normal_equations(rows, M, e)
+    view = _view_of(simulator, lines)
+    explained = block_products(rows, M, surrogates)
+    squares = np.sum(surrogates**2, axis=0)
+    alone = held_out_sums(equations.A, explained, squares, rows.fold, prior)
+    trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
+    for done, (effect, trial) in enumerate(trials):
+        tick(done / len(trials))
         try:
-            yield fit_jointly(simulator, state, fitted.base, tick=tick)
-        except (ModelError, IdentificationError):
-            # the fit that is there already stays
+            C = _columns(simulator, effect, trial, now)
+        except ModelError:
             continue
+        if not np.all(np.isfinite(C)) or not np.any(C):
+            continue
+        both = with_columns(rows, equations, M, C, e)
+        wide = np.concatenate([prior, np.zeros(C.shape[1])])
+        theta = solve(both.A.sum(axis=0), both.b.sum(axis=0), wide)[M.shape[1] :]
+        visible = _visible(both, M.shape[1], wide)
+        if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
+            yield Scored(effect, trial, theta, equations.s, 0.0, visible, False)
+            continue
+        together = np.concatenate([explained, block_products(rows, C, surrogates)], axis=1)
+        with_it = held_out_sums(both.A, together, squares, rows.fold, wide)
+        gains = np.maximum(alone - with_it, 0.0)
+        errors = held_out_errors(both, rows.fold, wide)
+        yield Scored(effect, trial, theta, errors, float(gains.max(initial=0.0)), visible)
+
+
+def _columns(simulator: Simulator, effect: type[Effect], trial: Trial, now: Array) -> Array:
+    """
+    Return what an effect would add to the rows for a step of each of its amplitudes.
+
+    Shape (n, c): for an effect that is driven by time, a column for each record and amplitude.
+    """
+    rows = simulator.rows
+    count = len(rows.names)
+    columns = []
+    for setting in trial.settings():
+        column = simulator.added(Added(effect.name, (setting,) * count)) - now
+        if effect.time_driven:
+            columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
+        else:
+            columns.append(column)
+    return np.stack(columns, axis=1)
+
+
+def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
+    """Return the largest share of a column that the first p columns cannot make."""
+    A = equations.A.sum(axis=0)
+    shares = []
+    for j in range(p, A.shape[0]):
+        theta = solve(A[:p, :p], A[:p, j], prior[:p])
+        left = A[j, j] - 2.0 * A[:p, j] @ theta + theta @ A[:p, :p] @ theta
+        shares.append(float(left / A[j, j]) if A[j, j] > 0.0 else 0.0)
+    return max(shares)
+
+
+def started(rows: Rows, scored: Scored) -> Added:
+    """Return the effect with the amplitudes of its score, where a joint fit may start."""
+    count = len(rows.names)
+    records = range(count) if scored.effect.time_driven else [0]
+    values: list[dict[str, Any]] = [dict(scored.trial.values) for _ in range(count)]
+    known = {p.name: p for p in scored.effect.parameters}
+    c = iter(scored.coefficients)
+    for (name, index), step in zip(scored.trial.moves, scored.trial.steps, strict=True):
+        for k in records:
+            amount = float(next(c)) * step
+            for j in [k] if scored.effect.time_driven else range(count):
+                if index is None:
+                    values[j][name] = float(known[name].clip(values[j][name] + amount))
+                else:
+                    vector = np.array(values[j][name], dtype=np.float64)
+                    vector[index] = known[name].clip(vector[index] + amount)
+                    values[j][name] = vector
+    return Added(scored.effect.name, tuple(values))
+
+
+def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
+    rows, model = simulator.rows, simulator.model
+    speeds, top = [], 0.0
+    channels: dict[str, list[Array]] = {}
+    for run in rows.runs:
+        # over a row, so that converter steps do not count as speed
+        speeds.append(np.abs(np.diff(means(run.u, rows.m))) * model.sample_rate / rows.m)
+        top = max(top, _highest_frequency(run.u, model.sample_rate))
+        for name, x in run.piece.channels.items():
+            channels.setdefault(name, []).append(x)
+    speed = np.concatenate(speeds)
+    moving = speed[speed > 1e-3 * speed.max(initial=0.0)]
+    quantiles = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 0.999])
+    # of all records that have it: the axis may rest in one of them
+    whole = {name: np.concatenate(parts) for name, parts in channels.items()}
+    return View(
+        sample_rate=model.sample_rate,
+        low=min(float(run.u.min()) for run in rows.runs),
+        high=max(float(run.u.max()) for run in rows.runs),
+        speeds=np.quantile(moving, quantiles) if moving.size else np.zeros(quantiles.size),
+        duration=rows.duration,
+        channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
+        lines=tuple(lines),
+        modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
+        max_frequency=top,
+        thresholds=model.hysteresis.thresholds,
+    )
+
+
+def _highest_frequency(u: Array, rate: float) -> float:
+    """Return the frequency below which all but a millionth of the moving power lies."""
+    du = np.diff(u)
+    if du.size == 0:
+        return 0.0
+    size = min(du.size, 1 << 17)
+    power = np.zeros(size // 2 + 1)
+    for start in range(0, du.size - size + 1, size):
+        power += np.abs(np.fft.rfft(du[start : start + size])) ** 2
+    # power of u, not of its derivative
+    frequency = np.fft.rfftfreq(size, 1.0 / rate)
+    power[1:] /= frequency[1:] ** 2
+    total = np.cumsum(power)
+    if total[-1] == 0.0:
+        return rate / 2.0
+    return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
@@ -36,13 +37,9 @@ RELAXATIONS = (15.0, 100.0)
 @dataclass(frozen=True, eq=False)
 class Added:
     """
-    An effect in the model under study.
+    An effect in the model under study, with its parameters in each record.
 
-    Attributes
-    ----------
-    name : str
-    values : tuple of mapping
-        Parameters in each record; the same in all, unless the effect is driven by time.
+    They are the same in all, unless the effect is driven by time.
     """
 
     name: str
@@ -99,14 +96,7 @@ class State:
 
 
 class Simulator:
-    """
-    Runs of a model over rows.
-
-    Parameters
-    ----------
-    model : StageModel
-        Its G, delay and scaling stay as they are, and so do the effects that it has.
-    """
+    """Runs of a model over rows; its G, delay, scaling and effects stay as they are."""
 
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model
@@ -174,10 +164,7 @@ class Simulator:
         """
         Return the predicted rows of a state that differs from the remembered one in one place.
 
-        Parameters
-        ----------
-        effect : type of Effect or None
-            The one that was added or changed, None for G; the chain is only run from there.
+        That is an effect, or (None) G; the chain is only run from there.
         """
         signals = []
         for i, k in enumerate(self.rows.record):
@@ -215,36 +202,18 @@ def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -
     Return G multiplied by a factor near one.
 
     ``1 + c_1 D + c_2 D^2 + sum_j c_j D / (1 - p_j z^-1)`` with ``D = 1 - z^-1`` and p_j the poles
-    of `RELAXATIONS`: a delay, a roll-off, and relaxations.  G(1) stays 1.
-
-    Parameters
-    ----------
-    retuning : sequence of float
-        The coefficients; c_1 acts like minus a delay in samples at low frequencies.
-    sample_rate : float
-        [Hz]
+    of `RELAXATIONS`: a delay, a roll-off, and relaxations.  G(1) stays 1, and c_1 acts like minus
+    a delay in samples at low frequencies.
     """
     if not any(retuning):
         return dynamics
-    difference = np.array([1.0, -1.0])
-    poles = [np.exp(-2.0 * np.pi * f / sample_rate) for f in RELAXATIONS]
-    denominators = [np.array([1.0, -p]) for p in poles[: len(retuning) - 2]]
-    common = np.array([1.0])
-    for denominator in denominators:
-        common = np.convolve(common, denominator)
-    square = np.convolve(difference, difference)
-    c1, c2, *others = (*retuning, 0.0, 0.0)[: max(len(retuning), 2)]
-    terms = [common, c1 * np.convolve(common, difference), c2 * np.convolve(common, square)]
-    for j, c in enumerate(others):
-        rest = np.array([1.0])
-        for k, denominator in enumerate(denominators):
-            if k != j:
-                rest = np.convolve(rest, denominator)
-        terms.append(c * np.convolve(rest, difference))
-    size = max(term.size for term in terms)
-    factor = np.sum([np.pad(term, (0, size - term.size)) for term in terms], axis=0)
-    a = np.convolve(np.concatenate([[1.0], dynamics.a]), common)[1:]
-    return Dynamics(a=a, b=np.convolve(dynamics.b, factor))
+    c1, c2, c3, c4 = retuning
+    # polynomials in z^-1
+    D = Polynomial([1.0, -1.0])
+    P, Q = (Polynomial([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
+    factor = (1.0 + c1 * D + c2 * D * D) * P * Q + c3 * D * Q + c4 * D * P
+    a, b = Polynomial([1.0, *dynamics.a]) * P * Q, Polynomial(dynamics.b) * factor
+    return Dynamics(a=np.asarray(a.coef[1:], float), b=np.asarray(b.coef, float))
 
 
 def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import standard_errors
+from piezo_ident.diagnosis.forward_selection import Selected
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.look_alikes import CONTAINS, look_alikes, separating_experiment
+from piezo_ident.diagnosis.next_experiment import CONTAINS, look_alikes, separating_experiment
 from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
@@ -36,10 +37,7 @@ __all__ = [
     'Findings',
     'candidates_of',
     'judge',
-    'percent',
     'rivals_of',
-    'smallest_detectable',
-    'takes',
     'untestable_of',
 ]
 
@@ -73,119 +71,26 @@ class Findings:
         return Unexplained(share, self.left, description)
 
 
-def percent(rows: Rows, mean_square: float) -> float:
-    """Return a mean square as rms in % of stroke."""
-    return 100.0 * float(np.sqrt(max(mean_square, 0.0))) / rows.stroke
-
-
-# -- is it an effect? ----------------------------------------------------------------------------
-
-
-def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: bool) -> bool:
-    """
-    Return whether the best contender of a round is an effect.
-
-    Parameters
-    ----------
-    noise : float
-        Mean square of the noise of a row.
-    explainable : float
-        Mean square that was there to be explained before anything was added.
-    first : bool
-        Whether nothing was added before.
-    """
-    if not this.contenders:
-        return False
-    best = this.contenders[0]
-    before, after = this.before.mean_square, best.fitted.mean_square
-    gain, left = before - after, max(before - noise, 1e-300)
-    if percent(rows, gain) < criteria.SMALLEST_EFFECT or gain < criteria.LEAST_GAIN * explainable:
-        return False
-    # what follows time alone fits a shifted residual as well; its lines and trends have tests
-    # of their own
-    chance = 0.0 if best.effect.time_driven else this.chance.get(best.name, 0.0)
-    if gain < criteria.BEYOND_CHANCE * chance:
-        return False
-    if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
-        return False
-    return not _harms(rows, this.before, best.fitted, noise)
-
-
-def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
-    """Return whether the error of a kind of excitation grows, where it was no trifle."""
-    kinds = np.unique(rows.group)
-    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
-    one = np.bincount(rows.group, before.errors) / counts
-    other = np.bincount(rows.group, after.errors) / counts
-    trifle = noise + (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2
-    return bool(np.any(other > criteria.HARM**2 * one + trifle))
-
-
-def smallest_detectable(
-    rows: Rows,
-    base: Fitted,
-    fitted: Fitted,
-    rounds: Sequence[Round],
-    taken: Sequence[Round],
-    noise: float,
-) -> float | None:
-    """
-    Return the size that a further effect must have to be taken, rms in % of stroke.
-
-    None where the range was passed so rarely that none is taken.  Parameters as in `judge`;
-    `rounds` are all rounds.
-    """
-    if rows.passes < criteria.PASSES:
-        return None
-    # what follows time alone fits any slow residual
-    last = rounds[-1].chance
-    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
-    share = criteria.FURTHER if taken else criteria.ADDED
-    least = max(
-        criteria.BEYOND_CHANCE * chance,
-        criteria.LEAST_GAIN * (base.mean_square - noise),
-        share * (fitted.mean_square - noise),
-    )
-    return max(criteria.SMALLEST_EFFECT, percent(rows, least))
-
-
 # -- which effect is it? -------------------------------------------------------------------------
 
 
-def judge(
-    rows: Rows,
-    base: Fitted,
-    fitted: Fitted,
-    taken: Sequence[Round],
-    noise: float,
-    left_out: Collection[str] = (),
-    bent: Round | None = None,
-) -> Findings:
+def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Findings:
     """
-    Return the verdict.
+    Return the verdict on what was added to a base.
 
-    Parameters
-    ----------
-    base, fitted : Fitted
-        Before and after everything that was added.
-    taken : sequence of Round
-        The rounds whose best contender was added.
-    noise : float
-        Mean square of the noise of a row.
-    left_out : collection of str, optional
-        Effects that were not tried.
-    bent : Round, optional
-        What else the first one may have been: an effect that bent G at the identification.
+    `noise` is the mean square of the noise of a row.  What could have bent G at the identification
+    is a rival of the first effect that was added.
     """
+    fitted, taken, bent = selected.fitted, selected.taken, selected.bent
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
     if not taken:
-        size = percent(rows, explainable)
+        size = rows.percent(explainable)
         small = size < criteria.SMALLEST_EFFECT
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
-    rest = percent(rows, left)
+    rest = rows.percent(left)
     if share < criteria.NAMED:
         return Findings('partly_explained', share, effects, None, rest)
     for i, this in enumerate(taken):
@@ -195,7 +100,7 @@ def judge(
         whole = (base if i == 0 else this.before).mean_square
         rivals = rivals_of(rows, contenders, rest_of, whole - rest_of)
         names = tuple(dict.fromkeys((effects[i], *(c.name for c in rivals))))
-        untried = [name for name in look_alikes(names[0]) if name in left_out]
+        untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
             names = (*names, *untried)[: criteria.CLASS_SIZE]
             return Findings('class', share, effects, _class(names, untried), rest)
@@ -217,12 +122,7 @@ def rivals_of(
     """
     Return the contenders that the data do not tell from the first one, which was added.
 
-    Parameters
-    ----------
-    noise : float
-        Mean square of the noise of a row.
-    explainable : float
-        Mean square that there was to explain.
+    `noise` and `explainable` are mean squares: of the noise, and of what there was to explain.
     """
     best, *others = contenders
     floor = (criteria.INDISTINCT * rows.stroke / 100.0) ** 2
@@ -313,14 +213,7 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
 def untestable_of(
     first: Round, settings: DiagnosisSettings, tested: Collection[str]
 ) -> tuple[Untestable, ...]:
-    """
-    Return the candidates that these data cannot show.
-
-    Parameters
-    ----------
-    tested : collection of str
-        Effects that were tested otherwise, or are in the model as it was given.
-    """
+    """Return the candidates that these data cannot show, but for those `tested` otherwise."""
     names = settings.effects or tuple(catalogue())
     return tuple(
         Untestable(name, find_effect(name).needs or 'data in which it shows')

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.diagnosis import forward_selection
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
-from piezo_ident.diagnosis.look_alikes import CONTAINS, LOOK_ALIKES, separating_experiment
-from piezo_ident.diagnosis.verdict import judge, rivals_of, takes
+from piezo_ident.diagnosis.forward_selection import takes
+from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
+from piezo_ident.diagnosis.verdict import judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
 import pytest
 
@@ -25,6 +26,7 @@ def rows():
     return SimpleNamespace(
         n=BLOCKS * SIZE,
         stroke=1.0,
+        percent=lambda mean_square: 100.0 * np.sqrt(max(mean_square, 0.0)),
         block=np.repeat(np.arange(BLOCKS), SIZE),
         group=np.arange(BLOCKS) // 10,
         labels=tuple(f'kind {i}' for i in range(8)),
@@ -111,7 +113,10 @@ def test_standard_errors_pair_the_blocks():
 
 
 def verdict(rows, taken, left, bent=None):
-    return judge(rows, fitted(WHOLE), fitted(left * WHOLE), taken, 0.0, (), bent)
+    selected = SimpleNamespace(
+        fitted=fitted(left * WHOLE), taken=taken, bent=bent, left_out=frozenset()
+    )
+    return judge(rows, fitted(WHOLE), selected, 0.0)
 
 
 def test_a_tie_of_laws_that_do_not_fit_is_a_class(rows):
