@@ -68,20 +68,6 @@ def test_saturation_with_one_end_leaves_the_other():
 # -- creep -------------------------------------------------------------------------------------
 
 
-def test_creep_of_one_element_a_decade_is_straight_in_the_logarithm_of_time():
-    fs, gamma = 200.0, 0.012
-    values = {'gain': [gamma] * 5, 'time_constant': [0.01, 0.1, 1.0, 10.0, 100.0]}
-    u = np.concatenate([[0.0], np.ones(int(100 * fs))])
-    y = alone('creep', values, u, fs)[1:]
-    t = np.arange(1, y.size + 1) / fs
-    at = np.geomspace(0.1, 30, 60)
-    rise = np.interp(at, t, y)
-    slope, offset = np.polyfit(np.log10(at), rise, 1)
-    assert slope == pytest.approx(gamma, rel=0.03)
-    # what bends is the ripple of the elements, a few per cent of the rise a decade
-    assert np.abs(rise - slope * np.log10(at) - offset).max() < 0.06 * gamma
-
-
 def test_creep_is_its_exponentials():
     values = {'gain': [0.02, 0.0, -0.01], 'time_constant': [0.01, 0.2, 3.0]}
     t = np.arange(1, 4001) / FS
@@ -124,31 +110,6 @@ def test_rate_dependence_is_its_equation(values):
     assert_allclose(got, plainly(u, FS, *values), atol=1e-13)
 
 
-def deviation(f: float, amplitude: float = 0.5) -> float:
-    """Return by how much rate dependence changes H on a sine, in % of the stroke."""
-    fs = FS * max(1.0, f / 100)
-    n = round(2 * fs / f)
-    u = amplitude * (1 - np.cos(2 * np.pi * f * np.arange(n) / fs))
-    values = {'gain': 1e-4, 'exponent': 1.0, 'cutoff': 1000.0}
-    w = alone('rate_dependent_hysteresis', values, u, fs)
-    still = H(u)
-    half = slice(n // 2, n)
-    return 100 * np.sqrt(np.mean((w - still)[half] ** 2)) / np.ptp(still[half])
-
-
-def test_rate_dependence_is_nothing_when_slow_and_grows_with_speed():
-    at = {f: deviation(f) for f in (0.2, 1.0, 10.0, 50.0, 100.0, 120.0)}
-    assert at[0.2] < 0.005
-    assert at[1.0] < 0.02
-    assert at[120.0] > 0.5
-    assert np.all(np.diff(list(at.values())) > 0)
-
-
-def test_rate_dependence_grows_with_amplitude_at_one_frequency():
-    # linear dynamics would give one number
-    assert deviation(100.0, 0.5) > 1.3 * deviation(100.0, 0.15)
-
-
 # -- the static curve and the minor loops ------------------------------------------------------
 
 
@@ -158,43 +119,12 @@ def test_even_nonlinearity_is_its_powers():
     assert_allclose(y - H(u), 0.02 * u**2 - 0.03 * u**4, atol=1e-14)
 
 
-def test_even_nonlinearity_makes_the_even_harmonics_that_h_lacks():
-    n = 20_000
-    u = 0.8 * np.sin(2 * np.pi * 5 * np.arange(2 * n) / n)
-
-    def harmonics(w):
-        return np.abs(np.fft.rfft(w[n:] - w[n:].mean()) / (n / 2))[[10, 20]]
-
-    y = alone('even_nonlinearity', {'square': 0.02}, u)
-    # the mean of the loops of one-sided plays is no even function, so only the difference counts
-    assert_allclose(harmonics(y - H(u)), [0.02 * 0.8**2 / 2, 0.0], atol=1e-12)
-
-
 def test_minor_loops_are_plays_with_a_tilted_weight():
     u = signal() / 10
     values = {'threshold': [0.03, 0.2], 'slope': [0.04, -0.02], 'bias': 0.4}
     y = alone('noncongruent_minor_loops', values, u)
     plays = play_columns(u, values['threshold'])
     assert_allclose(y - H(u), (u - 0.4) * (np.array(values['slope']) @ plays), atol=1e-13)
-
-
-def heights(values: dict, width: float = 0.2) -> np.ndarray:
-    """Return the height of the minor loop at three biases, halfway up."""
-    one = np.concatenate([np.linspace(0, 1, 201), np.linspace(1, 0, 201)])
-    found = []
-    for bias in (0.1, 0.4, 0.7):
-        u = np.concatenate([np.linspace(0, bias, 50), *(bias + width * one for _ in range(3))])
-        w = alone('noncongruent_minor_loops', values, u)[-402:]
-        found.append(w[201:][::-1][100] - w[:201][100])
-    return np.array(found)
-
-
-def test_minor_loops_of_one_width_differ_with_the_bias():
-    none = heights({'threshold': [0.05]})
-    assert_allclose(none, none[0], rtol=1e-9)
-    some = heights({'threshold': [0.05], 'slope': [0.3]})
-    # height of the play's own loop times the tilt at the middle of the loop
-    assert_allclose(some - none, 0.3 * (np.array([0.2, 0.5, 0.8]) - 0.5) * 0.05, atol=1e-12)
 
 
 @settings(deadline=None, max_examples=30)

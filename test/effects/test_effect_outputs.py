@@ -57,16 +57,6 @@ def test_changed_dynamics_have_their_frequency_response():
     assert_allclose([M[0], R[0]], [1 / 0.1j, 1 / 0.1], rtol=1e-12)
 
 
-@pytest.mark.parametrize('frequency', [0.01, 1.0, 100.0, 9999.0])
-def test_changed_dynamics_keep_the_static_gain(frequency):
-    effect = find_effect('changed_dynamics')(
-        FS, {'frequency': [frequency], 'damping': [0.1], 'gain': [0.5], 'rate_gain': [0.3]}
-    )
-    assert effect.reset(0.7, 0.7) == 0.7
-    still = np.full(1000, 0.7)
-    assert_array_equal(effect.process(Block(np.zeros(1000), still, still)).x, still)
-
-
 def second_order(own: float, damping: float, c: float) -> tuple[np.ndarray, np.ndarray]:
     """Return b and a of a mode by the bilinear transform s -> c (1 - z)/(1 + z), w in radians."""
     w = 2 * np.pi * own
@@ -186,32 +176,6 @@ def test_hum_has_the_lines_and_phases_it_was_given():
     assert_allclose(np.angle(spectrum[[50, 150]]) + np.pi / 2, [0.4, 1.1], atol=1e-9)
 
 
-def test_hum_as_sine_and_cosine_is_one_line_of_any_phase():
-    both = {
-        'frequency': 50.0,
-        'harmonic': [1.0, 1.0],
-        'amplitude': [0.003, 0.004],
-        'phase': [0.0, np.pi / 2],
-    }
-    one = {
-        'frequency': 50.0,
-        'harmonic': [1.0],
-        'amplitude': [0.005],
-        'phase': [np.arctan2(0.004, 0.003)],
-    }
-    zero = np.zeros(1000)
-    assert_allclose(
-        alone('periodic_disturbance', both, zero),
-        alone('periodic_disturbance', one, zero),
-        atol=1e-15,
-    )
-
-
-def test_hum_in_metres_is_a_share_of_the_span():
-    y = with_effects('periodic_disturbance').stream().process(np.zeros(20_000))
-    assert np.abs(np.fft.rfft(y)[50]) / 10_000 == pytest.approx(1e-3 * 75e-6, rel=1e-6)
-
-
 def test_drift_goes_on_through_a_gap():
     static = with_effects('thermal_drift', model=STATIC)
     zero = np.zeros(100)
@@ -276,12 +240,6 @@ def moved(delta: float, delay: Delay, *, v: np.ndarray) -> np.ndarray:
 def test_delay_changes_either_way_by_samples_and_fractions(delta, delay, same):
     v = signal()
     assert_array_equal(moved(delta, delay, v=v), played(replace(PAPER, delay=same), v))
-
-
-def test_delay_in_fractions_is_interpolation_of_the_prediction():
-    v = signal()
-    y, late = played(PAPER, v), moved(0.3, PAPER.delay, v=v)
-    assert_allclose(late[1:], 0.7 * y[1:] + 0.3 * y[:-1], atol=1e-15 * 75)
 
 
 def test_several_changes_of_the_delay_add_up():

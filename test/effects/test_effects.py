@@ -25,7 +25,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import catalogue, Effect, find_effect, Parameter, Trial, View
-from piezo_ident.model.files import load, model_from_dict, model_to_dict
+from piezo_ident.model.files import load, model_to_dict
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.chain import Block, SLOTS
 import pytest
@@ -87,14 +87,10 @@ def test_neutral_values_change_nothing(name):
     v, effect = signal(), catalogue()[name]
     plain = played(PAPER, v)
     assert_array_equal(played(with_setting(name, effect.neutral(VISIBLE[name])), v), plain)
+    # nor do those that are left out
+    assert_array_equal(played(with_setting(name, shape_of(name)), v), plain)
     # and the values of the other tests do change something
     assert np.abs(played(with_effects(name), v) - plain).max() > 1e-9
-
-
-@pytest.mark.parametrize('name', EVERY)
-def test_values_that_are_left_out_change_nothing(name):
-    v = signal()
-    assert_array_equal(played(with_setting(name, shape_of(name)), v), played(PAPER, v))
 
 
 @pytest.mark.parametrize('name', EVERY)
@@ -181,14 +177,6 @@ def test_result_does_not_depend_on_the_cutting(cuts, names, t0):
     assert_allclose(np.concatenate(parts), whole, rtol=0, atol=1e-12 * 75e-6)
 
 
-@pytest.mark.parametrize('name', EVERY)
-def test_sample_by_sample_is_batch(name):
-    model, v, other_axis = with_effects(name), signal(300, 400.0), other(300)
-    run = model.stream()
-    one = [run.process(v[[k]], channels={'other_axis': other_axis[[k]]})[0] for k in range(v.size)]
-    assert_allclose(one, played(model, v), rtol=0, atol=1e-12 * 75e-6)
-
-
 def test_saving_and_loading_changes_nothing(tmp_path):
     model = with_effects(*VISIBLE)
     model.save(tmp_path / 'model.yaml')
@@ -205,14 +193,6 @@ def test_saving_and_loading_neutral_values_changes_nothing(name, tmp_path):
     again = load(tmp_path / 'model.yaml')
     assert model_to_dict(again)['effects'] == model_to_dict(model)['effects']
     assert_array_equal(played(again, signal()), played(PAPER, signal()))
-
-
-@pytest.mark.parametrize('name', EVERY)
-def test_a_file_may_leave_out_what_has_a_default(name):
-    data = model_to_dict(PAPER)
-    data['effects'] = [{'name': name, 'parameters': shape_of(name)}]
-    (effect,) = model_from_dict(data).effects
-    assert set(effect.parameters) == {p.name for p in catalogue()[name].parameters}
 
 
 # -- refusals ----------------------------------------------------------------------------------
@@ -271,14 +251,6 @@ def test_missing_and_unknown_parameters_are_refused(name):
 def test_values_that_contradict_each_other_are_refused(name, change, says):
     with pytest.raises(ModelError, match=says):
         find_effect(name)(FS, {**VISIBLE[name], **change}, H)
-
-
-def test_parameters_are_read_as_what_they_are():
-    lag, coupling = find_effect('amplifier_lag'), find_effect('cross_coupling')
-    one, two = lag(FS, VISIBLE['amplifier_lag']), coupling(FS, VISIBLE['cross_coupling'])
-    assert one.number('time_constant') == 1e-3
-    assert_array_equal(one.array('time_constant'), [1e-3])
-    assert two.text('channel') == 'other_axis'
 
 
 # -- trials ------------------------------------------------------------------------------------
