@@ -23,10 +23,8 @@ from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
     'NormalEquations',
-    'block_products',
     'held_out_errors',
     'held_out_residual',
-    'held_out_sums',
     'normal_equations',
     'refit_holds',
     'solve',
@@ -43,13 +41,13 @@ RIDGE = 1e-9
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """
-    Normal equations of columns M and a residual e, block by block.
+    Normal equations of columns M and one residual or several, block by block.
 
     Attributes
     ----------
     A : ndarray, shape (blocks, p, p)
-    b : ndarray, shape (blocks, p)
-    s : ndarray, shape (blocks,)
+    b : ndarray, shape (blocks, p, k)
+    s : ndarray, shape (blocks, k)
     """
 
     A: Array
@@ -57,31 +55,23 @@ class NormalEquations:
     s: Array
 
 
-def block_products(rows: Rows, M: Array, N: Array) -> Array:
+def _block_products(rows: Rows, M: Array, N: Array) -> Array:
     """Return ``M_k' N_k`` of every block; shape (blocks, p, q)."""
-    edges = rows.edges
-    out = np.empty((edges.size - 1, M.shape[1], N.shape[1]))
-    for k, (start, stop) in enumerate(itertools.pairwise(edges)):
-        out[k] = M[start:stop].T @ N[start:stop]
-    return out
+    return np.stack([M[a:b].T @ N[a:b] for a, b in itertools.pairwise(rows.edges)])
 
 
-def normal_equations(rows: Rows, M: Array, e: Array) -> NormalEquations:
-    """Return the normal equations of columns M, shape (n, p), and a residual e, shape (n,)."""
-    column = e[:, None]
-    return NormalEquations(
-        A=block_products(rows, M, M),
-        b=block_products(rows, M, column)[:, :, 0],
-        s=block_products(rows, column, column)[:, 0, 0],
-    )
+def normal_equations(rows: Rows, M: Array, E: Array) -> NormalEquations:
+    """Return the normal equations of columns M, shape (n, p), and residuals E, shape (n, k)."""
+    squares = np.add.reduceat(E**2, rows.edges[:-1])
+    return NormalEquations(_block_products(rows, M, M), _block_products(rows, M, E), squares)
 
 
 def with_columns(
-    rows: Rows, equations: NormalEquations, M: Array, C: Array, e: Array
+    rows: Rows, equations: NormalEquations, M: Array, C: Array, E: Array
 ) -> NormalEquations:
     """Return the normal equations of ``[M C]`` from those of M."""
-    right = block_products(rows, M, C)
-    lower = block_products(rows, C, np.column_stack([C, e]))
+    right = _block_products(rows, M, C)
+    lower = _block_products(rows, C, np.column_stack([C, E]))
     c = C.shape[1]
     A = np.concatenate(
         [
@@ -90,7 +80,7 @@ def with_columns(
         ],
         axis=1,
     )
-    return NormalEquations(A, np.concatenate([equations.b, lower[:, :, c]], axis=1), equations.s)
+    return NormalEquations(A, np.concatenate([equations.b, lower[:, :, c:]], axis=1), equations.s)
 
 
 def solve(A: Array, b: Array, prior: Array) -> Array:
@@ -122,38 +112,19 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
 
 def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: Array) -> Array:
     """
-    Return the sum of squares of every block, each predicted from the blocks of other sets.
+    Return the squares of every block, each predicted from other sets; shape (blocks, k).
 
     Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
     """
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
-    errors = np.empty(equations.s.size)
+    errors = equations.s.copy()
     for one in np.unique(sets):
         out = sets == one
-        here = equations.A[out]
-        theta = np.zeros(b.size)
         if not out.all():
-            theta = solve(A - here.sum(axis=0), b - equations.b[out].sum(axis=0), prior)
-        errors[out] = equations.s[out] - 2.0 * equations.b[out] @ theta + (here @ theta) @ theta
+            A_out, b_out = equations.A[out], equations.b[out]
+            theta = solve(A - A_out.sum(axis=0), b - b_out.sum(axis=0), prior)
+            errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
     return np.maximum(errors, 0.0)
-
-
-def held_out_sums(A: Array, b: Array, s: Array, sets: NDArray[np.int64], prior: Array) -> Array:
-    """
-    Return the sum of the held-out squares of k residuals at once, shape (k,).
-
-    Their products with the columns are b, shape (blocks, p, k), their sums of squares s.
-    """
-    total_A, total_b = A.sum(axis=0), b.sum(axis=0)
-    errors = s.copy()
-    for one in np.unique(sets):
-        out = sets == one
-        if out.all():
-            continue
-        A_out, b_out = A[out].sum(axis=0), b[out].sum(axis=0)
-        theta = solve(total_A - A_out, total_b - b_out, prior)
-        errors += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=0)
-    return np.asarray(errors)
 
 
 def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
@@ -164,7 +135,7 @@ def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
     optimum the model is linear in its parameters, so leaving a set of blocks out moves them by one
     Gauss-Newton step.
     """
-    equations = normal_equations(rows, M, e)
+    equations = normal_equations(rows, M, e[:, None])
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
     left = e.copy()
     for one in np.unique(rows.fold):
@@ -173,7 +144,7 @@ def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
             continue
         theta = solve(A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior)
         here = out[rows.block]
-        left[here] -= M[here] @ theta
+        left[here] -= M[here] @ theta[:, 0]
     return left
 
 

@@ -280,7 +280,7 @@ def fit_jointly(
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
     prior = _prior(rows, e, p, m)
-    equations = normal_equations(rows, J[:, free], e)
+    equations = normal_equations(rows, J[:, free], e[:, None])
     return Fitted(
         state=state,
         base=base,
@@ -289,8 +289,8 @@ def fit_jointly(
         free=free,
         parameters=parameters,
         prior=prior,
-        errors=held_out_errors(equations, rows.fold, prior[free]),
-        transfer=held_out_errors(equations, rows.group, prior[free]),
+        errors=held_out_errors(equations, rows.fold, prior[free])[:, 0],
+        transfer=held_out_errors(equations, rows.group, prior[free])[:, 0],
     )
 
 

@@ -27,9 +27,7 @@ from piezo_ident.diagnosis.criteria import (
     WORTH_FIT,
 )
 from piezo_ident.diagnosis.cross_validation import (
-    block_products,
     held_out_errors,
-    held_out_sums,
     normal_equations,
     NormalEquations,
     solve,
@@ -245,15 +243,14 @@ def score_trials(
     surrogates: Array,
     tick: Tick = lambda share: None,
 ) -> Iterator[Scored]:
-    """Score every trial of every effect on the residual of a fit; surrogates (n, k)."""
+    """Score every trial of every effect on the residual of a fit; surrogates, shape (n, k)."""
     rows = simulator.rows
     now = simulator.remember(fitted.state)
-    M, e, prior = fitted.J[:, fitted.free], fitted.e, fitted.prior[fitted.free]
-    equations = normal_equations(rows, M, e)
+    M, prior = fitted.J[:, fitted.free], fitted.prior[fitted.free]
+    E = np.column_stack([fitted.e, surrogates])
+    equations = normal_equations(rows, M, E)
+    alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)
     view = _view_of(simulator, lines)
-    explained = block_products(rows, M, surrogates)
-    squares = np.sum(surrogates**2, axis=0)
-    alone = held_out_sums(equations.A, explained, squares, rows.fold, prior)
     trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
     for done, (effect, trial) in enumerate(trials):
         tick(done / len(trials))
@@ -263,18 +260,16 @@ def score_trials(
             continue
         if not np.all(np.isfinite(C)) or not np.any(C):
             continue
-        both = with_columns(rows, equations, M, C, e)
+        both = with_columns(rows, equations, M, C, E)
         wide = np.concatenate([prior, np.zeros(C.shape[1])])
-        theta = solve(both.A.sum(axis=0), both.b.sum(axis=0), wide)[M.shape[1] :]
+        theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[M.shape[1] :]
         visible = _visible(both, M.shape[1], wide)
         if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
-            yield Scored(effect, trial, theta, equations.s, 0.0, visible, False)
+            yield Scored(effect, trial, theta, equations.s[:, 0], 0.0, visible, False)
             continue
-        together = np.concatenate([explained, block_products(rows, C, surrogates)], axis=1)
-        with_it = held_out_sums(both.A, together, squares, rows.fold, wide)
-        gains = np.maximum(alone - with_it, 0.0)
         errors = held_out_errors(both, rows.fold, wide)
-        yield Scored(effect, trial, theta, errors, float(gains.max(initial=0.0)), visible)
+        chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
+        yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
 
 
 def _columns(simulator: Simulator, effect: type[Effect], trial: Trial, now: Array) -> Array:

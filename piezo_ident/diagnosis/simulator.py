@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
@@ -209,11 +208,19 @@ def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -
         return dynamics
     c1, c2, c3, c4 = retuning
     # polynomials in z^-1
-    D = Polynomial([1.0, -1.0])
-    P, Q = (Polynomial([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
-    factor = (1.0 + c1 * D + c2 * D * D) * P * Q + c3 * D * Q + c4 * D * P
-    a, b = Polynomial([1.0, *dynamics.a]) * P * Q, Polynomial(dynamics.b) * factor
-    return Dynamics(a=np.asarray(a.coef[1:], float), b=np.asarray(b.coef, float))
+    D = np.array([1.0, -1.0])
+    P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
+    common = np.convolve(P, Q)
+    terms = (
+        common,
+        c1 * np.convolve(common, D),
+        c2 * np.convolve(common, np.convolve(D, D)),
+        c3 * np.convolve(Q, D),
+        c4 * np.convolve(P, D),
+    )
+    factor = np.sum([np.pad(term, (0, 5 - term.size)) for term in terms], axis=0)
+    a = np.convolve([1.0, *dynamics.a], common)[1:]
+    return Dynamics(a=a, b=np.convolve(dynamics.b, factor))
 
 
 def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:

@@ -407,7 +407,7 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
     rows = make_rows(model, [record])
     rng = np.random.default_rng(0)
     M, e = rng.standard_normal((rows.n, 4)), rng.standard_normal(rows.n)
-    errors = held_out_errors(normal_equations(rows, M, e), rows.fold, np.zeros(4))
+    errors = held_out_errors(normal_equations(rows, M, e[:, None]), rows.fold, np.zeros(4))
     out = (rows.fold == 2)[rows.block]
     theta = np.linalg.lstsq(M[~out], e[~out], rcond=None)[0]
     left = e[out] - M[out] @ theta
