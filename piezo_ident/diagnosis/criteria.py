@@ -77,6 +77,13 @@ LINEAR = 0.5
 BENT = 0.25
 #: share that a candidate must gain to be fitted jointly, and the most candidates of a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
+#: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
+#: round are fitted to the end
+STARTS, FIRST, FINAL = 2, 3, 2
+#: passes with fresh columns at the end, at most, and the gain that makes another worth it
+POLISHING, POLISH = 6, 0.02
+#: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
+TUNED = 0.05
 #: factor by which a refit of H may raise the rms of a kind of excitation that was held out
 REFIT_HARM = 1.05
 #: gain in rms from which a refit of H alone is kept, and the same if structure is unexplained

@@ -21,15 +21,12 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted, RETUNING
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round, score_trials, search_round, started, STARTS
+from piezo_ident.diagnosis.search import Round, score_trials, search_round, started
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.identification.results import Progress
 
 __all__ = ['ForwardSelection', 'Selected', 'smallest_detectable', 'takes']
-
-#: passes with fresh columns at the end, at most, and the gain that makes another worth it
-POLISHING, POLISH = 6, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,10 +243,10 @@ def _polished(
         for fresh in _afresh(simulator, fitted, i, lines, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
-    for _ in range(POLISHING):
+    for _ in range(criteria.POLISHING):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
+        if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
             break
         fitted = fresh
     return fitted
@@ -269,7 +266,7 @@ def _afresh(
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
     scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
     trials = sorted((s for s in scored if s.is_possible), key=lambda s: s.error)
-    for start in trials[:STARTS]:
+    for start in trials[: criteria.STARTS]:
         effects = (*others[:i], started(rows, start), *others[i:])
         state = replace(rest.state, effects=effects)
         try:

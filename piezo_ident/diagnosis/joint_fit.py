@@ -204,17 +204,11 @@ def fit_base(simulator: Simulator, state: State, thresholds: Array) -> tuple[Sta
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
     """Return the columns of a refit of H in a state, its effects and a retuned G included."""
-    h = state.hysteresis
-    prediction = simulator.run(state)
-    columns = []
-    for j in range(h.thresholds.size + 2):
-        weights, p1, p2 = h.weights.copy(), h.p1, h.p2
-        if j < h.thresholds.size:
-            weights[j] += WEIGHT_STEP
-        p1 += WEIGHT_STEP * (j == h.thresholds.size)
-        p2 += WEIGHT_STEP * (j == h.thresholds.size + 1)
-        moved = replace(state, hysteresis=Hysteresis(h.thresholds, weights, p1, p2))
-        columns.append((simulator.run(moved) - prediction) / WEIGHT_STEP)
+    prediction, m = simulator.run(state), state.hysteresis.thresholds.size
+    columns = [
+        (simulator.run(_moved(state, (), step)) - prediction) / WEIGHT_STEP
+        for step in WEIGHT_STEP * np.eye(m + 2, m + 2 + state.offsets.size)
+    ]
     whole = np.hstack([np.stack(columns, axis=1), _offset_columns(simulator.rows)])
     return BaseColumns(whole, whole.T @ whole)
 
@@ -303,14 +297,10 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     """
     M = fitted.J[:, fitted.free]
     size = np.linalg.norm(M, axis=0)
-    A = M.T @ M / np.outer(size, size)
+    equations = normal_equations(rows, M, fitted.e[:, None])
+    A = equations.A.sum(axis=0) / np.outer(size, size)
     A[np.diag_indices_from(A)] += 1e-10
-    gradients = np.stack(
-        [
-            M[start:stop].T @ fitted.e[start:stop] / size
-            for start, stop in zip(rows.edges[:-1], rows.edges[1:], strict=True)
-        ]
-    )
+    gradients = equations.b[:, :, 0] / size
     inverse = np.linalg.pinv(A, hermitian=True)
     covariance = inverse @ (gradients.T @ gradients) @ inverse
     deviation = np.full(fitted.free.size, np.nan)

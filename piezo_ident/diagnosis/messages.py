@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import WORTH_REFIT_IN_DOUBT
+from piezo_ident.diagnosis.criteria import TUNED, WORTH_REFIT_IN_DOUBT
 from piezo_ident.diagnosis.refined_model import lasting, Refined
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.simulator import Added
@@ -18,9 +18,6 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
 
 __all__ = ['left_over', 'part_searched', 'sentence', 'warnings_of']
-
-#: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
-TUNED = 0.05
 
 
 def left_over(findings: Findings, smallest: float | None, passes: float) -> str:

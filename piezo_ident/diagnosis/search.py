@@ -20,9 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.criteria import (
+    FINAL,
+    FIRST,
     JOINT_FITS,
     ON_AMPLITUDE,
     SIMPLER,
+    STARTS,
     SURROGATES,
     WORTH_FIT,
 )
@@ -38,17 +41,12 @@ from piezo_ident.diagnosis.rows import means, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
 
-__all__ = ['STARTS', 'Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
+__all__ = ['Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
 
 Array = NDArray[np.float64]
 
 #: called with the share of the work that is done; may raise `Cancelled`
 Tick = Callable[[float], None]
-
-#: iterations of the first joint fit of a candidate, and how many are fitted to the end
-FIRST, FINAL = 3, 2
-#: trials of a candidate that a fit starts from
-STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
