@@ -13,8 +13,6 @@ and the workers of dask.distributed run before the clock starts.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -35,12 +33,11 @@ from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from side_by_side import markdown, ratio, take_turns
+from side_by_side import markdown, ratio, show, take_turns
 
 HOME = Path(__file__).resolve().parents[1]
 #: turns, and records, of which one is damaged
 RUNS, RECORDS = 5, 200
-QUICK_RUNS, QUICK_RECORDS = 1, 12
 WORKERS = 2
 RATE = 2000.0
 PROGRAM = """\
@@ -57,41 +54,23 @@ segments:
 OPTIONS = ('--max-order', '4', '--thresholds', '6', '--solver', 'least_squares')
 
 
-def stages(n: int) -> Iterator[SimulatedStage]:
-    """Yield stages of one line: they differ a little, and their gain falls as the line ages."""
+def make_records(folder: Path, n: int) -> None:
+    """Write n records of stages whose gain falls as their line ages; one file is damaged."""
+    folder.mkdir()
     rng = np.random.default_rng(5)
-    base = StageModel(
+    model = StageModel(
         sample_rate=RATE,
         scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
-        hysteresis=Hysteresis(
-            np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.2, 0.1]), p1=-0.2, p2=0.9
-        ),
-        dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
+        hysteresis=Hysteresis([0.2, 0.4, 0.6], [0.3, 0.2, 0.1], p1=-0.2, p2=0.9),
+        dynamics=Dynamics([-1.2, 0.5], [0.2, 0.1]),
         delay=Delay(2),
     )
-    for i in range(n):
-        h, g, s = base.hysteresis, base.dynamics, base.scaling
-        # one of them has a loose preload
-        loose = 1.35 if i == n // 3 else 1.0
-        weights = loose * h.weights * (1.0 + 0.03 * rng.standard_normal(3))
-        a = g.a * np.array([1.0, 1.0 + 0.005 * rng.standard_normal()])
-        gain = 1.0 + 0.006 * rng.standard_normal() - 0.04 * i / n
-        model = replace(
-            base,
-            hysteresis=replace(h, weights=weights),
-            dynamics=replace(g, a=a),
-            scaling=replace(s, Y=s.Y * gain),
-        )
-        yield SimulatedStage(model, Sensor(noise_rms=5e-9))
-
-
-def make_records(folder: Path, n: int) -> None:
-    """Write n records, the damaged one included."""
-    folder.mkdir()
     sequence = parse_program(PROGRAM).build(RATE)
-    for i, stage in enumerate(stages(n)):
-        path = folder / f'stage_{i + 1:03d}.npz'
-        pi.write(stage.play(sequence, np.random.default_rng(i)), path)
+    for i in range(n):
+        gain = 1.0 + 0.006 * rng.standard_normal() - 0.04 * i / n
+        scaling = replace(model.scaling, Y=model.scaling.Y * gain)
+        stage = SimulatedStage(replace(model, scaling=scaling), Sensor(noise_rms=5e-9))
+        pi.write(stage.play(sequence, rng), folder / f'stage_{i + 1:03d}.npz')
     broken = folder / f'stage_{2 * n // 3:03d}.npz'
     broken.write_bytes(broken.read_bytes()[:20_000])
 
@@ -100,17 +79,14 @@ def identify(records: Path, out: Path, *options: str) -> None:
     """Run the command as a user would."""
     shutil.rmtree(out, ignore_errors=True)
     command = [sys.executable, '-m', 'piezo_ident', 'identify', str(records), '--each', str(out)]
+    # the same package as here, wherever a process starts
+    paths = os.pathsep.join([str(HOME), os.environ.get('PYTHONPATH', '')])
+    environment = os.environ | {'PYTHONPATH': paths}
     done = subprocess.run(
-        [*command, *OPTIONS, *options], env=_environment(), capture_output=True, text=True
+        [*command, *OPTIONS, *options], env=environment, capture_output=True, text=True
     )
     if done.returncode:
         raise RuntimeError(done.stderr.strip() or f'exit code {done.returncode}')
-
-
-def _environment() -> dict[str, str]:
-    # the same package as here, wherever a process starts
-    paths = [str(HOME), *filter(None, [os.environ.get('PYTHONPATH')])]
-    return {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -133,56 +109,46 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     RuntimeError
         When the tables differ: then nothing else is worth saying.
     """
-    runs, n = (QUICK_RUNS, QUICK_RECORDS) if quick else (RUNS, RECORDS)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
-    many = max(2, cores or 1)
+    runs, n = (1, 12) if quick else (RUNS, RECORDS)
+    cores = len(os.sched_getaffinity(0))
+    many = max(2, cores)
     with tempfile.TemporaryDirectory(prefix='bench_many.') as name:
         folder = Path(name)
-        records = folder / 'records'
+        records, few = folder / 'records', folder / 'few'
         make_records(records, n)
-        outs = {place: folder / place for place in ('one', 'cores', 'dask')}
+        few.mkdir()
+        for path in sorted(records.iterdir())[: 2 * WORKERS]:
+            shutil.copy(path, few)
         with LocalCluster(
             n_workers=WORKERS, threads_per_worker=1, dashboard_address=None
         ) as cluster:
-            address = cluster.scheduler_address
             options = {
-                'one': ('--jobs', '1'),
-                'cores': ('--jobs', str(many)),
-                'dask': ('--scheduler', address),
+                'one process': ('--jobs', '1'),
+                f'{many} processes': ('--jobs', str(many)),
+                f'{WORKERS} dask workers': ('--scheduler', cluster.scheduler_address),
             }
             # kernels are compiled on their first call, and the workers import on theirs
-            few = folder / 'few'
-            few.mkdir()
-            for path in sorted(records.iterdir())[: 2 * WORKERS]:
-                shutil.copy(path, few)
-            for place, chosen in options.items():
-                identify(few, folder / f'warm_{place}', *chosen)
+            for chosen in options.values():
+                identify(few, folder / 'warm', *chosen)
             turns = take_turns(
                 {
-                    place: lambda k, place=place: identify(records, outs[place], *options[place])
-                    for place in outs
+                    place: lambda k, place=place: identify(
+                        records, folder / place, *options[place]
+                    )
+                    for place in options
                 },
                 runs,
             )
-        found = {place: contents(out) for place, out in outs.items()}
-        if not found['one'] == found['cores'] == found['dask']:
+        first, *others = (contents(folder / place) for place in options)
+        if any(other != first for other in others):
             raise RuntimeError('the tables of the three places differ')
-        rows = (outs['one'] / 'records.csv').read_text(encoding='utf-8').splitlines()[1:]
-    failed = [row for row in rows if ',failed,' in row]
+    rows = first['records.csv'].decode().splitlines()[1:]
+    failed = [row.rstrip(',') for row in rows if ',failed,' in row]
     heads = ('where', 'whole command', 'records a second', 'speed-up')
-    names = {
-        'one': 'one process',
-        'cores': f'{many} processes',
-        'dask': f'{WORKERS} dask workers',
-    }
+    one = next(iter(turns.values()))
     table = [
-        (
-            names[place],
-            f'{turns[place].median:.1f} s',
-            f'{n / turns[place].median:.1f}',
-            ratio(turns['one'].over(turns[place])),
-        )
-        for place in outs
+        (place, f'{t.median:.1f} s', f'{n / t.median:.1f}', ratio(one.over(t)))
+        for place, t in turns.items()
     ]
     seconds = len(parse_program(PROGRAM).build(RATE).v) / RATE
     text = [
@@ -192,25 +158,12 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         '',
         markdown(heads, table),
         '',
-        f'The three tables ({len(rows)} rows) and the {len(found["one"]) - 1} models are the same '
+        f'The three tables ({len(rows)} rows) and the {len(first) - 1} models are the same '
         'byte for byte.',
-        f'{len(failed)} of {len(rows)} rows failed: `{_short(failed)}`.',
+        f'{len(failed)} of {len(rows)} rows failed: `{"; ".join(failed)}`.',
     ]
     return [('Many records', '\n'.join(text))]
 
 
-def _short(rows: Sequence[str]) -> str:
-    return '; '.join(row.rstrip(',') for row in rows[:3])
-
-
-def main() -> None:
-    """Print the section."""
-    parser = argparse.ArgumentParser(description='Identifies a folder of records.')
-    parser.add_argument('--quick', action='store_true', help='a few records, once')
-    args = parser.parse_args()
-    for title, text in sections(args.quick):
-        print(f'## {title}\n\n{text}\n')
-
-
 if __name__ == '__main__':
-    main()
+    show(sections)

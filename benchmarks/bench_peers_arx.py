@@ -115,26 +115,6 @@ def ours(data: Data, most: int, refine: bool = False) -> Coefficients:
     return delayed(found.b), found.a
 
 
-def plain(data: Data, most: int) -> Coefficients:
-    """Do the same search with one least-squares problem an order, in NumPy."""
-    n, first = data.n_fit, most + DELAY
-    past = [-data.y[first - i : n - i] for i in range(1, most + 1)]
-    past += [data.u[first - j : n - j] for j in range(DELAY, DELAY + most)]
-    columns, y = np.stack(past, axis=1), data.y[first:n]
-    best: tuple[float, Coefficients] = (np.inf, (np.ones(1), np.empty(0)))
-    for na in range(1, most + 1):
-        for nb in range(1, most + 1):
-            A = columns[:, [*range(na), *range(most, most + nb)]]
-            theta = np.linalg.lstsq(A, y, rcond=None)[0]
-            a, b = theta[:na], delayed(theta[na:])
-            with np.errstate(over='ignore', invalid='ignore'):
-                e = data.y[n:] - lfilter(b, np.concatenate([[1.0], a]), data.u[n:])
-                score = float(e[WARM_UP:].std())
-            if score < best[0]:
-                best = (score, (b, a))
-    return best[1]
-
-
 def sippy(data: Data, most: int) -> Coefficients:
     """Search with sippy_unipi: all orders, BIC on all data."""
     from sippy_unipi import system_identification
@@ -222,7 +202,6 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     works: dict[str, Callable[[Data, int], Coefficients]] = {
         'piezo_ident: search': ours,
         'piezo_ident: search, then output error': lambda data, m: ours(data, m, refine=True),
-        'NumPy: one `lstsq` an order, same search': plain,
         'sippy_unipi: all orders, BIC': sippy,
         'SysIdentPy: FROLS at every order, BIC': frols_orders,
         'SysIdentPy: FROLS, its own terms, BIC': frols,
@@ -237,31 +216,16 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         name: np.array([data_of(k).error(found) for k, found in enumerate(turn.results)])
         for name, turn in turns.items()
     }
-    rows = [
-        [
-            name,
-            seconds(turn.median),
-            ratio(turn.over(turns[base])),
-            f'{np.median(errors[name]):.4f}',
-            ''
-            if name.startswith('piezo_ident')
-            else f'{sum(errors[base] <= errors[name] * (1 + EQUAL))} of {runs}',
-        ]
-        for name, turn in turns.items()
-    ]
-    heads = (
-        'search',
-        'median time',
-        f'over `{base}`',
-        'test error, % of rms',
-        'ours equal or better',
-    )
-    return [
-        (
-            f'Order search, {most}² ARX models',
-            _text(turns, base, most, runs, markdown(heads, rows)),
-        )
-    ]
+    rows = []
+    for name, turn in turns.items():
+        better = sum(errors[base] <= errors[name] * (1 + EQUAL))
+        judged = '' if name.startswith('piezo_ident') else f'{better} of {runs}'
+        times = (seconds(turn.median), ratio(turn.over(turns[base])))
+        rows.append([name, *times, f'{np.median(errors[name]):.4f}', judged])
+    times = f'over `{base}`'
+    heads = ('search', 'median time', times, 'test error, % of rms', 'ours equal or better')
+    text = _text(turns, base, most, runs, markdown(heads, rows))
+    return [(f'Order search, {most}² ARX models', text)]
 
 
 def _text(turns: dict[str, Turn], base: str, most: int, runs: int, table: str) -> str:
@@ -289,7 +253,6 @@ time.
   by what they explain. That is another search, of {2 * most} nested models with holes in their
   lags instead of {most * most} orders; it can do with fewer terms, and takes nonlinear ones by the
   same call, which we do not.
-- The NumPy loop is what one would write without any of them: the same columns, the same choice.
 
 {versions('sippy_unipi', 'sysidentpy', 'numpy', 'scipy', 'numba')}."""
 

@@ -3,7 +3,7 @@
 
 
 """
-Prediction and play simulation beside a kernel fused by hand, and beside memory itself.
+Prediction and play simulation beside a kernel fused by hand.
 
     .venv-bench/bin/python benchmarks/bench_prediction.py [--quick]
 
@@ -27,20 +27,15 @@ import numpy as np
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
-from piezo_ident.model.stream import CHUNK
-from piezo_ident.operators.chain import Block
 from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
-from scipy.signal import lfilter
-from side_by_side import markdown, ratio, show, take_turns, Turn
+from side_by_side import markdown, ratio, show, take_turns
 
 RUNS = 7
 #: samples of a block, as they come on a topic
 BLOCK = 100
-#: bytes that a prediction must move for each sample: the voltage in, the displacement out
-BYTES = 16
-
+LAG = EffectSetting('amplifier_lag', {'time_constant': 2e-4})
 Work = Callable[[], object]
 
 
@@ -124,14 +119,6 @@ class Plays:
         fused_plays(u, self.r, self.q, self.p1, self.p2, np.zeros(self.r.size), out)
         return out
 
-    def numpy_loop(self, u: np.ndarray) -> np.ndarray:
-        """Return w by a loop over time, all plays at once."""
-        f, w = np.zeros(self.r.size), np.empty(u.size)
-        for k, x in enumerate(u):
-            f = np.maximum(x - self.r, np.minimum(x, f))
-            w[k] = self.q @ f
-        return w + self.polynomial(u)
-
     def python_loop(self, u: np.ndarray) -> np.ndarray:
         """Return w by plain loops over time and plays."""
         r, q, memory, w = self.r.tolist(), self.q.tolist(), [0.0] * self.r.size, []
@@ -151,49 +138,28 @@ class Plays:
         stretch is reduced to a clamp, the memory is handed from stretch to stretch, and then
         every stretch runs from its own start.
         """
-        n_rows = int(np.sqrt(u.size))
-        n = n_rows * (u.size // n_rows)
-        x = np.ascontiguousarray(u[:n].reshape(n_rows, -1).T)
-        r, q = self.r[:, None], self.q
-        low = np.full((r.size, n_rows), -np.inf)
-        high = np.full((r.size, n_rows), np.inf)
-        bottom = np.empty_like(low)
+        rows = int(np.sqrt(u.size))
+        # the end is filled up with the last value, at which nothing moves
+        x = np.pad(u, (0, -u.size % rows), mode='edge').reshape(rows, -1).T.copy()
+        r = self.r[:, None]
+        low, high = np.full((r.size, rows), -np.inf), np.full((r.size, rows), np.inf)
         for column in x:
-            np.subtract(column, r, out=bottom)
-            for end in (low, high):
-                np.minimum(end, column, out=end)
-                np.maximum(end, bottom, out=end)
-        start, f = np.empty((r.size, n_rows)), np.zeros(r.size)
-        for j in range(n_rows):
+            bottom = column - r
+            low = np.maximum(bottom, np.minimum(low, column))
+            high = np.maximum(bottom, np.minimum(high, column))
+        start, f = np.empty((r.size, rows)), np.zeros(r.size)
+        for j in range(rows):
             start[:, j] = f
             f = np.maximum(low[:, j], np.minimum(high[:, j], f))
         w = np.empty_like(x)
         for k, column in enumerate(x):
-            np.subtract(column, r, out=bottom)
-            np.minimum(start, column, out=start)
-            np.maximum(start, bottom, out=start)
-            np.dot(q, start, out=w[k])
-        rest = np.empty(u.size - n)
-        for k, value in enumerate(u[n:]):
-            f = np.maximum(value - self.r, np.minimum(value, f))
-            rest[k] = q @ f
-        return np.concatenate([w.T.ravel(), rest]) + self.polynomial(u)
+            start = np.maximum(column - r, np.minimum(start, column))
+            w[k] = self.q @ start
+        return w.T.ravel()[: u.size] + self.polynomial(u)
 
 
-def unfused(model: StageModel, v: np.ndarray) -> np.ndarray:
-    """Return the prediction by the single operators, stretch by stretch."""
-    chain, u0 = model.chain(), float(model.scaling.u(v[0]))
-    chain.reset(u0, u0)
-    y = np.empty(v.size)
-    for start in range(0, v.size, CHUNK):
-        cut = slice(start, start + CHUNK)
-        u = model.scaling.u(v[cut])
-        y[cut] = model.scaling.y(chain.process(Block(t=u, v=u, x=u)).x)
-    return y
-
-
-def timed(works: Mapping[str, Work], runs: int) -> dict[str, Turn]:
-    """Run works in turns, after one warm-up each; their results are thrown away."""
+def table(works: Mapping[str, tuple[Work, int]], runs: int) -> str:
+    """Run works in turns, after one warm-up each; return their times for a sample."""
 
     def without_result(work: Work) -> Callable[[int], None]:
         def run(_: int) -> None:
@@ -201,24 +167,16 @@ def timed(works: Mapping[str, Work], runs: int) -> dict[str, Turn]:
 
         return run
 
-    return take_turns({n: without_result(w) for n, w in works.items()}, runs, warm=works)
-
-
-def rows(turns: Mapping[str, Turn], sizes: Mapping[str, int], base: str) -> list[list[str]]:
-    """Return name, samples, ns a sample, Msamples/s and ratio to the base, size for size."""
-    found = []
-    for name, turn in turns.items():
-        n = sizes[name]
-        found.append(
-            [
-                name,
-                f'{n:,}',
-                f'{1e9 * turn.median / n:.3g}',
-                f'{n / turn.median / 1e6:.3g}',
-                ratio(turn.over(turns[base]) * sizes[base] / n),
-            ]
-        )
-    return found
+    turns = take_turns(
+        {name: without_result(w) for name, (w, _) in works.items()}, runs, warm=works
+    )
+    base, size = next(iter(turns.values())), next(iter(works.values()))[1]
+    rows = []
+    for (name, turn), (_, n) in zip(turns.items(), works.values(), strict=True):
+        a_sample = f'{1e9 * turn.median / n:.3g}'
+        rate = f'{n / turn.median / 1e6:.3g}'
+        rows.append([name, f'{n:,}', a_sample, rate, ratio(turn.over(base) * size / n)])
+    return markdown(HEADS, rows)
 
 
 HEADS = ('', 'samples', 'ns a sample', 'Msamples/s', 'times the hand-fused kernel')
@@ -228,39 +186,24 @@ def whole_record(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     """Return the table of records in one go."""
     v = voltage(model, n)
     piece = Piece(v, np.zeros(n), model.sample_rate)
-    u, out = model.scaling.u(v), np.empty(n)
-    b, a = model.dynamics.b, np.concatenate([[1.0], model.dynamics.a])
     creep = EffectSetting('creep', {'gain': [0.01, 0.02], 'time_constant': [0.1, 1.0]})
-    lag = EffectSetting('amplifier_lag', {'time_constant': 2e-4})
     nonlinear = EffectSetting('sensor_nonlinearity', {'square': 0.004, 'cubic': -0.002})
-    base = 'kernel fused by hand'
-    works: dict[str, Work] = {
-        base: lambda: Fused(model)(v),
-        '`StageModel.predict_piece`': lambda: model.predict_piece(piece),
-        'the same operators one by one': lambda: unfused(model, v),
+    models = {
+        '`StageModel.predict_piece`': model,
+        '`predict_piece` with an effect on either side (amplifier lag, sensor)': replace(
+            model, effects=(LAG, nonlinear)
+        ),
+        '`predict_piece` with an effect between H and G (creep)': replace(model, effects=(creep,)),
     }
-    for text, effects in (
-        ('with an effect on either side (amplifier lag, sensor)', (lag, nonlinear)),
-        ('with an effect between H and G (creep)', (creep,)),
-    ):
-        other = replace(model, effects=effects)
-        works[f'`predict_piece` {text}'] = lambda m=other: m.predict_piece(piece)
-    works['`scipy.signal.lfilter`, G alone'] = lambda: lfilter(b, a, u)
-    works['copy of the record (memory)'] = lambda: np.copyto(out, v)
-    works['copy into new memory'] = lambda: v.copy()
-    turns = timed(works, runs)
+    works: dict[str, tuple[Work, int]] = {'kernel fused by hand': (lambda: Fused(model)(v), n)}
+    works |= {name: (lambda m=m: m.predict_piece(piece), n) for name, m in models.items()}
+    works['copy of the record (memory)'] = (lambda: v.copy(), n)
     gap = np.abs(Fused(model)(v) - model.predict_piece(piece))[1000:].max() / abs(model.scaling.Y)
-    ours, copy = turns['`StageModel.predict_piece`'], turns['copy of the record (memory)']
-    text = markdown(HEADS, rows(turns, dict.fromkeys(turns, n), base))
-    text += (
-        f'\n\nLargest difference between the two predictions: {gap:.1e} of stroke.  Copying moves '
-        f'{BYTES * n / copy.median / 1e9:.1f} GB/s; the prediction moves the same {BYTES} bytes a '
-        f'sample at {BYTES * n / ours.median / 1e9:.2f} GB/s, {ratio(ours.over(copy))} times the '
-        f'time of the copy: it is bound by arithmetic, not by memory.  H has '
-        f'{model.hysteresis.thresholds.size} plays, G {model.dynamics.a.size} and '
+    return 'Prediction of a record', (
+        f'{table(works, runs)}\n\nLargest difference between the two predictions: {gap:.1e} of '
+        f'stroke.  H has {model.hysteresis.thresholds.size} plays, G {model.dynamics.a.size} and '
         f'{model.dynamics.b.size} coefficients, the delay is {model.delay.samples} samples.'
     )
-    return 'Prediction of a record', text
 
 
 def in_blocks(model: StageModel, n: int, runs: int) -> tuple[str, str]:
@@ -269,19 +212,11 @@ def in_blocks(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     t = np.arange(n) / model.sample_rate
     cuts = [slice(k, k + BLOCK) for k in range(0, n, BLOCK)]
     samples = [Samples(t[cut], v[cut], 'sine') for cut in cuts]
-    lag = EffectSetting('amplifier_lag', {'time_constant': 2e-4})
-    with_effect = replace(model, effects=(lag,))
+    with_effect = replace(model, effects=(LAG,))
 
     def each(process: Callable[[np.ndarray], object]) -> None:
         for cut in cuts:
             process(v[cut])
-
-    def one_by_one() -> None:
-        chain, s = model.chain(), model.scaling
-        chain.reset(float(s.u(v[0])), float(s.u(v[0])))
-        for cut in cuts:
-            u = s.u(v[cut])
-            s.y(chain.process(Block(t=t[cut], v=u, x=u)).x)
 
     def live() -> None:
         predictor = Predictor()
@@ -289,41 +224,33 @@ def in_blocks(model: StageModel, n: int, runs: int) -> tuple[str, str]:
         for block in samples:
             predictor.process(block)
 
-    base = 'kernel fused by hand'
-    turns = timed(
-        {
-            base: lambda: each(Fused(model)),
-            '`Stream.process`': lambda: each(model.stream().process),
-            'the same operators one by one': one_by_one,
-            '`Stream.process` with an effect (amplifier lag)': lambda: each(
-                with_effect.stream().process
-            ),
-            '`Predictor.process` (checks, gaps, memory)': live,
-        },
-        runs,
-    )
-    return f'Prediction in blocks of {BLOCK}', markdown(
-        HEADS, rows(turns, dict.fromkeys(turns, n), base)
-    )
+    works: dict[str, tuple[Work, int]] = {
+        'kernel fused by hand': (lambda: each(Fused(model)), n),
+        '`Stream.process`': (lambda: each(model.stream().process), n),
+        '`Stream.process` with an effect (amplifier lag)': (
+            lambda: each(with_effect.stream().process),
+            n,
+        ),
+        '`Predictor.process` (checks, gaps, memory)': (live, n),
+    }
+    return f'Prediction in blocks of {BLOCK}', table(works, runs)
 
 
 def plays(model: StageModel, n: int, short: int, runs: int) -> tuple[str, str]:
     """Return the table of ways to simulate H."""
     h, u = Plays(model), model.scaling.u(voltage(model, n))
-    base = 'kernel fused by hand'
-    works = {
-        base: (h.fused, n),
+    ways = {
+        'kernel fused by hand': (h.fused, n),
         '`piezo_ident.operators.play.weighted_plays`': (h.ours, n),
         'NumPy, vectorised prefix scan': (h.prefix_scan, n // 4),
-        'NumPy, loop over time': (h.numpy_loop, short),
         'Python, loops over time and plays': (h.python_loop, short),
     }
-    turns = timed({name: lambda f=f, m=m: f(u[:m]) for name, (f, m) in works.items()}, runs)
+    works = {name: (lambda f=f, m=m: f(u[:m]), m) for name, (f, m) in ways.items()}
     reference = h.fused(u)
-    gap = max(float(np.abs(f(u[:m]) - reference[:m]).max()) for f, m in works.values())
-    text = markdown(HEADS, rows(turns, {name: m for name, (_, m) in works.items()}, base))
+    gap = max(float(np.abs(f(u[:m]) - reference[:m]).max()) for f, m in ways.values())
     return 'Play simulation: H alone', (
-        f'{text}\n\nAll agree to {gap:.1e}; slow ways run on the beginning of the record.'
+        f'{table(works, runs)}\n\nAll agree to {gap:.1e}; slow ways run on the beginning of the '
+        'record.'
     )
 
 
