@@ -107,13 +107,23 @@ def _rounded_to(x: Vector, decimals: NDArray[np.int_]) -> bool:
     return bool(np.all(np.abs(rounded - x) <= 2 * np.spacing(x)))
 
 
-def time_stamps(clock: Clock, start: int, stop: int) -> Vector:
-    """Return the times of samples `start` to ``stop - 1``, by the formula of `Piece.t`."""
-    first = round(clock.start_time * clock.sample_rate)
-    k = np.arange(start, stop, dtype=np.float64)
-    if first / clock.sample_rate == clock.start_time:
-        return (first + k) / clock.sample_rate
-    return clock.start_time + k / clock.sample_rate
+def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) -> Vector:
+    """
+    Return the times of samples `start` to ``stop - 1`` [s].
+
+    ``k / sample_rate`` in one division where the first sample lies on a tick of the sample clock,
+    so that two streams of the same clock join on equal numbers.
+    """
+    first = round(start_time * sample_rate)
+    t = np.arange(start, stop, dtype=np.float64)
+    # in place: an hour has 72 million samples
+    if first / sample_rate == start_time:
+        t += first
+        t /= sample_rate
+    else:
+        t /= sample_rate
+        t += start_time
+    return t
 
 
 def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
@@ -264,7 +274,7 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
 def _settled(clock: Clock, n: int) -> Clock:
     """Return the clock that its own stamps are read as, so that a file written reads the same."""
     for _ in range(5):
-        t = time_stamps(clock, 0, n)
+        t = time_stamps(clock.sample_rate, clock.start_time, 0, n)
         resolution = Resolution.of(t)
         low, high = _rates(t, _last_bit)
         if not low <= high:
@@ -330,11 +340,10 @@ def _start(t0: float, rate: float, resolution: Resolution) -> float:
 
 
 def _reproduces(clock: Clock, t: Vector) -> bool:
-    chunks = range(0, t.size, _CHUNK)
-    return all(
-        np.array_equal(time_stamps(clock, i, min(i + _CHUNK, t.size)), t[i : i + _CHUNK])
-        for i in chunks
-    )
+    def part(i: int) -> Vector:
+        return time_stamps(clock.sample_rate, clock.start_time, i, min(i + _CHUNK, t.size))
+
+    return all(np.array_equal(part(i), t[i : i + _CHUNK]) for i in range(0, t.size, _CHUNK))
 
 
 def has_restarted(first: float, last: float, begin: float, period: float) -> bool:

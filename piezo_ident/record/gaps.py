@@ -93,15 +93,10 @@ def _joined(pieces: list[Piece]) -> Bridged:
     for start, piece in zip(starts, pieces, strict=True):
         measured[start : start + piece.n] = True
 
+    k, known = np.arange(n), np.flatnonzero(measured)
+
     def fill(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        whole = np.empty(n)
-        for start, part in zip(starts, parts, strict=True):
-            whole[start : start + part.size] = part
-        for (start, part), (stop, after) in itertools.pairwise(zip(starts, parts, strict=True)):
-            end = start + part.size
-            slope = (after[0] - part[-1]) / (stop - end + 1)
-            whole[end:stop] = slope * np.arange(1, stop - end + 1) + part[-1]
-        return whole
+        return np.interp(k, known, np.concatenate(parts))
 
     sound = measured.copy()
     settle = max(1, round(SETTLING * first.sample_rate))

@@ -229,16 +229,10 @@ def _cut(x: Vector, matches: Matches, keep: NDArray[np.bool_], *, alone: bool = 
 
 
 def _labels(stream: BlockStream, keep: NDArray[np.bool_]) -> tuple[list[str], list[int]]:
-    """Return the label of each stretch of the rows that are kept, and its first row."""
+    """Return the label of each stretch, and how many rows before it are kept."""
     names, starts = stream.labels()
-    sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else np.empty(0, np.int64)
-    at = np.cumsum(sizes) - sizes
-    kept: tuple[list[str], list[int]] = ([], [])
-    for name, begin, n in zip(names, at.tolist(), sizes.tolist(), strict=True):
-        if n and kept[0][-1:] != [name]:
-            kept[0].append(name)
-            kept[1].append(begin)
-    return kept
+    sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else starts
+    return names, (np.cumsum(sizes) - sizes).tolist()
 
 
 def _in_step(

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array, robust_range
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.showable import Showable
+from piezo_ident.record.clock import time_stamps
 
 __all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment', 'records_of']
 
@@ -141,26 +142,12 @@ class Piece:
 
     @property
     def t(self) -> NDArray[np.float64]:
-        """
-        Time of each sample [s].
-
-        ``k / sample_rate`` in one division where the piece starts on a tick of the sample clock,
-        so that two streams of the same clock join on equal numbers.
-        """
+        """Time of each sample [s]; see `piezo_ident.record.clock.time_stamps`."""
         return self.time(0, self.n)
 
     def time(self, start: int, stop: int) -> NDArray[np.float64]:
         """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
-        first = round(self.start_time * self.sample_rate)
-        t = np.arange(start, min(stop, self.n), dtype=np.float64)
-        # in place: an hour has 72 million samples
-        if first / self.sample_rate == self.start_time:
-            t += first
-            t /= self.sample_rate
-        else:
-            t /= self.sample_rate
-            t += self.start_time
-        return t
+        return time_stamps(self.sample_rate, self.start_time, start, min(stop, self.n))
 
     def find(self, kind: str) -> list[Segment]:
         """Return the segments of a kind (``sine``) or with a full label (``sine:50Hz``)."""
