@@ -99,26 +99,6 @@ def test_lost_blocks_split_the_record_and_are_counted(record):
     assert [f.count for f in lost] == [100]
 
 
-def test_a_lost_block_of_applied_voltage_costs_no_sample(record):
-    made = capture_of(without(blocks_of(record), (APPLIED, 5))).record()
-    assert made.n == N
-    assert faults(made)['applied_unknown'].count == 100
-
-
-def test_where_another_voltage_was_applied_the_record_is_split(record):
-    def guarded():
-        for key, s in blocks_of(record):
-            if key == APPLIED and 0.3 <= s.t[0] < 0.32:
-                s = Samples(s.t, s.values - 0.5, s.segment, s.quantity)
-            yield key, s
-
-    made = capture_of(guarded()).record()
-    assert [p.n for p in made] == [6000, N - 6400]
-    fault = faults(made)['guarded_voltage']
-    assert fault.count == 400 and 'at 0.3 s, by up to 0.5 V' in fault.where
-    assert capture_of(guarded(), tolerance=1.0).record().n == N
-
-
 def test_a_voltage_that_is_never_applied_is_refused(record):
     blocks = (
         (k, Samples(s.t, s.values + (k == APPLIED), s.segment, s.quantity))
@@ -140,29 +120,6 @@ def test_repeated_blocks_are_dropped_and_said(record):
     made = capture.record()
     assert_equal(made, record)
     assert faults(made)['repeated_rows'].count > 0
-
-
-def test_swapped_blocks_are_refused(record):
-    blocks = list(blocks_of(record))
-    blocks[40:44], blocks[44:48] = blocks[44:48], blocks[40:44]
-    with pytest.raises(DataError, match='time is unsorted'):
-        capture_of(blocks).record()
-
-
-def test_a_block_of_nan_is_cut_out_and_too_many_are_refused(record):
-    def broken(blocks):
-        seen = 0
-        for key, s in blocks_of(record):
-            if key == 'displacement':
-                seen += 1
-                if 20 < seen <= 20 + blocks:
-                    s = Samples(s.t, s.values * np.nan, s.segment, s.quantity)
-            yield key, s
-
-    made = capture_of(broken(1)).record()
-    assert faults(made)['not_finite'].count == 100 and len(made.pieces) == 2
-    with pytest.raises(DataError, match='more than 1 %'):
-        capture_of(broken(10)).record()
 
 
 def test_a_restart_begins_another_piece(record):
@@ -266,11 +223,6 @@ def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
     assert snapshot.sent() == pytest.approx({'step': 0.25, 'noise': 0.35, 'triangle': 0.4})
     with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step segments are missing'):
         refuse_incomplete(snapshot.record(), snapshot.sent())
-
-
-def test_runs_that_follow_each_other_miss_nothing(record):
-    snapshot = capture_of([*blocks_of(record), *blocks_of(record)]).snapshot()
-    refuse_incomplete(snapshot.record(), snapshot.sent())
 
 
 def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):

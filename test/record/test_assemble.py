@@ -61,32 +61,52 @@ def test_inputs_stay_as_they_are():
         np.testing.assert_array_equal(x, y)
 
 
-def test_gap_splits():
-    record = read(rows(columns(100), columns(100, start=150)))
-    assert sizes(record) == [100, 100]
-    assert [p.start_time for p in record] == [0.0, 0.15]
-    assert faults(record) == {'gap': 1}
-    assert '0.099' in record.faults[0].where
+def changed(row: int, column: int, by: float, c: list[np.ndarray]) -> list[np.ndarray]:
+    c[column][row] += by
+    return c
 
 
-def test_single_lost_sample_splits():
-    record = read(rows(columns(100), columns(100, start=101)))
-    assert sizes(record) == [100, 100]
+def inserted(at: int, column: int, by: float) -> list[np.ndarray]:
+    return changed(at, column, by, [np.insert(x, at, x[at - 1]) for x in columns()])
 
 
-def test_the_same_run_again_is_a_restart():
-    record = read(rows(columns(500), columns(600)))
-    assert sizes(record) == [500, 600]
-    assert faults(record) == {'restart': 1}
+def block_again(by: float = 0.0) -> list[np.ndarray]:
+    block = [x[40:60] for x in columns()]
+    block[2] = block[2] + by
+    return rows(columns(60), block, columns(100, start=60))
 
 
-def test_restart_splits():
-    again = columns(120)
-    again[2] = again[2] + 1e-7
-    record = read(rows(columns(100), again))
-    assert sizes(record) == [100, 120]
-    assert faults(record) == {'restart': 1}
-    assert [p.start_time for p in record] == [0.0, 0.0]
+@pytest.mark.parametrize(
+    ('c', 'pieces', 'met'),
+    [
+        (columns(), [(200, 0.0)], {}),
+        (rows(columns(100), columns(100, start=150)), [(100, 0.0), (100, 0.15)], {'gap': 1}),
+        (rows(columns(100), columns(100, start=101)), [(100, 0.0), (100, 0.101)], {'gap': 1}),
+        # the same run again, bit for bit or not
+        (rows(columns(500), columns(600)), [(500, 0.0), (600, 0.0)], {'restart': 1}),
+        (
+            rows(columns(100), changed(7, 2, 1e-7, columns(120))),
+            [(100, 0.0), (120, 0.0)],
+            {'restart': 1},
+        ),
+        (block_again(), [(160, 0.0)], {'repeated_rows': 20}),
+        ([np.repeat(x, 2) for x in columns()], [(200, 0.0)], {'repeated_rows': 200}),
+        (
+            changed(200, 2, np.nan, changed(202, 2, np.nan, columns(500))),
+            [(200, 0.0), (297, 0.203)],
+            {'not_finite': 2, 'lone_sample': 1},
+        ),
+        *(
+            (changed(200, k, bad, columns(500)), [(200, 0.0), (299, 0.201)], {'not_finite': 1})
+            for k in range(3)
+            for bad in (np.nan, np.inf, -np.inf)
+        ),
+    ],
+)
+def test_what_is_met_and_where_the_record_is_split(c, pieces, met):
+    record = read(c)
+    assert [(p.n, p.start_time) for p in record] == pieces
+    assert faults(record) == met
 
 
 @pytest.mark.parametrize('other', [1100.0, 500.0, 8000.0])
@@ -168,74 +188,12 @@ def test_jitter_is_reported():
     assert record.pieces[0].sample_rate == pytest.approx(RATE, rel=1e-4)
 
 
-def test_random_sampling_is_refused():
-    t, v, y = columns(2000)
-    t = np.sort(np.random.default_rng(1).uniform(size=t.size))
-    with pytest.raises(DataError, match=r'data: time is not uniformly sampled'):
-        read([t, v, y])
-
-
-def test_repeated_rows_are_dropped():
-    block = [x[40:60] for x in columns()]
-    tail = columns(100, start=60)
-    record = read(rows(columns(60), block, tail))
-    assert sizes(record) == [160]
-    assert faults(record) == {'repeated_rows': 20}
-
-
-def test_every_row_twice():
-    record = read([np.repeat(x, 2) for x in columns()])
-    assert sizes(record) == [200]
-    assert faults(record) == {'repeated_rows': 200}
-
-
-@pytest.mark.parametrize('column', [1, 2])
-def test_same_time_other_value_is_refused(column):
-    c = [np.insert(x, 50, x[49]) for x in columns()]
-    c[column][50] += 1e-6
-    with pytest.raises(DataError, match=r'data: two different samples at t = 0\.049 s'):
-        read(c)
-
-
-def test_block_again_with_other_values_is_refused():
-    block = [x[40:60] for x in columns()]
-    block[2] = block[2] + 1e-9
-    with pytest.raises(DataError, match='two different samples'):
-        read(rows(columns(60), block, columns(100, start=60)))
-
-
-@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize('column', [0, 1, 2])
-def test_not_finite_splits_around(bad, column):
-    c = columns(500)
-    c[column][200] = bad
-    record = read(c)
-    assert sizes(record) == [200, 299]
-    assert record.pieces[1].start_time == 0.201
-    assert faults(record) == {'not_finite': 1}
-
-
 def test_not_finite_channel_splits():
     x = np.ones(500)
     x[0], x[499] = np.nan, np.nan
     record = read(columns(500), channels={'temperature': x})
     assert sizes(record) == [498]
     assert np.isfinite(record.pieces[0].channels['temperature']).all()
-
-
-def test_more_than_one_percent_not_finite_is_refused():
-    c = columns(500)
-    c[2][100:106] = np.nan
-    with pytest.raises(DataError, match='6 of 500 samples are NaN or infinite, more than 1 %'):
-        read(c)
-
-
-def test_sample_between_two_bad_ones_is_dropped():
-    c = columns(500)
-    c[2][[200, 202]] = np.nan
-    record = read(c)
-    assert sizes(record) == [200, 297]
-    assert faults(record) == {'not_finite': 2, 'lone_sample': 1}
 
 
 def swapped() -> Iterator[list[np.ndarray]]:
@@ -248,17 +206,40 @@ def swapped() -> Iterator[list[np.ndarray]]:
     yield np.concatenate([np.r_[0:50], np.r_[100:150], np.r_[50:100], np.r_[150:200]])
 
 
-@pytest.mark.parametrize('order', list(swapped()))
-def test_unsorted_time_is_refused(order):
-    with pytest.raises(DataError, match=r'data: time is unsorted, .* sort the rows by t'):
-        read([x[order] for x in columns()])
+def scaled(*by: float) -> list[np.ndarray]:
+    return [x * f for x, f in zip(columns(), by, strict=True)]
 
 
-@pytest.mark.parametrize('factor', [1e6, 1e-6])
-def test_stroke_of_no_piezo_stage_is_refused(factor):
-    t, v, y = columns()
-    with pytest.raises(DataError, match='--displacement-unit'):
-        read([t, v, y * factor])
+@pytest.mark.parametrize(
+    ('c', 'reason'),
+    [
+        *(
+            ([x[order] for x in columns()], 'time is unsorted, .* sort the rows by t')
+            for order in swapped()
+        ),
+        *((inserted(50, k, 1e-6), r'two different samples at t = 0\.049 s') for k in (1, 2)),
+        (block_again(1e-9), 'two different samples'),
+        (
+            [
+                np.where((np.arange(500) >= 100) & (np.arange(500) < 106), np.nan, x)
+                for x in columns(500)
+            ],
+            '6 of 500 samples are NaN or infinite, more than 1 %',
+        ),
+        *((scaled(1, 1, f), '--displacement-unit') for f in (1e6, 1e-6)),
+        *((scaled(f, 1, 1), 'write t in seconds') for f in (1e15, 1e-9)),
+        (
+            [np.sort(np.random.default_rng(1).uniform(size=200)), *columns()[1:]],
+            'not uniformly sampled',
+        ),
+        ([x[:0] for x in columns()], 'no samples'),
+        ([x[:1] for x in columns()], 'one sample only'),
+        ([x[: 200 - k // 2] for k, x in enumerate(columns())], 't 200, v 200, y 199'),
+    ],
+)
+def test_what_would_need_a_guess_is_refused(c, reason):
+    with pytest.raises(DataError, match=f'data: .*{reason}'):
+        read(c)
 
 
 @pytest.mark.parametrize(('unit', 'factor'), [('mm', 1e3), ('um', 1e6), ('µm', 1e6), ('nm', 1e9)])
@@ -279,29 +260,10 @@ def test_voltage_limits():
         read(columns(), voltage_limits=(0.0, 9.0))
 
 
-@pytest.mark.parametrize('factor', [1e15, 1e-9])
-def test_time_in_another_unit_is_refused(factor):
-    t, v, y = columns()
-    with pytest.raises(DataError, match='write t in seconds'):
-        read([t * factor, v, y])
-
-
 def test_an_idle_record_is_a_record():
     t, v, y = columns()
     record = read([t, np.zeros_like(v), np.full_like(y, 3e-6)])
     assert record.stroke == 0
-
-
-@pytest.mark.parametrize(('n', 'reason'), [(0, 'no samples'), (1, 'one sample only')])
-def test_too_few_samples_are_refused(n, reason):
-    with pytest.raises(DataError, match=f'data: {reason}'):
-        read([x[:n] for x in columns()])
-
-
-def test_columns_of_different_length_are_refused():
-    t, v, y = columns()
-    with pytest.raises(DataError, match='t 200, v 200, y 199'):
-        read([t, v, y[:-1]])
 
 
 def test_named_rate_is_checked_against_the_stamps():

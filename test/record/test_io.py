@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 import scipy.io
@@ -153,7 +152,7 @@ def test_what_cannot_be_written_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('name', FORMATS)
-def test_existing_output_is_kept_unless_asked(tmp_path, name):
+def test_outputs_are_kept_unless_asked_and_places_refused(tmp_path, name):
     path = tmp_path / name
     pi.write(record(), path, storage=storage(name))
     with pytest.raises(DataError, match='exists already'):
@@ -161,54 +160,40 @@ def test_existing_output_is_kept_unless_asked(tmp_path, name):
     pi.write(record(), path, storage=storage(name), overwrite=True)
     assert_equal(pi.read(path), record())
     assert [p.name for p in tmp_path.iterdir()] == [name]
+    nowhere = tmp_path / 'missing' / name
+    with pytest.raises(DataError, match=f'{nowhere}.*cannot be written'):
+        pi.write(record(), nowhere, storage=storage(name))
 
 
-def test_a_folder_that_is_no_bag_is_never_replaced(tmp_path):
-    (tmp_path / 'home').mkdir()
-    (tmp_path / 'home' / 'thesis.tex').touch()
-    with pytest.raises(DataError, match='no bag'):
-        pi.write(record(), tmp_path / 'home', overwrite=True)
-    assert (tmp_path / 'home' / 'thesis.tex').exists()
-    # others call their files metadata.yaml, too
-    for text in ('author: me', '[', ''):
-        (tmp_path / 'home' / 'metadata.yaml').write_text(text)
-        with pytest.raises(DataError, match='no bag'):
-            pi.write(record(), tmp_path / 'home', overwrite=True)
-    assert (tmp_path / 'home' / 'thesis.tex').exists()
-
-
-@pytest.mark.parametrize('name', ['notes.txt', 'model.yaml', 'pictures'])
-def test_a_bag_with_something_beside_it_is_never_replaced(tmp_path, name):
-    bag = tmp_path / 'bag'
-    pi.write(record(), bag)
-    for part in ('bag.db3-wal', 'bag_1.mcap.zstd'):
-        (bag / part).touch()
-    pi.write(record(), bag, overwrite=True)
-    if name == 'pictures':
-        (bag / name).mkdir()
+@pytest.mark.parametrize(
+    ('metadata', 'other', 'reason'),
+    [
+        (None, 'thesis.tex', 'no bag'),
+        # others call their files metadata.yaml, too
+        ('author: me', 'thesis.tex', 'no bag'),
+        ('[', 'thesis.tex', 'no bag'),
+        ('', 'thesis.tex', 'no bag'),
+        (..., 'notes.txt', 'holds notes.txt, which is no part of a bag'),
+        (..., 'model.yaml', 'holds model.yaml, which is no part of a bag'),
+    ],
+)
+def test_a_folder_that_is_no_bag_or_holds_more_is_never_replaced(
+    tmp_path, metadata, other, reason
+):
+    path = tmp_path / 'home'
+    if metadata is ...:
+        pi.write(record(), path)
+        for part in ('bag.db3-wal', 'bag_1.mcap.zstd'):
+            (path / part).touch()
+        pi.write(record(), path, overwrite=True)
     else:
-        (bag / name).touch()
-    with pytest.raises(DataError, match=f'holds {name}, which is no part of a bag'):
-        pi.write(record(), bag, overwrite=True)
-    assert (bag / name).exists()
-
-
-@pytest.mark.parametrize('name', FORMATS)
-def test_unwritable_place(tmp_path, name):
-    path = tmp_path / 'missing' / name
-    with pytest.raises(DataError, match='cannot be written') as caught:
-        pi.write(record(), path, storage=storage(name))
-    assert str(path) in str(caught.value)
-
-
-def test_interrupted_output_leaves_nothing(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text('old')
-    with pytest.raises(KeyboardInterrupt), temporary_output(path, overwrite=True) as target:
-        target.write_text('half')
-        raise KeyboardInterrupt
-    assert path.read_text() == 'old'
-    assert list(tmp_path.iterdir()) == [path]
+        path.mkdir()
+        if metadata is not None:
+            (path / 'metadata.yaml').write_text(metadata)
+    (path / other).touch()
+    with pytest.raises(DataError, match=reason):
+        pi.write(record(), path, overwrite=True)
+    assert (path / other).exists()
 
 
 # --- CSV
@@ -254,11 +239,12 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('# one\n# t,v,y\n0,1,2\n1,oops,3\n', ['line 4, column v', "'oops'"]),
         ('t,v,y\n0,1,2\n1,"2,3\n', ['no CSV file']),
         ('t,v,y\n0,1,2\n1,\0,3\n', ['r.csv']),
+        ('t,v,y,segment\n0,1,2,größe\n', ['UTF-8']),
     ],
 )
 def test_bad_csv(tmp_path, text, words):
     path = tmp_path / 'r.csv'
-    path.write_text(text)
+    path.write_bytes(text.encode('latin-1'))
     refuse(path, *words)
 
 
@@ -284,12 +270,6 @@ def test_error_beyond_the_first_rows(tmp_path):
     lines[69000] = '69,nothing,1e-6'
     path.write_text('\n'.join(['t,v,y', *lines]))
     refuse(path, 'line 69002, column v', 'nothing')
-
-
-def test_csv_in_another_encoding(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_bytes('t,v,y,segment\n0,1,2,größe\n'.encode('latin-1'))
-    refuse(path, 'UTF-8')
 
 
 # --- npz and mat

@@ -4,6 +4,7 @@
 """Records from arrays, and what they say of themselves."""
 
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Piece, Record
 import pytest
@@ -60,3 +61,17 @@ def test_html_names_what_it_holds_and_escapes_it():
 def test_plot_draws_voltage_and_displacement():
     drawn = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 5.0))).plot()
     assert [len(axes.lines) for axes in drawn.axes] == [2, 2]
+
+
+def test_what_needs_a_displacement_refuses_a_voltage_alone():
+    model = pi.SimulatedStage.load('paper').model
+    v = 5 - 5 * np.cos(np.arange(4000) / 100)
+    record = Record((Piece(v, np.full(v.size, np.nan), 20_000.0),), 'scan')
+    for use in (
+        lambda: pi.identify(record),
+        lambda: pi.diagnose(model, record),
+        lambda: pi.free_run(model, record),
+    ):
+        with pytest.raises(DataError, match=r'scan.*no displacement'):
+            use()
+    assert np.isfinite(model.simulate(v)).all()

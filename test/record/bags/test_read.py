@@ -13,9 +13,8 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
 from piezo_ident.record.bags.write import SAMPLE_QOS, write_bag
 from piezo_ident.record.blocks import Dimension, Samples
-from piezo_ident.record.join import APPLIED, join
+from piezo_ident.record.join import APPLIED
 from piezo_ident.record.record import Piece, Record, Segment
-from piezo_ident.record.stream import BlockStream
 import pytest
 from rosbags.rosbag2 import storage_mcap
 import yaml
@@ -87,15 +86,6 @@ def test_other_readers_see_the_same(tmp_path, start):
     assert SAMPLE_QOS.depth == 100
 
 
-def test_lost_blocks_are_gaps(tmp_path):
-    messages = interleave(blocks())
-    del messages[8]  # the fifth of the voltage
-    got = read_bag(write(tmp_path / 'bag', messages))
-    assert [p.n for p in got] == [400, 500]
-    assert got.pieces[1].start_time == 0.5
-    assert faults(got) == {'unmatched': 100, 'gap': 1}
-
-
 def test_late_and_early_streams_meet(tmp_path):
     pairs = blocks()
     messages = [('/voltage', v) for v, _ in pairs[:3]] + interleave(pairs[3:])[:-1]
@@ -124,15 +114,6 @@ def test_a_block_twice_with_other_values_is_refused(tmp_path):
         read_bag(write(tmp_path / 'bag', messages))
 
 
-def test_restart(tmp_path):
-    first, second = blocks(seed=1), blocks(1200, seed=2)
-    got = read_bag(write(tmp_path / 'bag', interleave([*first, *second])))
-    assert [(p.n, p.start_time) for p in got] == [(1000, 0.0), (1200, 0.0)]
-    assert faults(got) == {'restart': 1}
-    want = np.concatenate([v.values for v, _ in second])
-    np.testing.assert_array_equal(got.pieces[1].v, want)
-
-
 def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
     first, second = blocks(seed=1), blocks(seed=2)
     again = [(v, y) for (v, _), (_, y) in zip(first, second, strict=True)]
@@ -142,20 +123,6 @@ def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
     assert [(p.n, p.start_time) for p in got] == [(900, 0.1), (1000, 0.0)]
     np.testing.assert_array_equal(got.pieces[0].y[:100], first[1][1].values)
     np.testing.assert_array_equal(got.pieces[1].y[:100], second[0][1].values)
-
-
-def test_streams_cut_into_other_blocks():
-    streams = {'voltage': BlockStream(), 'displacement': BlockStream()}
-    t = np.arange(700) / RATE
-    for i in range(0, 700, 100):
-        streams['voltage'].append(Samples(t[i : i + 100], t[i : i + 100]), i)
-    for i in range(0, 700, 70):
-        streams['displacement'].append(Samples(t[i : i + 70], -t[i : i + 70]), i + 1)
-    joined = join(streams)
-    np.testing.assert_array_equal(joined.t, t)
-    np.testing.assert_array_equal(joined.columns['displacement'], -t)
-    assert joined.segments == ([''], [0])
-    assert joined.faults == ()
 
 
 def test_streams_that_never_meet_are_refused(tmp_path):
