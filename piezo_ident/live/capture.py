@@ -116,7 +116,6 @@ class Snapshot:
 
     streams: Mapping[str, BlockStream]
     faults: tuple[Fault, ...] = ()
-    tolerance: float | None = None
 
     def record(self, name: str = 'capture') -> Record:
         """
@@ -137,7 +136,7 @@ class Snapshot:
         streams = {key: self.streams[key] for key in dict.fromkeys(order)}
         if not streams.get(APPLIED, streams['voltage']).n:
             del streams[APPLIED]
-        return record_of_streams(streams, name=name, tolerance=self.tolerance, faults=self.faults)
+        return record_of_streams(streams, name=name, faults=self.faults)
 
     def sent(self) -> dict[str, float]:
         """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
@@ -161,13 +160,10 @@ class Capture:
     limit : float, optional
         Longest measured time that is kept [s].  Beyond it the oldest whole run of the sample
         clock is forgotten, or the oldest tenth where there is only one.
-    tolerance : float, optional
-        As for `record_of_streams`.
     """
 
-    def __init__(self, limit: float = 600.0, tolerance: float | None = None) -> None:
+    def __init__(self, limit: float = 600.0) -> None:
         self.limit = limit
-        self.tolerance = tolerance
         self.clear()
 
     def clear(self) -> None:
@@ -236,7 +232,7 @@ class Capture:
         streams = {key: topic.stream.copy() for key, topic in self._topics.items()}
         for key, stream in streams.items():
             stream.drop((since or {}).get(key, 0) - self._topics[key].dropped)
-        return Snapshot(streams, tuple(faults), self.tolerance)
+        return Snapshot(streams, tuple(faults))
 
     def record(self, name: str = 'capture') -> Record:
         """Return what was captured as a record; see `Snapshot.record`."""

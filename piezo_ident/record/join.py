@@ -13,7 +13,7 @@ two that arrived closest to each other do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import itertools
 
 import numpy as np
@@ -47,7 +47,6 @@ def record_of_streams(
     streams: Mapping[str, BlockStream],
     *,
     name: str,
-    tolerance: float | None = None,
     options: ReadOptions | None = None,
     sample_rate: float | None = None,
     faults: Iterable[Fault] = (),
@@ -64,9 +63,6 @@ def record_of_streams(
         `MAX_MISSING` of the samples is left out.
     name : str
         What errors call the data, and the record's name.
-    tolerance : float, optional
-        Difference of command and applied voltage that counts as none [V]; a thousandth of the
-        range when absent.
     options, sample_rate, faults
         As for `piezo_ident.record.assemble.assemble`.
 
@@ -88,7 +84,7 @@ def record_of_streams(
         raise DataError(f'{name}: {error}') from None
     met = [*faults, *sparse.values(), *joined.faults]
     if APPLIED in joined.columns:
-        joined = _without_guarded(joined, tolerance, name, met)
+        joined = _without_guarded(joined, name, met)
     columns = dict(joined.columns)
     return assemble(
         joined.t,
@@ -113,40 +109,37 @@ class Joined:
     faults: tuple[Fault, ...]
 
 
-def _without_guarded(
-    joined: Joined, tolerance: float | None, name: str, met: list[Fault]
-) -> Joined:
+def _without_guarded(joined: Joined, name: str, met: list[Fault]) -> Joined:
     """Cut out the samples at which another voltage was applied than commanded."""
     columns = dict(joined.columns)
     v, applied, t = columns['voltage'], columns.pop(APPLIED), joined.t
-    wrong = np.zeros(v.size, dtype=np.bool_)
-    if not np.array_equal(v, applied):
-        unknown = np.isnan(applied)
-        if unknown.any():
-            count = int(np.count_nonzero(unknown))
-            where = at_times(t[unknown][:1])
-            met.append(Fault('applied_unknown', where, count, 'taken as commanded'))
-        if tolerance is None:
-            finite = v[np.isfinite(v)]
-            span = float(np.ptp(finite)) if finite.size else 0.0
-            tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
-        wrong = np.abs(v - applied) > tolerance  # False where either is NaN
+    if np.array_equal(v, applied):
+        return replace(joined, columns=columns)
+    unknown = np.isnan(applied)
+    if unknown.any():
+        where, count = at_times(t[unknown][:1]), int(np.count_nonzero(unknown))
+        met.append(Fault('applied_unknown', where, count, 'taken as commanded'))
+    finite = v[np.isfinite(v)]
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
+    wrong = np.abs(v - applied) > tolerance  # False where either is NaN
     if wrong.all():
         raise DataError(
             f'{name}: the applied voltage is nowhere the commanded one; look at the guards of the '
             "amplifier's driver"
         )
-    segments = joined.segments
-    if wrong.any():
-        worst = float(np.abs(v - applied)[wrong].max())
-        begins = np.flatnonzero(wrong & ~np.concatenate([[False], wrong[:-1]]))
-        where = f'{at_times(t[begins])}, by up to {worst:.3g} V'
-        count = int(np.count_nonzero(wrong))
-        met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
-        keep = np.flatnonzero(~wrong)
-        segments = segments[0], np.searchsorted(keep, segments[1]).tolist()
-        t, columns = t[keep], {key: x[keep] for key, x in columns.items()}
-    return Joined(t, columns, segments, joined.faults)
+    if not wrong.any():
+        return replace(joined, columns=columns)
+    worst = float(np.abs(v - applied)[wrong].max())
+    begins = np.flatnonzero(wrong & ~np.concatenate([[False], wrong[:-1]]))
+    where = f'{at_times(t[begins])}, by up to {worst:.3g} V'
+    count = int(np.count_nonzero(wrong))
+    met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
+    keep = np.flatnonzero(~wrong)
+    names, starts = joined.segments
+    columns = {key: x[keep] for key, x in columns.items()}
+    segments = names, np.searchsorted(keep, starts).tolist()
+    return Joined(t[keep], columns, segments, joined.faults)
 
 
 def join(

@@ -190,72 +190,53 @@ def test_decaying_triangle_shrinks_to_its_bias():
 
 # -- programs --------------------------------------------------------------------------------
 
+
+def signal(name: str, **options: object) -> st.SearchStrategy:
+    drawn = {k: x if isinstance(x, st.SearchStrategy) else st.just(x) for k, x in options.items()}
+    return st.fixed_dictionaries({'signal': st.just(name), **drawn})
+
+
 volt = st.floats(-0.5, 10.5)
+size, few, short = st.floats(0.1, 5), st.integers(1, 5), st.floats(0.01, 0.1)
 ONE_SIGNAL = st.one_of(
-    st.fixed_dictionaries({'signal': st.just('idle'), 'duration': st.floats(0.01, 0.1)}),
-    st.fixed_dictionaries(
-        {'signal': st.just('hold'), 'level': volt, 'duration': st.floats(0.01, 0.1)}
+    signal('idle', duration=short),
+    signal('hold', level=volt, duration=short),
+    signal('step', bias=volt, size=size, hold=0.01, count=few),
+    signal(
+        'noise',
+        bias=volt,
+        amplitude=size,
+        cutoff=st.floats(100, 500),
+        duration=st.floats(0.05, 0.2),
     ),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('step'),
-            'bias': volt,
-            'size': st.floats(0.1, 2),
-            'hold': st.just(0.01),
-            'count': st.integers(1, 5),
-        }
+    signal(
+        'sine',
+        bias=volt,
+        amplitude=size,
+        frequency=st.sampled_from([10, 50]),
+        periods=few,
+        phase=st.floats(-3, 3),
     ),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('noise'),
-            'bias': volt,
-            'amplitude': st.floats(0.1, 5),
-            'cutoff': st.floats(100, 500),
-            'duration': st.floats(0.05, 0.2),
-        }
+    signal('staircase', levels=st.lists(volt, min_size=1, max_size=4), hold=0.02),
+    signal(
+        'minor_loops',
+        biases=st.lists(volt, min_size=1, max_size=3),
+        amplitude=st.floats(0.1, 1),
+        cycles=2,
+        slope=100,
     ),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('sine'),
-            'bias': volt,
-            'amplitude': st.floats(0.1, 5),
-            'frequency': st.sampled_from([10, 50]),
-            'periods': st.integers(1, 5),
-            'phase': st.floats(-3, 3),
-        }
-    ),
-    st.fixed_dictionaries(
-        {'signal': st.just('staircase'), 'levels': st.lists(volt, min_size=1, max_size=4)}
-    ).map(lambda d: {**d, 'hold': 0.02}),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('minor_loops'),
-            'biases': st.lists(volt, min_size=1, max_size=3),
-            'amplitude': st.floats(0.1, 1),
-            'cycles': st.just(2),
-            'slope': st.just(100),
-        }
-    ),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('settle'),
-            'bias': volt,
-            'amplitude': st.floats(0.1, 1),
-            'cycles': st.integers(1, 4),
-        }
-    ),
-    st.just({'signal': 'triangle', 'slope': 100}),
-    st.fixed_dictionaries(
-        {
-            'signal': st.just('multisine'),
-            'bias': volt,
-            'amplitude': st.floats(0.1, 5),
-            'lowest': st.just(10),
-            'highest': st.just(90),
-            'period': st.just(0.1),
-            'periods': st.just(2),
-            'realisations': st.integers(1, 2),
-        }
+    signal('decaying_triangle', bias=volt, amplitude=size, cycles=few, slope=100),
+    signal('settle', bias=volt, amplitude=st.floats(0.1, 1), cycles=few),
+    signal('triangle', slope=100),
+    signal(
+        'multisine',
+        bias=volt,
+        amplitude=size,
+        lowest=10,
+        highest=90,
+        period=0.1,
+        periods=2,
+        realisations=st.integers(1, 2),
     ),
 )
 
@@ -346,7 +327,10 @@ def test_limits_of_the_caller_only_narrow():
     assert program({'signal': 'triangle'}).build(1000, limits=(0, 6)).v.max() == 6.0
 
 
-SINE = 'signal: sine, bias: 5, amplitude: 5, frequency: 10'
+HEAD = 'limits: [0, 10]\nsegments: [{signal: idle, duration: 1}]\n'
+SINE = 'sine, bias: 5, amplitude: 5, frequency: 10'
+NOISE = 'noise, bias: 5, amplitude: 1, cutoff: 600, duration: 1'
+MULTISINE = 'multisine, bias: 5, amplitude: 1, lowest: 1, highest: 600, period: 1, periods: 1'
 
 
 @pytest.mark.parametrize(
@@ -357,47 +341,40 @@ SINE = 'signal: sine, bias: 5, amplitude: 5, frequency: 10'
         ('segments: [{signal: idle, duration: 1}]', 'limits is missing'),
         ('limits: [0, 10]', 'segments must be a list'),
         ('limits: [0, 10]\nsegments: []', 'segments must be a list'),
-        ('limits: [10, 0]\nsegments: [{signal: idle, duration: 1}]', 'limits must be'),
-        ('limits: 5\nsegments: [{signal: idle, duration: 1}]', 'limits must be'),
-        ('limits: [0, .inf]\nsegments: [{signal: idle, duration: 1}]', 'not a number'),
-        ('limits: [0, 10]\nrest: 11\nsegments: [{signal: idle, duration: 1}]', 'rest = 11'),
-        ('limits: [0, 10]\nseed: -1\nsegments: [{signal: idle, duration: 1}]', 'seed'),
-        ('limits: [0, 10]\nslew: 0\nsegments: [{signal: idle, duration: 1}]', 'slew'),
-        ('limits: [0, 10]\nspeed: 3\nsegments: [{signal: idle, duration: 1}]', 'unknown speed'),
         ('limits: [0, 10]\nsegments: [3]', r'segment 1 \(None\): signal must be one of'),
-        ('limits: [0, 10]\nsegments: [{signal: chirp}]', 'must be one of'),
-        ('limits: [0, 10]\nsegments: [{signal: [1]}]', 'must be one of'),
-        ('limits: [0, 10]\nsegments: [{signal: idle}]', r'1 \(idle\): duration is missing'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: -1}]', 'greater than zero'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: true}]', 'not a number'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: abc}]', "'abc' is not a number"),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: .nan}]', 'not a number'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: [1]}]', 'not a number'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, length: 1}]', 'unknown length'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1, name: a b}]', 'must be a word'),
-        (f'limits: [0, 10]\nsegments: [{{{SINE}}}]', 'either periods or duration'),
-        (f'limits: [0, 10]\nsegments: [{{{SINE}, periods: 1.5}}]', 'whole number'),
-        (f'limits: [0, 10]\nsegments: [{{{SINE}, periods: 2, duration: 1}}]', 'either periods'),
-        ('limits: [0, 10]\nsegments: [{signal: triangle, preset: own}]', 'none of range, paper'),
-        ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: []}]', 'list is empty'),
-        ('limits: [0, 10]\nsegments: [{signal: triangle, peaks: [3, 11]}]', 'reaches 0 .. 11 V'),
-        ('limits: [0, 5]\nsegments: [{signal: triangle, preset: paper}]', 'reaches 0 .. 9 V'),
-        ('limits: [0, 10]\nsegments: [{signal: triangle, preset: paper, slope: 60}]', 'own slope'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e9}]', 'make it shorter'),
-        ('limits: [0, 10]\nsegments: [{signal: idle, duration: 1e-9}]', 'shorter than one sample'),
-        (
-            'limits: [0, 9]\nsegments: [{signal: staircase, levels: [1, 2], hold: [1, 1, 1]}]',
-            '2 levels and 3 holds',
-        ),
-        (
-            'limits: [0, 10]\nsegments: '
-            '[{signal: noise, bias: 5, amplitude: 1, cutoff: 600, duration: 1}]',
-            'half the sampling rate',
-        ),
-        (
-            'limits: [0, 10]\nsegments: [{signal: multisine, bias: 5, amplitude: 1, lowest: 1, '
-            'highest: 600, period: 1, periods: 1}]',
-            'half the sampling rate',
+        (HEAD.replace('[0, 10]', '[10, 0]'), 'limits must be'),
+        (HEAD.replace('[0, 10]', '5'), 'limits must be'),
+        (HEAD.replace('[0, 10]', '[0, .inf]'), 'not a number'),
+        (HEAD + 'rest: 11', 'rest = 11'),
+        (HEAD + 'seed: -1', 'seed'),
+        (HEAD + 'slew: 0', 'slew'),
+        (HEAD + 'speed: 3', 'unknown speed'),
+        *(
+            (f'limits: [0, 10]\nsegments: [{{signal: {segment}}}]', says)
+            for segment, says in (
+                ('chirp', 'must be one of'),
+                ('[1]', 'must be one of'),
+                ('idle', r'1 \(idle\): duration is missing'),
+                ('idle, duration: -1', 'greater than zero'),
+                ('idle, duration: true', 'not a number'),
+                ('idle, duration: abc', "'abc' is not a number"),
+                ('idle, duration: .nan', 'not a number'),
+                ('idle, duration: [1]', 'not a number'),
+                ('idle, duration: 1e9', 'make it shorter'),
+                ('idle, duration: 1e-9', 'shorter than one sample'),
+                ('idle, length: 1', 'unknown length'),
+                ('idle, duration: 1, name: a b', 'must be a word'),
+                (SINE, 'either periods or duration'),
+                (f'{SINE}, periods: 1.5', 'whole number'),
+                (f'{SINE}, periods: 2, duration: 1', 'either periods'),
+                ('triangle, preset: own', 'none of range, paper'),
+                ('triangle, peaks: []', 'list is empty'),
+                ('triangle, peaks: [3, 11]', 'reaches 0 .. 11 V'),
+                ('triangle, preset: paper, slope: 60', 'own slope'),
+                ('staircase, levels: [1, 2], hold: [1, 1, 1]', '2 levels and 3 holds'),
+                (NOISE, 'half the sampling rate'),
+                (MULTISINE, 'half the sampling rate'),
+            )
         ),
     ],
 )
@@ -415,11 +392,6 @@ def test_rate_is_needed_from_somewhere():
     with pytest.raises(ConfigError, match='sample_rate'):
         p.build(float('nan'))
     assert program({'signal': 'idle', 'duration': 1}, sample_rate=100).build().n == 100
-
-
-def test_missing_file_is_named():
-    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such program'):
-        Program.load('nowhere.yaml')
 
 
 def test_every_signal_says_its_kind():

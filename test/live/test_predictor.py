@@ -7,7 +7,7 @@
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.monitor import LiveError, Matcher, Preview
-from piezo_ident.live.predictor import expected_error, Predictor, TurningPoints, warm_up
+from piezo_ident.live.predictor import expected_error, Predictor, TurningPoints
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -89,19 +89,13 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
     predictor = Predictor()
     predictor.set_model(m)
     blocks = cut(v[:10_000], 100) + cut(v[10_000:], 33, start=10_000)
-    made = predicted(predictor, blocks)
+    first = predictor.process(blocks[0])
+    np.testing.assert_array_equal(first.t, blocks[0].t)
+    assert (first.segment, first.quantity) == ('noise', 'displacement')
+    made = np.concatenate([first.values, predicted(predictor, blocks[1:])])
     np.testing.assert_array_equal(made, m.predict_piece(Piece(v, np.zeros_like(v), RATE)))
     assert predictor.problem == '' and predictor.lost == predictor.late == 0
     assert predictor.memory_known
-
-
-def test_prediction_carries_time_and_segment_of_the_voltage():
-    predictor = Predictor()
-    predictor.set_model(model())
-    block = cut(drive(300), 300)[0]
-    made = predictor.process(block)
-    np.testing.assert_array_equal(made.t, block.t)
-    assert (made.segment, made.quantity) == ('noise', 'displacement')
 
 
 @pytest.mark.parametrize('n', [20_000, 120_000], ids=['whole run at hand', 'longer than kept'])
@@ -223,13 +217,6 @@ def test_a_block_with_nan_is_left_out():
     assert predictor.lost == 100
 
 
-def test_ragged_time_is_left_out():
-    predictor = Predictor()
-    t = np.array([0.0, 1.0, 2.0, 5.0, 6.0]) / RATE
-    assert predictor.process(Samples(t, np.zeros(5))) is None
-    assert 'not uniform' in predictor.problem
-
-
 def test_another_sampling_rate_is_refused():
     predictor = Predictor()
     predictor.process(cut(drive(300))[0])
@@ -239,10 +226,6 @@ def test_another_sampling_rate_is_refused():
     other.set_model(model(rate=20_000.0))
     assert other.process(cut(drive(300))[0]) is None
     assert 'identify a model at the rate of the stream' in other.problem
-
-
-def test_warm_up_runs():
-    warm_up()
 
 
 def test_expected_error_prefers_what_was_held_out():
@@ -266,13 +249,6 @@ def test_a_block_of_one_sample_does_not_set_the_rate():
     assert predictor.process(cut(v[1:], 100, start=1)[0]) is not None
     # behind others its rate is known
     assert predictor.process(cut(v[101:], 1, start=101)[0]).t.size == 1
-
-
-def test_a_stretch_longer_than_the_window_is_the_window():
-    error = LiveError(0.01)
-    for k in (0, 400, 800):
-        error.add(np.arange(k, k + 400) / RATE, np.full(400, 2e-9))
-        assert error.rms == pytest.approx(2e-9)
 
 
 @pytest.mark.parametrize('measured_first', [True, False])
@@ -361,11 +337,10 @@ def test_preview_waits_for_a_late_quantity_but_not_for_ever():
     assert [b.t for b in done] == [0.02]
 
 
-def test_preview_begins_anew_behind_a_restart():
+def test_preview_begins_again_behind_a_restart():
     preview = Preview(50.0)
-    preview.add('prediction', np.array([1.0]), np.ones(1))
-    assert [b.t for b in preview.add('prediction', np.array([0.0]), np.ones(1))] == [1.0]
-    assert [b.t for b in preview.add('prediction', np.array([0.02]), np.ones(1))] == [0.0]
+    done = [preview.add('prediction', np.array([t]), np.ones(1)) for t in (1.0, 0.0, 0.02)]
+    assert [[b.t for b in bins] for bins in done] == [[], [1.0], [0.0]]
 
 
 def test_preview_leaves_out_what_is_no_number():
@@ -386,15 +361,23 @@ def test_live_error_is_the_rms_of_the_window():
     assert live.seconds == pytest.approx(1.0, abs=0.02)
     live.add(np.array([0.0]), np.array([7.0]))
     assert live.rms == 7.0
+    # a stretch longer than the window is the window
+    short = LiveError(0.001)
+    for k in (0, 100):
+        short.add(block(k, 100).t, np.full(100, 2.0))
+        assert short.rms == 2.0
 
 
-def test_a_clock_faster_than_any_card_is_left_out_and_blocks_are_bounded(monkeypatch):
+@pytest.mark.parametrize('t', [np.array([0.0, 1.0, 2.0, 5.0, 6.0]) / RATE, 1e-9 * np.arange(100)])
+def test_ragged_time_and_clocks_faster_than_any_card_are_left_out(t):
+    predictor = Predictor()
+    assert predictor.process(Samples(t, np.zeros(t.size))) is None
+    assert 'not uniform' in predictor.problem
+
+
+def test_blocks_that_are_kept_are_bounded(monkeypatch):
     monkeypatch.setattr('piezo_ident.live.predictor.MOST_BLOCKS', 50)
     predictor = Predictor()
-    t = 1e-9 * np.arange(100)
-    assert predictor.process(Samples(t, np.zeros(100))) is None
-    assert 'not uniform' in predictor.problem
-    predictor.process(Samples(np.arange(2) / 20_000.0, np.zeros(2)))
-    for k in range(2, 200):
-        predictor.process(Samples(np.array([k / 20_000.0]), np.zeros(1)))
+    for b in [block(0, 2), *(block(k, 1) for k in range(2, 200))]:
+        predictor.process(b)
     assert len(predictor._recent) == 50
