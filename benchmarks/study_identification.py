@@ -27,9 +27,10 @@ from piezo_ident import __version__
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
-from piezo_ident.model.free_run import free_run, sine_errors
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 import scipy

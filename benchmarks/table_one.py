@@ -27,9 +27,9 @@ from piezo_ident.diagnosis import diagnose
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.free_run import sine_errors
 from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from truths import table_one_sines

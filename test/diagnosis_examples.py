@@ -20,7 +20,7 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.model.free_run import sine_frequency
+from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.effects import find_effect
-from piezo_ident.model.free_run import sine_frequency
+from piezo_ident.model.sines import sine_frequency
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import rests
 

@@ -19,9 +19,9 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
-from piezo_ident.model.free_run import sine_frequency
 from piezo_ident.model.initial_memory import fit_memory, is_at_rest
 from piezo_ident.model.metrics import percent, strokes
+from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record

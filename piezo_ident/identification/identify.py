@@ -18,20 +18,22 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.errors import (
+    errors_of,
+    noise_floor_of,
+    predictions_of,
+    validation_errors,
+)
 from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
-    errors_of,
     FitOutcome,
     Identification,
-    key_of,
-    Memories,
     Progress,
     Settings,
     silent,
     Steps,
-    validation_errors,
 )
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.three_steps import (
@@ -45,13 +47,10 @@ from piezo_ident.identification.three_steps import (
 )
 from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warnings_of
-from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import FORMULA, percent
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record, records_of
-from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.stretches import ResidualPart, stretches_of
 import scipy
 
 __all__ = ['first_steps', 'identify']
@@ -127,14 +126,15 @@ def _identify(
     else:
         fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
     model, stroke = fit.model, abs(scaling.Y)
-    floor = _noise_floor(model, runs, fit.memories)
+    predictions = predictions_of(model, runs, fit.memories)
+    floor = noise_floor_of(predictions)
     result = Identification(
         model=model,
         delay=fit.delay,
         dynamics=fit.dynamics,
         hysteresis=fit.hysteresis,
         errors=(
-            *errors_of(model, runs, fit.masks, fit.memories),
+            *errors_of(predictions, fit.masks),
             *validation_errors(model, validation),
         ),
         noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
@@ -150,19 +150,6 @@ def _identify(
     result = replace(result, warnings=warnings)
     provenance = _provenance(result, [record.name for record in records])
     return replace(result, model=replace(model, identification=provenance))
-
-
-def _noise_floor(model: StageModel, runs: Sequence[Run], memories: Memories) -> NoiseFloor:
-    parts = []
-    for run in runs:
-        memory = memories.get(key_of(run))
-        if memory is None:
-            memory = start_memory(model, run.piece)
-        e = run.piece.y - model.predict_piece(run.piece, memory)
-        parts.append(ResidualPart(run.record, run.piece, e, run.use))
-    return residual_noise_floor(
-        parts, [s for i, p in enumerate(parts) for s in stretches_of(p, i)]
-    )
 
 
 def _labelled(

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     FitOutcome,
-    key_of,
     Progress,
     Settings,
 )

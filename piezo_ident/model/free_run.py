@@ -13,14 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-import re
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
-from piezo_ident.model.metrics import nrmse_fit, percent, percent_of_stroke
+from piezo_ident.model.metrics import nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
@@ -29,24 +28,16 @@ __all__ = [
     'FreeRun',
     'FreeRunErrors',
     'PieceRun',
-    'SineError',
     'free_run',
     'piece_runs',
     'predict',
     'run_pieces',
-    'sine_errors',
-    'sine_frequency',
-    'sines_of',
 ]
 
 Vector = NDArray[np.float64]
 
 #: samples per block, so that temporaries stay small beside a long record
 BLOCK = 1 << 20
-#: what is dropped at the start of a sine: this time and at least one period [s]
-SETTLING = 1.0
-
-_SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -162,17 +153,13 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     record.require_displacement()
     record = without_faults(record)
-    for piece in record:
-        try:
-            model.check_rate(piece)
-        except ModelError as error:
-            raise ModelError(f'{record.name}: {error}') from None
-    predicted: list[Vector] = []
+    groups = connected_pieces(record)
+    _check_rates(model, record)
+    memories = [start_memory(model, pieces[0]) for pieces in groups]
+    predicted = _predicted(model, record, groups, memories)
     estimated: list[bool] = []
     starts: list[int] = []  # the sample of each piece from which its start is forgotten
-    for pieces in connected_pieces(record):
-        memory = start_memory(model, pieces[0])
-        predicted += run_pieces(model, pieces, memory)
+    for pieces, memory in zip(groups, memories, strict=True):
         estimated += [memory is not None, *[False] * (len(pieces) - 1)]
         start = 0
         if memory is not None:
@@ -183,8 +170,6 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
         for piece in pieces:
             starts.append(min(start, piece.n))
             start -= starts[-1]
-    if not all(np.isfinite(y_hat).all() for y_hat in predicted):
-        raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
     has_more = sum(starts) < record.n
     warnings = []
     if any(estimated):
@@ -223,12 +208,31 @@ def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...
     ModelError
         When a piece has another sampling rate than the model, or the prediction overflows.
     """
-    for piece in record:
-        model.check_rate(piece)
-    pieces = [y for part in connected_pieces(record) for y in run_pieces(model, part, None)]
-    if not all(np.isfinite(y_hat).all() for y_hat in pieces):
+    _check_rates(model, record)
+    groups = connected_pieces(record)
+    return tuple(_predicted(model, record, groups, [None] * len(groups)))
+
+
+def _check_rates(model: StageModel, record: Record) -> None:
+    try:
+        for piece in record:
+            model.check_rate(piece)
+    except ModelError as error:
+        raise ModelError(f'{record.name}: {error}') from None
+
+
+def _predicted(
+    model: StageModel,
+    record: Record,
+    groups: Sequence[Sequence[Piece]],
+    memories: Sequence[Vector | None],
+) -> list[Vector]:
+    predicted: list[Vector] = []
+    for pieces, memory in zip(groups, memories, strict=True):
+        predicted += run_pieces(model, pieces, memory)
+    if not all(np.isfinite(y_hat).all() for y_hat in predicted):
         raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
-    return tuple(pieces)
+    return predicted
 
 
 def run_pieces(
@@ -298,28 +302,6 @@ class PieceRun:
     y_static: Vector
 
 
-@dataclass(frozen=True)
-class SineError:
-    """
-    Steady-state error of one sine segment.
-
-    Attributes
-    ----------
-    frequency : float
-        [Hz]
-    percent, static_percent : float
-        `piezo_ident.model.metrics.percent_of_stroke` of the whole model and of the hysteresis
-        alone, by the stroke of the samples compared.
-    n : int
-        Samples compared.
-    """
-
-    frequency: float
-    percent: float
-    static_percent: float
-    n: int
-
-
 def piece_runs(
     model: StageModel,
     records: Iterable[Record] | Record,
@@ -354,73 +336,3 @@ def piece_runs(
             for piece, y_hat, y_static in zip(pieces, *both, strict=True):
                 runs.append(PieceRun(record.name, piece, y_hat, y_static))
     return runs
-
-
-def sine_frequency(label: str) -> float | None:
-    """
-    Return the frequency in a segment label [Hz], None when it names no sine.
-
-    Examples
-    --------
-    >>> sine_frequency('sine:50Hz'), sine_frequency('noise')
-    (50.0, None)
-    """
-    match = _SINE.match(label)
-    frequency = float(match.group(1)) if match else 0.0
-    return frequency if 0.0 < frequency < float('inf') else None
-
-
-def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
-    """
-    Return the steady-state error of every sine segment, by frequency.
-
-    The first second and at least one period of each segment do not count; a segment that is then
-    shorter than a period is left out.
-
-    Parameters
-    ----------
-    runs : sequence of PieceRun
-    """
-    rows = []
-    for run in runs:
-        rate = run.piece.sample_rate
-        for s in run.piece.segments:
-            frequency = sine_frequency(s.label)
-            if frequency is None:
-                continue
-            start = s.start + int(np.ceil(max(SETTLING, 1.0 / frequency) * rate))
-            # half a sample is forgiven: the period need not be a whole number of them
-            if s.stop - start < rate / frequency - 0.5:
-                continue
-            steady = slice(start, s.stop)
-            y = run.piece.y[steady]
-            rows.append(
-                SineError(
-                    frequency=frequency,
-                    percent=percent_of_stroke(y, run.y_hat[steady]),
-                    static_percent=percent_of_stroke(y, run.y_static[steady]),
-                    n=y.size,
-                )
-            )
-    return tuple(sorted(rows, key=lambda row: row.frequency))
-
-
-def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
-    """
-    Return the steady-state error of every sine segment of a record, as `sines_of` does.
-
-    Parameters
-    ----------
-    model : StageModel
-    record : Record
-        With segments labelled by their frequency, as ``sine:50Hz``.
-
-    Raises
-    ------
-    ModelError
-        When a piece with sines has another sampling rate than the model.
-    """
-    for piece in record:
-        if piece.find('sine'):
-            model.check_rate(piece)
-    return sines_of(piece_runs(model, record))

@@ -17,7 +17,8 @@ from piezo_ident.common.files import write_together
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification, Progress, silent
 from piezo_ident.model.files import model_to_yaml
-from piezo_ident.model.free_run import piece_runs, sines_of
+from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.sines import sines_of
 from piezo_ident.report.diagnosis import diagnosis_page
 from piezo_ident.report.html import page_html, Shown
 from piezo_ident.report.identification import identification_page

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.identification.results import ErrorRow, Identification
-from piezo_ident.model.free_run import SineError
 from piezo_ident.model.metrics import FORMULA, percent
+from piezo_ident.model.sines import SineError
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.table import (
     FAULTS,

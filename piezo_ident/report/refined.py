@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.effects import find_effect
-from piezo_ident.model.free_run import free_run, sine_errors
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
 

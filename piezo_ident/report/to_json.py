@@ -24,7 +24,8 @@ from piezo_ident.identification.results import (
 )
 from piezo_ident.model import metrics
 from piezo_ident.model.files import plain
-from piezo_ident.model.free_run import PieceRun, sines_of
+from piezo_ident.model.free_run import PieceRun
+from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from piezo_ident.report.identification import headline, KINDS

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.model.free_run import sine_errors
 from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.assemble import assemble, label_runs
 from piezo_ident.record.gaps import bridged, follows
 from piezo_ident.record.record import Piece, Record, Segment

@@ -9,7 +9,8 @@ from diagnosis_examples import example, HOSTILE
 from matplotlib.image import imread
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.model.free_run import piece_runs, sines_of
+from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.sines import sines_of
 from piezo_ident.record.record import Piece
 from piezo_ident.report import save_plot
 from piezo_ident.report.figures.diagnosis import draw_diagnosis, errors_figure

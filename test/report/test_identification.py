@@ -8,7 +8,8 @@ import json
 import math
 
 from piezo_ident.identification.results import Steps
-from piezo_ident.model.free_run import piece_runs, SineError, sines_of
+from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.sines import SineError, sines_of
 from piezo_ident.report import headline, identification_text, steps_to_json, table_one, to_json
 from piezo_ident.report.identification import (
     dynamics_tables,

@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.model.free_run import PieceRun, sine_frequency, SineError
+from piezo_ident.model.free_run import PieceRun
+from piezo_ident.model.sines import sine_frequency, SineError
 from piezo_ident.record.record import Record, Segment
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy

@@ -10,7 +10,8 @@ from functools import partial
 
 import numpy as np
 from piezo_ident.identification.results import Identification
-from piezo_ident.model.free_run import PieceRun, sines_of
+from piezo_ident.model.free_run import PieceRun
+from piezo_ident.model.sines import sines_of
 from piezo_ident.report.figures.free_run import (
     loops_figure,
     overview_figure,

@@ -1,0 +1,134 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Errors of an identified model on the runs that it came from, and the noise floor below them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.identification.results import ErrorRow, Memories
+from piezo_ident.model.initial_memory import start_memory
+from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
+from piezo_ident.residual.stretches import ResidualPart, stretches_of
+
+__all__ = ['errors_of', 'key_of', 'noise_floor_of', 'predictions_of', 'validation_errors']
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """
+    The free run of a model over a run, and of its hysteresis alone [m].
+
+    Where the memory at the start is estimated, the samples that it is estimated from are no test:
+    they are not among `judged`.
+    """
+
+    run: Run
+    y_hat: NDArray[np.float64]
+    y_static: NDArray[np.float64]
+    judged: NDArray[np.bool_]
+
+
+def key_of(run: Run) -> tuple[str, float]:
+    """Return record and start time of a run [s]; a clock that restarts may give it to several."""
+    return run.record, run.piece.start_time
+
+
+def predictions_of(
+    model: StageModel, runs: Sequence[Run], memories: Memories | None = None
+) -> list[Prediction]:
+    """Return the free run over each run; a memory at the start that is not given is estimated."""
+    static, found = model.without_dynamics(), []
+    for run in runs:
+        memory, judged = (memories or {}).get(key_of(run)), run.use
+        if memory is None:
+            memory, judged = start_memory(model, run.piece), run.known
+        y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
+        found.append(Prediction(run, y_hat, y_static, judged))
+    return found
+
+
+def errors_of(
+    predictions: Sequence[Prediction],
+    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+) -> list[ErrorRow]:
+    """
+    Return the free-run error of every segment, split into what was fitted and what was not.
+
+    Parameters
+    ----------
+    predictions : sequence of Prediction
+    masks : sequence of (fitted, selection)
+        For each run, the samples that were fitted and those that only chose between models.
+    """
+    stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
+    rows = []
+    for p, (fitted, selection) in zip(predictions, masks, strict=True):
+        piece, stroke = p.run.piece, stroke_of[p.run.record]
+        names = [(s.label, s.start, s.stop) for s in piece.segments]
+        for label, start, stop in names or [('', 0, piece.n)]:
+            part = np.zeros(piece.n, dtype=bool)
+            part[start:stop] = p.run.use[start:stop]
+            for data, mask in (
+                ('fitted', part & fitted),
+                ('selection', part & selection),
+                ('held out', part & p.judged & ~fitted & ~selection),
+            ):
+                if not mask.any():
+                    continue
+                y, y_hat = piece.y[mask], p.y_hat[mask]
+                rows.append(
+                    ErrorRow(
+                        record=p.run.record,
+                        segment=label,
+                        percent=percent_of_stroke(y, y_hat, stroke),
+                        static_percent=percent_of_stroke(y, p.y_static[mask], stroke),
+                        fit=fit_percent(y, y_hat),
+                        n=int(mask.sum()),
+                        data=data,
+                    )
+                )
+    return rows
+
+
+def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
+    """Return the noise floor that the residuals of all runs show."""
+    parts = [
+        ResidualPart(p.run.record, p.run.piece, p.run.piece.y - p.y_hat, p.run.use)
+        for p in predictions
+    ]
+    return residual_noise_floor(
+        parts, [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
+    )
+
+
+def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
+    """
+    Return the free-run errors of records that were given for validation.
+
+    Raises
+    ------
+    IdentificationError
+        When a record has no piece at the sampling rate of the model.
+    """
+    rows: list[ErrorRow] = []
+    for record in records:
+        runs = runs_of([record], model.sample_rate, model.scaling)
+        if not runs:
+            raise IdentificationError(
+                f'{record.name}: no piece is sampled at {model.sample_rate:g} Hz, the rate of the '
+                'model; record the data for validation at that rate'
+            )
+        nothing = [(np.zeros(run.piece.n, dtype=bool),) * 2 for run in runs]
+        judged = errors_of(predictions_of(model, runs), nothing)
+        rows += [replace(row, data='validation') for row in judged]
+    return rows

@@ -1,0 +1,115 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The steady-state error of a model under sines, as in the paper's Table I."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import re
+
+import numpy as np
+from piezo_ident.model.free_run import piece_runs, PieceRun
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+
+__all__ = ['SineError', 'sine_errors', 'sine_frequency', 'sines_of']
+
+#: what is dropped at the start of a sine: this time and at least one period [s]
+SETTLING = 1.0
+
+_SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])', re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class SineError:
+    """
+    Steady-state error of one sine segment.
+
+    Attributes
+    ----------
+    frequency : float
+        [Hz]
+    percent, static_percent : float
+        `piezo_ident.model.metrics.percent_of_stroke` of the whole model and of the hysteresis
+        alone, by the stroke of the samples compared.
+    n : int
+        Samples compared.
+    """
+
+    frequency: float
+    percent: float
+    static_percent: float
+    n: int
+
+
+def sine_frequency(label: str) -> float | None:
+    """
+    Return the frequency in a segment label [Hz], None when it names no sine.
+
+    Examples
+    --------
+    >>> sine_frequency('sine:50Hz'), sine_frequency('noise')
+    (50.0, None)
+    """
+    match = _SINE.match(label)
+    frequency = float(match.group(1)) if match else 0.0
+    return frequency if 0.0 < frequency < float('inf') else None
+
+
+def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
+    """
+    Return the steady-state error of every sine segment, by frequency.
+
+    The first second and at least one period of each segment do not count; a segment that is then
+    shorter than a period is left out.
+
+    Parameters
+    ----------
+    runs : sequence of PieceRun
+    """
+    rows = []
+    for run in runs:
+        rate = run.piece.sample_rate
+        for s in run.piece.segments:
+            frequency = sine_frequency(s.label)
+            if frequency is None:
+                continue
+            start = s.start + int(np.ceil(max(SETTLING, 1.0 / frequency) * rate))
+            # half a sample is forgiven: the period need not be a whole number of them
+            if s.stop - start < rate / frequency - 0.5:
+                continue
+            steady = slice(start, s.stop)
+            y = run.piece.y[steady]
+            rows.append(
+                SineError(
+                    frequency=frequency,
+                    percent=percent_of_stroke(y, run.y_hat[steady]),
+                    static_percent=percent_of_stroke(y, run.y_static[steady]),
+                    n=y.size,
+                )
+            )
+    return tuple(sorted(rows, key=lambda row: row.frequency))
+
+
+def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
+    """
+    Return the steady-state error of every sine segment of a record, as `sines_of` does.
+
+    Parameters
+    ----------
+    model : StageModel
+    record : Record
+        With segments labelled by their frequency, as ``sine:50Hz``.
+
+    Raises
+    ------
+    ModelError
+        When a piece with sines has another sampling rate than the model.
+    """
+    for piece in record:
+        if piece.find('sine'):
+            model.check_rate(piece)
+    return sines_of(piece_runs(model, record))
