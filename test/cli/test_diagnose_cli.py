@@ -11,12 +11,13 @@ import signal
 import sys
 import time
 
+from command_line import refuse, run, succeed
 from diagnosis_examples import base_model, example, measured, RATE, refined_model
 import jsonschema
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import diagnose_command as module
-from piezo_ident.cli import effects_command, main
+from piezo_ident.cli import effects_command
 from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run
@@ -25,31 +26,6 @@ from piezo_ident.report.to_json import diagnosis_schema
 import pytest
 
 ONLY = ('--only', 'creep')
-
-
-def run(capsys, *argv: object) -> tuple[int, str, str]:
-    code = main([str(a) for a in argv])
-    said = capsys.readouterr()
-    return code, said.out, said.err
-
-
-def succeed(capsys, *argv: object) -> str:
-    code, out, err = run(capsys, *argv)
-    assert (code, err) == (0, '')
-    return out
-
-
-def refuse(capsys, folder: Path, argv: list[object], *words: object) -> None:
-    """Run a command that cannot work: one line, exit code 2, and nothing new on disk."""
-    before = {p: p.read_bytes() for p in folder.rglob('*') if p.is_file()}
-    code, out, err = run(capsys, *argv)
-    assert (code, out) == (2, ''), out
-    assert err.count('\n') == 1, err
-    assert err.startswith('piezo_ident')
-    assert 'Traceback' not in err
-    for word in words:
-        assert str(word) in err
-    assert {p: p.read_bytes() for p in folder.rglob('*') if p.is_file()} == before
 
 
 @pytest.fixture
@@ -77,9 +53,6 @@ def quick(monkeypatch):
 
     monkeypatch.setattr(module, 'diagnose', diagnose)
     return asked
-
-
-# --- the way it is meant --------------------------------------------------------------------
 
 
 def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
@@ -110,13 +83,6 @@ def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
     assert 'with creep' in text
     assert (report / 'report.html').is_file()
     assert load(made / 'model.yaml').effects == ()
-
-
-def test_help(capsys):
-    assert 'diagnose' in succeed(capsys, '--help')
-    text = succeed(capsys, 'diagnose', '--help')
-    for option in ('--model', '--report', '--validation', '--only', '--without', '--seed'):
-        assert option in text
 
 
 def test_what_it_prints(capsys, made, quick):
@@ -190,9 +156,6 @@ def test_a_unit_converts(capsys, made, quick):
     refuse(capsys, made, argv, 'um.csv', '--displacement-unit')
 
 
-# --- what a user gets wrong -----------------------------------------------------------------
-
-
 def test_misspelt_effects(capsys, made, quick):
     argv = ['diagnose', made / 'model.yaml', made / 'val.npz']
     refuse(capsys, made, [*argv, '--without', 'crep'], "'crep'; did you mean creep?")
@@ -210,10 +173,7 @@ def test_misspelt_effects(capsys, made, quick):
         (['--most-effects', 0], 'most_effects'),
         (['--most-effects', 'all'], '--most-effects'),
         (['--seed', -1], '--seed'),
-        (['--mdoel', 'r.yaml'], '--mdoel'),
         (['--only', ''], 'is empty; give a name'),
-        (['--model', 'r.csv'], 'r.csv'),
-        (['--displacement-unit', 'ym'], 'nm'),
     ],
 )
 def test_bad_options(capsys, made, quick, options, word):
@@ -234,9 +194,6 @@ def test_inputs_and_other_reports_are_never_overwritten(capsys, made, quick):
     (made / 'mine').mkdir()
     (made / 'mine' / 'model.yaml').write_text('')
     refuse(capsys, made, [*argv, '--report', made / 'mine'], 'of no earlier report')
-    (made / 'file').write_text('')
-    refuse(capsys, made, [*argv, '--report', made / 'file'], 'is a file')
-    refuse(capsys, made, [*argv, '--model', made / 'no' / 'r.yaml'], 'make it first')
     assert quick == {}
 
 
@@ -270,15 +227,6 @@ def test_interrupt_leaves_nothing(capsys, made, monkeypatch):
     assert (code, out) == (130, '')
     assert err.startswith('piezo_ident: interrupted') and err.count('\n') == 1
     assert sorted(made.rglob('*')) == before
-
-
-def test_an_unwritable_folder_is_refused_before_the_work(capsys, made, quick):
-    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', '--report', '/proc/report']
-    refuse(capsys, made, argv, '/proc/report')
-    assert quick == {}
-
-
-# --- the catalogue --------------------------------------------------------------------------
 
 
 def test_catalogue(capsys):

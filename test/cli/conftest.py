@@ -1,0 +1,62 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A small stage with records and a model, which tests of the command line only read."""
+
+from pathlib import Path
+
+from piezo_ident.cli import main
+import pytest
+
+# a stage with one slow mode at 2 kHz, so that an identification takes a moment only
+STAGE = """\
+schema_version: 1
+sample_rate: 2000.0
+input: {v0: 0.0, V: 10.0, range: [0.0, 10.0]}
+output: {y0: 0.0, Y: 75.0e-6}
+delay: {samples: 2}
+hysteresis: {thresholds: [0.2, 0.4, 0.6], weights: [0.3, 0.2, 0.1], p1: -0.2, p2: 0.9}
+dynamics: {a: [-1.2, 0.5], b: [0.2, 0.1]}
+sensor: {noise_rms: 1.0e-9}
+seed: 7
+"""
+PROGRAM = """\
+limits: [0, 10]
+seed: 1
+segments:
+  - {signal: idle, duration: 0.3}
+  - {signal: step, bias: 5, size: 1, hold: 0.06, count: 8}
+  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 12, frequency: 20}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 600, duration: 3}
+  - {signal: triangle, slope: 10}
+  - {signal: idle, duration: 0.3}
+"""
+SINE = """\
+limits: [0, 10]
+segments:
+  - {signal: sine, bias: 5, amplitude: 5, frequency: 5, duration: 2}
+"""
+
+
+@pytest.fixture(scope='session')
+def made(tmp_path_factory) -> Path:
+    """Return a folder with a stage, its record, a record of a sine and the model."""
+    folder = tmp_path_factory.mktemp('made')
+    (folder / 'stage.yaml').write_text(STAGE)
+    (folder / 'program.yaml').write_text(PROGRAM)
+    (folder / 'sine.yaml').write_text(SINE)
+    for program, out in (('program.yaml', 'record.npz'), ('sine.yaml', 'sine.csv')):
+        files = ['--config', folder / 'stage.yaml', '--program', folder / program, folder / out]
+        assert main(['simulate', *map(str, files)]) == 0
+    argv = [
+        'identify',
+        folder / 'record.npz',
+        '--model',
+        folder / 'model.yaml',
+        '--order',
+        '2,2',
+        '--thresholds',
+        '5',
+    ]
+    assert main([str(a) for a in argv]) == 0
+    return folder
