@@ -117,8 +117,9 @@ class Residual:
     @property
     def text(self) -> str:
         """The rms for people."""
+        size, spread = 1e9 * self.rms, 1e9 * float(np.std(self.r))
         percent = 100.0 * self.rms / self.stroke
-        return f'{1e9 * self.rms:.0f} nm ({percent:.3f} % of stroke)'
+        return f'{size:.0f} nm ({percent:.3f} % of stroke), {spread:.0f} nm without its mean'
 
 
 @dataclass
@@ -339,8 +340,8 @@ def _residual(model: pi.StageModel, record: pi.Record) -> Residual:
 
 
 #: below the residual of the running graph
-NOTE = """The slow rest is creep that earlier motions have left, which the model cannot know: it
-starts anew with each stream."""
+NOTE = """What remains is slow: creep that earlier motions have left, which the model cannot know,
+since it begins at rest with each stream."""
 PAGE = """\
 <!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>piezo_ident: the demo</title>
