@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,6 @@ from piezo_ident.record.record import Segment
 __all__ = [
     'BLOCK_SIZE',
     'Dimension',
-    'DimensionLike',
     'Samples',
     'cut_blocks',
     'decode',
@@ -45,25 +44,6 @@ class Dimension(NamedTuple):
     label: str
     size: int
     stride: int
-
-
-class DimensionLike(Protocol):
-    """What a `Dimension` and a std_msgs/MultiArrayDimension have in common."""
-
-    @property
-    def label(self) -> str:
-        """Name of the dimension."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Number of entries."""
-        ...
-
-    @property
-    def stride(self) -> int:
-        """Numbers in one entry and all that is nested in it, times `size`."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +85,14 @@ def encode(samples: Samples) -> tuple[NDArray[np.float64], tuple[Dimension, Dime
     )
 
 
-def quantity_of(dims: Sequence[DimensionLike]) -> str | None:
+def quantity_of(dims: Sequence[Any]) -> str | None:
     """Return what a layout says it carries, or None for a layout that is none of ours."""
     if len(dims) != 2 or not dims[1].label.startswith('t,'):
         return None
-    return dims[1].label[2:].strip()
+    return str(dims[1].label)[2:].strip()
 
 
-def decode(data: ArrayLike, dims: Sequence[DimensionLike], data_offset: int = 0) -> Samples:
+def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Samples:
     """
     Return the samples of a block.
 
@@ -120,7 +100,7 @@ def decode(data: ArrayLike, dims: Sequence[DimensionLike], data_offset: int = 0)
     ----------
     data : array_like, shape (2 n,)
         The message's numbers; not copied.
-    dims : sequence of DimensionLike
+    dims : sequence of Dimension, or of std_msgs/MultiArrayDimension
         The message's layout.
     data_offset : int
         Numbers in front of the matrix.
@@ -135,11 +115,10 @@ def decode(data: ArrayLike, dims: Sequence[DimensionLike], data_offset: int = 0)
     if quantity is None:
         labels = [d.label for d in dims]
         raise DataError(f"layout {labels} is not ['sample:<segment>', 't,<quantity>']")
-    n, width = dims[0].size, dims[1].size
-    if n < 0 or width != 2 or dims[1].stride != 2 or dims[0].stride != 2 * n:
+    (n, outer), (width, inner) = ((int(d.size), int(d.stride)) for d in dims)
+    if n < 0 or (outer, width, inner) != (2 * n, 2, 2):
         raise DataError(
-            f'layout {n} x {width} with strides {dims[0].stride}, {dims[1].stride} is not N x 2 '
-            'with strides 2N, 2'
+            f'layout {n} x {width} with strides {outer}, {inner} is not N x 2 with strides 2N, 2'
         )
     if flat.size - data_offset != 2 * n or data_offset < 0:
         raise DataError(

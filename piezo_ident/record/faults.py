@@ -200,19 +200,15 @@ def line_error(pieces: Iterable[Piece]) -> float:
     ----------
     pieces : iterable of Piece
     """
-    parts = [
-        (p.v[i : i + _CHUNK], p.y[i : i + _CHUNK]) for p in pieces for i in range(0, p.n, _CHUNK)
-    ]
-    n = sum(y.size for _, y in parts)
-    stroke = max(float(y.max()) for _, y in parts) - min(float(y.min()) for _, y in parts)
+    parts = list(pieces)
+    v, y = (np.concatenate(x) for x in ([p.v for p in parts], [p.y for p in parts]))
+    stroke = float(np.ptp(y))
     if stroke == 0.0:
         return 0.0
-    middle_v, middle_y = (sum(float(part[k].sum()) for part in parts) / n for k in (0, 1))
-    power = sum(float(np.sum((v - middle_v) ** 2)) for v, _ in parts)
-    cross = sum(float((v - middle_v) @ (y - middle_y)) for v, y in parts)
-    slope = cross / power if power > 0.0 else 0.0
-    square = sum(float(np.sum((y - middle_y - slope * (v - middle_v)) ** 2)) for v, y in parts)
-    return 100.0 * float(np.sqrt(square / n)) / stroke
+    v, y = v - v.mean(), y - y.mean()
+    power = float(v @ v)
+    error = y - (float(v @ y) / power if power > 0.0 else 0.0) * v
+    return 100.0 * float(np.sqrt(np.mean(error**2))) / stroke
 
 
 def misspelt(labels: Sequence[str]) -> list[str]:
