@@ -128,19 +128,9 @@ def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) ->
 
 def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
     """
-    Split increasing stamps where the sampling is interrupted or changes its rate.
+    Split strictly increasing stamps [s] where sampling is interrupted or changes its rate.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Strictly increasing stamps [s].
-    resolution : Resolution
-        Of the whole file.
-
-    Returns
-    -------
-    list of (start, stop)
-        In order; stretches of a single sample are among them.
+    Returns (start, stop) of each stretch in order; a stretch may be a single sample.
     """
     cuts = np.flatnonzero(_breaks(t)) + 1
     bounds = [0, *cuts.tolist(), t.size]
@@ -355,14 +345,9 @@ def has_restarted(first: float, last: float, begin: float, period: float) -> boo
 
     Parameters
     ----------
-    first : float
-        Time of the first sample of the new stretch [s].
-    last : float
-        Time of the newest sample so far [s].
-    begin : float
-        Time of the first sample since the last restart [s].
-    period : float
-        Sampling period [s].
+    first, last, begin, period : float
+        Time of the first sample of the new stretch, of the newest sample so far, and of the first
+        one since the last restart, and the sampling period [s].
 
     Examples
     --------

@@ -52,23 +52,9 @@ class OrderedRows:
 
 def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRows, list[int]]:
     """
-    Drop repeated rows and find where the clock restarts.
+    Drop repeated rows of finite numbers, and return the rows at which the clock restarts, with 0.
 
-    Parameters
-    ----------
-    table : OrderedRows
-        Finite rows as measured.
-    name : str
-        What errors call the data.
-    met : list of Fault
-        What is met is added here.
-
-    Returns
-    -------
-    OrderedRows
-        What is left, rising in time within each epoch.
-    list of int
-        The row at which each epoch begins; the first is 0.
+    What is met is added to `met`.
 
     Raises
     ------

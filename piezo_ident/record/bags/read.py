@@ -59,12 +59,7 @@ def typestore() -> Typestore:
 @contextmanager
 def opened_bag(path: str | Path) -> Iterator[Bag]:
     """
-    Open a rosbag2 folder, or a single .mcap or .db3 file.
-
-    Parameters
-    ----------
-    path : path
-        The folder or file; one that was not finished is read as far as it goes.
+    Open a rosbag2 folder, or a single .mcap or .db3 file, as far as it was finished.
 
     Raises
     ------

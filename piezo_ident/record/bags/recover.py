@@ -107,14 +107,7 @@ def damage_as_data_error(path: Path) -> Iterator[None]:
 
 
 def metadata(folder: Path) -> dict[str, Any]:
-    """
-    Return the contents of the ``metadata.yaml`` of a folder.
-
-    Raises
-    ------
-    ConfigError
-        When it is not YAML.
-    """
+    """Return the contents of the ``metadata.yaml`` of a folder; ConfigError for no YAML."""
     info = load_yaml(folder / 'metadata.yaml').get('rosbag2_bagfile_information')
     return info if isinstance(info, dict) else {}
 
@@ -197,14 +190,7 @@ class _Part(NamedTuple):
 
 def recovered_bag(path: Path, stack: ExitStack) -> Bag:
     """
-    Open an unfinished bag.
-
-    Parameters
-    ----------
-    path : Path
-        The folder or file.
-    stack : ExitStack
-        Closes what was opened.
+    Open an unfinished bag; `stack` closes it.
 
     Raises
     ------

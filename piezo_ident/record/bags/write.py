@@ -174,10 +174,7 @@ class BagWriter:
         return self._closed_size + self._size_here()
 
     def _size_here(self) -> int:
-        try:
-            return self.file.stat().st_size
-        except OSError:
-            return 0
+        return self.file.stat().st_size if self.file.exists() else 0
 
     def __contains__(self, topic: str) -> bool:
         """Return whether a topic was added."""
@@ -185,16 +182,7 @@ class BagWriter:
 
     def add_topic(self, topic: str, message_type: str, qos: Sequence[Qos] = (SAMPLE_QOS,)) -> None:
         """
-        Add a topic, once.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-        message_type : str
-            As in ``std_msgs/msg/String``.
-        qos : sequence of Qos
-            What its publishers offer.
+        Add a topic by its full name, once, with what its publishers offer.
 
         Raises
         ------
@@ -215,16 +203,7 @@ class BagWriter:
 
     def write(self, topic: str, stamp: int, raw: bytes) -> None:
         """
-        Write a message as it is.
-
-        Parameters
-        ----------
-        topic : str
-            One that was added.
-        stamp : int
-            Log time [ns].
-        raw : bytes
-            Serialised message.
+        Write a serialised message under its log time [ns] on a topic that was added.
 
         Raises
         ------
