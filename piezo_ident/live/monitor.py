@@ -107,10 +107,6 @@ class Matcher:
             if one.t[-1] < rest.t[0] or one.t[0] > rest.t[-1]:
                 continue
             other.waiting.remove(one)
-            if np.array_equal(one.t, rest.t):
-                pairs.append((rest, one))
-                rest = _without(rest, np.arange(rest.t.size))
-                break
             _, i, j = np.intersect1d(rest.t, one.t, return_indices=True)
             if i.size:
                 pairs.append((_rows(rest, i), _rows(one, j)))

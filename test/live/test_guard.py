@@ -96,13 +96,6 @@ def test_a_ramp_that_must_end_in_time_is_steeper_but_keeps_the_slew():
     assert np.flatnonzero(v == 0.0)[0] == 19
 
 
-def test_new_limits_are_moved_into_at_the_slew():
-    guard = Guard(USUAL, applied=9.0)
-    guard.process([9.0])
-    guard.settings = GuardSettings(0.0, 5.0, 1000.0, 20.0, 0.0, FS)
-    assert guard.process([9.0] * 6).voltage.tolist() == [8.0, 7.0, 6.0, 5.0, 5.0, 5.0]
-
-
 @pytest.mark.parametrize(
     ('change', 'reason'),
     [
