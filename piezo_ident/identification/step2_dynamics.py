@@ -29,6 +29,8 @@ __all__ = [
     'ArxFactor',
     'OrderTable',
     'arx_factor',
+    'delayed',
+    'free_run_error',
     'instrumental_variables',
     'scan_orders',
     'stabilised',
@@ -191,6 +193,25 @@ class OrderTable:
         return [orders for *_, orders in sorted(order)]
 
 
+def delayed(u: NDArray[np.float64], d: int) -> NDArray[np.float64]:
+    """Return a signal delayed by whole samples, zeros first; shape (n,)."""
+    return np.concatenate([np.zeros(d), u[: u.size - d]])
+
+
+def free_run_error(
+    model: Dynamics, d: int, u: NDArray[np.float64], y: NDArray[np.float64]
+) -> float:
+    """
+    Return the rms free-run error but for an offset, infinite for an unstable model.
+
+    The first fifth is left for the transient.
+    """
+    if not model.is_stable:
+        return float('inf')
+    e = y - filter_arx(model.a, model.b, delayed(u, d), at_rest=False)
+    return float(e[y.size // 5 :].std())
+
+
 def scan_orders(
     factor: ArxFactor,
     d: int,
@@ -209,15 +230,13 @@ def scan_orders(
         Delay [samples].
     nb_max : int
     u_held, y_held : ndarray, shape (n,)
-        Data that were not fitted; the first fifth is left for the transient.
+        Data that were not fitted.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
     """
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
     size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
-    delayed = np.concatenate([np.zeros(d), u_held[: u_held.size - d]])
-    skip = y_held.size // 5
     models = []
     for na in range(1, shape[0] + 1):
         row = []
@@ -225,10 +244,7 @@ def scan_orders(
             loss[na - 1, nb - 1] = one_step
             model = Dynamics(a=theta[:na], b=theta[na:])
             row.append(model)
-            if model.is_stable:
-                simulated = filter_arx(model.a, model.b, delayed, at_rest=False)
-                e = (y_held - simulated)[skip:]
-                held[na - 1, nb - 1] = np.sqrt(np.mean((e - e.mean()) ** 2))
+            held[na - 1, nb - 1] = free_run_error(model, d, u_held, y_held)
         models.append(tuple(row))
         if tick is not None:
             tick(na / shape[0])
@@ -300,14 +316,13 @@ def instrumental_variables(
     """
     na, nb = start.a.size, start.b.size
     model = stabilised(start)
-    delayed = np.concatenate([np.zeros(d), u[: u.size - d]])
+    w = delayed(u, d)
     first = max(na, nb)
-
     n = u.size - first
     for _ in range(iterations):
         one = np.ones(1)
-        y_sim = filter_arx(model.a, model.b, delayed, at_rest=False)
-        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, delayed, y_sim))
+        y_sim = filter_arx(model.a, model.b, w, at_rest=False)
+        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, w, y_sim))
         u_lags = (uf, first, 1.0, nb)
         z, phi = ((sf, first - 1, -1.0, na), u_lags), ((yf, first - 1, -1.0, na), u_lags)
         A = np.block([[_inner(x, other, n) for other in phi] for x in z])

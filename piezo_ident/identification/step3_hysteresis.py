@@ -86,13 +86,8 @@ def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
     """
     Return thresholds for an H that only serves to find G.
 
-    Forty over the swing, and a dozen within the excursion of the noise: what H does inside the
-    noise would otherwise be taken for slow dynamics.
-
-    Parameters
-    ----------
-    swing, excursion : float
-        Normalised peak-to-peak voltage of the whole record and of the noise.
+    Forty over the swing of the record, and a dozen within the excursion of the noise, both peak
+    to peak: what H does inside the noise would otherwise be taken for slow dynamics.
     """
     fine = excursion * np.arange(1, 13) / 12.0
     return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
@@ -238,10 +233,7 @@ def fit_hysteresis(
     solver: Solver = 'least_squares',
     polish: bool = False,
     rows: int | None = None,
-    rng: np.random.Generator | None = None,
-    swarm_size: int = 40,
-    maxiter: int = 20_000,
-    callback: Callable[[OptimizeResult], Any] | None = None,
+    **flight: Any,
 ) -> HysteresisFit:
     """
     Find the weights of H from factorised data.
@@ -259,15 +251,13 @@ def fit_hysteresis(
         Let bounded least squares finish what the swarm found.
     rows : int, optional
         Number of rows that the samples were averaged to (`Excerpt.rows`); `n` when absent.
-    rng : numpy.random.Generator
-        Needed by the swarm.
-    swarm_size, maxiter, callback
-        As in `piezo_ident.identification.solvers.particle_swarm.particle_swarm`.
+    **flight
+        `rng` and options of `piezo_ident.identification.solvers.particle_swarm.particle_swarm`.
 
     Raises
     ------
     IdentificationError
-        When the swarm is asked for without `rng`, or the data hold nothing.
+        When the data hold nothing.
     """
     m = thresholds.size
     k = R.shape[0] - m - 3
@@ -281,23 +271,12 @@ def fit_hysteresis(
     lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
     x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
     x[np.linalg.norm(inner[:, :-1], axis=0) == 0.0] = 0.0
-    swarm = None
-    swarm_loss = None
+    swarm, swarm_loss = None, None
     if solver == 'swarm':
-        if rng is None:
-            raise IdentificationError('hysteresis: the swarm needs a random generator')
-        box = np.array([WEIGHT_BOX] * m + [P1_BOX, P2_BOX])
+        low, high = np.array([WEIGHT_BOX] * m + [P1_BOX, P2_BOX]).T
         A, y = inner[:, :-1], inner[:, -1]
-        swarm = particle_swarm(
-            Quadratic(A.T @ A, A.T @ y, float(y @ y)),
-            box[:, 0],
-            box[:, 1],
-            rng=rng,
-            swarm_size=swarm_size,
-            maxiter=maxiter,
-            tol=1e-3,
-            callback=callback,
-        )
+        problem = Quadratic(A.T @ A, A.T @ y, float(y @ y))
+        swarm = particle_swarm(problem, low, high, tol=1e-3, **flight)
         # from the factor, not from the Gram matrix: the difference of large squares loses digits
         swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
         if not polish:
@@ -386,15 +365,10 @@ def choose_thresholds(
         The same runs in the same order with the fitted and the held-out samples.
     swing : float
         Excited range of the normalised voltage.
-    dynamics : Dynamics
-    delay : Delay
+    dynamics, delay
+        As in `factorise`.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
-
-    Returns
-    -------
-    ndarray
-        Thresholds, normalised.
     """
     best = even_thresholds(swing, COUNTS[0])
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)

@@ -14,7 +14,7 @@ for.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
@@ -25,7 +25,6 @@ from piezo_ident.identification.results import DelayResult, DynamicsResult, Prog
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
-    OutputErrorFit,
     simulation_error,
 )
 from piezo_ident.identification.spectra import excited_band, frequency_response, prefilter
@@ -33,6 +32,8 @@ from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_s
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     ArxFactor,
+    delayed,
+    free_run_error,
     instrumental_variables,
     scan_orders,
     stabilised,
@@ -54,11 +55,8 @@ __all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_exce
 
 #: plays of the paper, where the data cannot choose their number
 PAPER_COUNT = 10
-
-#: delays that the scan tries [samples]
-MAX_DELAY = 30
-#: na and nb of the scan
-SCAN_ORDER = 8
+#: delays [samples] that the scan tries, and its na and nb
+MAX_DELAY, SCAN_ORDER = 30, 8
 #: orders within this share of the best held-out error count as equal; smaller ones go first
 SLACK = 0.05
 #: share by which a larger order must lower the held-out error
@@ -71,19 +69,30 @@ CANDIDATES = 5
 SLOWEST = 5.0
 
 
-def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> tuple[Excerpt, float]:
-    """Return input and output of a noise segment, prefiltered, and its band [Hz]."""
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """Input and output of a noise segment, prefiltered to its band [Hz]; the end is held out."""
+
+    fitted: tuple[NDArray[np.float64], NDArray[np.float64]]
+    held: tuple[NDArray[np.float64], NDArray[np.float64]]
+    band: float
+
+
+def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
     rate = run.piece.sample_rate
     if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
         raise IdentificationError(
             f'{run.record}: voltage or displacement is constant in the noise segment'
         )
-    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
-    u = prefilter(signal[start:stop], rate, band)
-    y = prefilter(run.x[start:stop], rate, band)
-    settle = min(500, u.size // 20)
-    n_fit = u.size - int(END_HELD * u.size) - settle
-    return Excerpt(u[settle:], y[settle:], np.arange(u.size - settle) < n_fit), band
+    band = _band(run, start, stop)
+    u, y = (prefilter(x[start:stop], rate, band) for x in (signal, run.x))
+    fit = slice(min(500, u.size // 20), u.size - int(END_HELD * u.size))
+    return _Noise((u[fit], y[fit]), (u[fit.stop :], y[fit.stop :]), band)
+
+
+def _band(run: Run, start: int, stop: int) -> float:
+    u = run.u[start:stop]
+    return excited_band(u - u.mean(), run.piece.sample_rate)
 
 
 def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
@@ -130,9 +139,8 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
             'or set --delay'
         )
     run, start, stop = _longest_noise(runs)
-    rate = run.piece.sample_rate
-    band = excited_band(run.u[start:stop] - run.u[start:stop].mean(), rate)
-    return DelayResult(scan, 0.5 * rate / band, 'scan', step, loss, scan)
+    std = 0.5 * run.piece.sample_rate / _band(run, start, stop)
+    return DelayResult(scan, std, 'scan', step, loss, scan)
 
 
 def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:
@@ -166,38 +174,8 @@ def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
     return excerpts
 
 
-def _fitted(noise: Excerpt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    n_fit = int(noise.use.sum())
-    return noise.u[:n_fit], noise.x[:n_fit]
-
-
-def _held(noise: Excerpt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    n_fit = int(noise.use.sum())
-    return noise.u[n_fit:], noise.x[n_fit:]
-
-
-def _held_error(noise: Excerpt, model: Dynamics, delay: int) -> float:
-    """Free-run error on the held-out noise in % of its rms, infinite when unstable."""
-    if not model.is_stable:
-        return float('inf')
-    u, y = _held(noise)
-    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
-    e = (y - filter_arx(model.a, model.b, delayed, at_rest=False))[u.size // 5 :]
-    return float(100.0 * e.std() / y.std())
-
-
-def _refined_on_noise(
-    noise: Excerpt, start: Dynamics, delay: int, maxiter: int, tick: Callable[[], None]
-) -> OutputErrorFit:
-    u, y = _fitted(noise)
-    delayed = np.concatenate([np.zeros(delay), u[: u.size - delay]])
-    use = np.arange(u.size) >= u.size // 50
-    return output_error([Excerpt(delayed, y, use)], start, maxiter=maxiter, tick=tick)
-
-
 def _orders(
-    noise: Excerpt,
-    band: float,
+    noise: _Noise,
     settings: Settings,
     delay: int,
     candidates: int,
@@ -205,11 +183,16 @@ def _orders(
 ) -> list[tuple[DynamicsResult, Dynamics]]:
     """Search the orders and refine the best few."""
     size = max(settings.max_order, *(settings.order or (1, 1)))
-    u, y = _fitted(noise)
+    u, y = noise.fitted
     factor = arx_factor(u, y, size, size + delay)
     table = scan_orders(
-        factor, delay, settings.max_order, *_held(noise), lambda share: progress(0.5 * share)
+        factor, delay, settings.max_order, *noise.held, lambda share: progress(0.5 * share)
     )
+    refined_on = Excerpt(delayed(u, delay), y, np.arange(u.size) >= u.size // 50)
+
+    def held_error(model: Dynamics) -> float:
+        return float(100.0 * free_run_error(model, delay, *noise.held) / noise.held[1].std())
+
     orders = [settings.order] if settings.order else table.ranked(SLACK)[:candidates]
     if not orders:
         raise IdentificationError(
@@ -222,17 +205,14 @@ def _orders(
         theta, _ = factor.fit(na, nb, delay)
         ls = Dynamics(a=theta[:na], b=theta[na:])
         iv = instrumental_variables(u, y, ls, delay)
-        errors = {
-            'least squares': _held_error(noise, ls, delay),
-            'instrumental variables': _held_error(noise, iv, delay),
-        }
+        errors = {'least squares': held_error(ls), 'instrumental variables': held_error(iv)}
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls
         # ticks repeat the share, so that the work can be stopped within an iteration
         tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
-        fit = _refined_on_noise(noise, stabilised(start), delay, 10, tick)
-        errors['output error'] = _held_error(noise, fit.dynamics, delay)
+        fit = output_error([refined_on], stabilised(start), maxiter=10, tick=tick)
+        errors['output error'] = held_error(fit.dynamics)
         if np.isfinite(errors['output error']):
-            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=band)
+            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
             found.append((result, fit.dynamics))
         progress(0.5 + 0.5 * (i + 1) / len(orders))
     if not found:
@@ -253,13 +233,15 @@ def second_step(
     """
     d = delay.samples
     run, start, stop = _longest_noise(runs)
+
+    def part(start: float, width: float) -> Callable[[float], None]:
+        return lambda share: progress('dynamics', start + width * share)
+
     progress('dynamics', 0.0)
     # only good enough to undo the hysteresis
     rate = run.piece.sample_rate
-    raw, band = _noise(run, run.u, start, stop)
-    [(_, first)] = _orders(
-        raw, band, settings, d, 1, lambda share: progress('dynamics', 0.3 * share)
-    )
+    raw = _noise(run, run.u, start, stop)
+    [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
     del raw  # of an hour's record it is a gigabyte
     G = first.without_slow_poles(SLOWEST, rate).normalised()
 
@@ -274,13 +256,8 @@ def second_step(
 
     H = undo(G)
     progress('dynamics', 0.45)
-    found = _orders(
-        *_noise(run, H(run.u), start, stop),
-        settings,
-        d,
-        CANDIDATES,
-        lambda share: progress('dynamics', 0.45 + 0.2 * share),
-    )
+    undone = _noise(run, H(run.u), start, stop)
+    found = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
     result, G = _best_in_free_run(found, runs, H, delay, progress)
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
@@ -295,25 +272,17 @@ def second_step(
     )
     g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[start:stop]))
     slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
-    bias = float(run.u[start:stop].mean())
-    response = frequency_response(
-        run.u[start:stop], run.x[start:stop], run.piece.sample_rate, band
-    )
+    response = frequency_response(run.u[start:stop], run.x[start:stop], rate, result.band)
     progress('dynamics', 1.0)
-    return (
-        DynamicsResult(
-            order=result.order,
-            table=result.table,
-            methods=result.methods,
-            covariance=fit.normalised_covariance,
-            response=response,
-            bias=bias,
-            slope_measured=slope_measured,
-            slope_model=slope_model,
-            band=band,
-        ),
-        G,
+    found_last = replace(
+        result,
+        covariance=fit.normalised_covariance,
+        response=response,
+        bias=float(run.u[start:stop].mean()),
+        slope_measured=slope_measured,
+        slope_model=slope_model,
     )
+    return found_last, G
 
 
 def _best_in_free_run(
@@ -383,8 +352,6 @@ def third_step(
     ----------
     fit, held : sequence of Excerpt
         The same runs in the same order with the fitted and the held-out samples.
-    G, delay, settings, progress
-        As for `second_step`.
     whole : sequence of Excerpt, optional
         What the weights are fitted to in the end; `fit` when absent.
     """

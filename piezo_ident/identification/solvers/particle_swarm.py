@@ -165,6 +165,8 @@ def particle_swarm(
         raise ConfigError('swarm: every parameter needs two finite bounds, the lower one first')
     if swarm_size < 2 or maxiter < 1:
         raise ConfigError('swarm: needs at least 2 particles and 1 iteration')
+    # of one layout for the compiler, whatever they are columns or rows of
+    lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     n = lower.size
     X = lower + (upper - lower) * rng.random((swarm_size, n))
     V = (upper - lower) * (rng.random((swarm_size, n)) - 0.5) * 0.5
