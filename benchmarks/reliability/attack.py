@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import itertools
 import math
@@ -75,24 +76,28 @@ def odd_messages(large: int = 5_000_000) -> Iterator[tuple[str, Any]]:
     rows = np.column_stack([np.arange(100) / FS, np.zeros(100)]).ravel().tobytes()
     usual, width = ('sample:x', 100, 200), ('t,voltage', 2, 2)
     most = 2**32 - 1
+    long = 'x' * 1_000_000
     yield 'nothing', Float64MultiArray()
-    yield 'numbers without a layout', message(rows)
-    yield 'one dimension', message(rows, usual)
-    yield 'three dimensions', message(rows, usual, width, width)
-    yield '10,000 dimensions', message(rows, *[usual] * 10_000)
-    yield 'a size that lies', message(rows, ('sample:x', 101, 202), width)
-    yield 'a size of 2^32 - 1', message(rows, ('sample:x', most, most), width)
-    yield 'strides of 0', message(rows, ('sample:x', 100, 0), ('t,voltage', 2, 0))
-    yield 'three columns', message(rows, ('sample:x', 100, 300), ('t,voltage', 3, 3))
+    for name, dims in (
+        ('numbers without a layout', ()),
+        ('one dimension', (usual,)),
+        ('three dimensions', (usual, width, width)),
+        ('10,000 dimensions', (usual,) * 10_000),
+        ('a size that lies', (('sample:x', 101, 202), width)),
+        ('a size of 2^32 - 1', (('sample:x', most, most), width)),
+        ('strides of 0', (('sample:x', 100, 0), ('t,voltage', 2, 0))),
+        ('three columns', (('sample:x', 100, 300), ('t,voltage', 3, 3))),
+        ('another quantity', (usual, ('t,current', 2, 2))),
+        ('no quantity', (usual, ('', 2, 2))),
+        ('another first label', (('rows', 100, 200), width)),
+        ('a label of 1 MB', ((f'sample:{long}', 100, 200), width)),
+        ('a quantity of 1 MB', (usual, (f't,{long}', 2, 2))),
+        ('markup in a label', (('sample:<script>\n\x1b[2J', 100, 200), width)),
+    ):
+        yield name, message(rows, *dims)
     yield 'an offset beyond the end', message(rows, usual, width, offset=most)
     yield 'an odd count', message(rows[:-8], usual, width)
     yield 'no samples', message(b'', ('sample:x', 0, 0), width)
-    yield 'another quantity', message(rows, usual, ('t,current', 2, 2))
-    yield 'no quantity', message(rows, usual, ('', 2, 2))
-    yield 'another first label', message(rows, ('rows', 100, 200), width)
-    yield 'a label of 1 MB', message(rows, ('sample:' + 'x' * 1_000_000, 100, 200), width)
-    yield 'a quantity of 1 MB', message(rows, usual, ('t,' + 'v' * 1_000_000, 2, 2))
-    yield 'markup in a label', message(rows, ('sample:<script>\n\x1b[2J', 100, 200), width)
     for name, raw in (
         ('no bytes', b''),
         ('a lone header', b'\0\1\0\0'),
@@ -236,7 +241,7 @@ class Attack:
         self._atomically: Any = SetParametersAtomically
         self._text: Any = String
         #: how many things were sent, by attack
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
 
     def survived(self, what: str) -> None:
         """See that every node is there and answers, and that the voltage kept its contract."""
@@ -301,7 +306,7 @@ class Attack:
                     self._send_raw(topic, message)
                 else:
                     self.send(topic, message)
-                self._count('messages that are no blocks')
+                self.counts['messages that are no blocks'] += 1
                 if large > 10**6 and 'doubles' in name:
                     time.sleep(1.0)
         self.survived('messages that are no blocks')
@@ -312,7 +317,7 @@ class Attack:
         for k, block in enumerate(odd_blocks(rng, count)):
             for topic in self.publishers:
                 self.send(topic, block)
-            self._count('blocks of any number at any time', 2)
+            self.counts['blocks of any number at any time'] += 2
             if k % 20 == 19:
                 time.sleep(0.02)
         self.survived('blocks of any number at any time')
@@ -334,7 +339,7 @@ class Attack:
         """Set what must be refused."""
         for name, parameters in bad_parameters(node):
             answer = self.set_raw(node, parameters)
-            self._count('parameters of wrong type or value', len(parameters))
+            self.counts['parameters of wrong type or value'] += len(parameters)
             taken = [r for r in answer.results if r.successful] if answer is not None else []
             assert not taken, f'{node} took {name}'
         self.survived('parameters of wrong type or value')
@@ -345,7 +350,7 @@ class Attack:
         for name, text in foreign_models(model):
             seen = len(self.g.statuses('model'))
             self.model.publish(self._text(data=text))
-            self._count('models that are none')
+            self.counts['models that are none'] += 1
             self.g.wait(
                 lambda seen=seen: (
                     any('model refused' in s['message'] for s in self.g.statuses('model')[seen:])
@@ -379,12 +384,9 @@ class Attack:
         failed = [error for (_, error), p in zip(said, running, strict=True) if p.returncode]
         assert not failed, f'a client ended under service calls: {failed[0][-2000:]}'
         counts = [int(out) for out, _ in said]
-        self._count('service calls', sum(counts))
+        self.counts['service calls'] += sum(counts)
         self.survived('service calls')
         return sum(counts) / seconds
-
-    def _count(self, what: str, n: int = 1) -> None:
-        self.counts[what] = self.counts.get(what, 0) + n
 
 
 def client(seconds: float) -> int:
@@ -403,12 +405,6 @@ def client(seconds: float) -> int:
             count += 1
     print(count)
     return 0
-
-
-def memory(pid: int) -> float:
-    """Return the memory of a process [MB]."""
-    text = Path(f'/proc/{pid}/status').read_text()
-    return int(text.partition('VmRSS:')[2].split()[0]) / 1024
 
 
 def start(g: Any, nodes: Mapping[str, Mapping[str, Any]]) -> Attack:
@@ -460,37 +456,22 @@ def main() -> int:
         answer = attack.set_raw('stage', contradiction(), at_once=True)
         assert not answer.result.successful
         rate = attack.services(args.seconds)
-        used = {n: memory(g.handle(n).process.pid) for n in NODES}
-        silent = g.set('stage', 'use_sim_time', True)[0]
-        g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
-        attack.survived('use_sim_time')
         samples, lost = attack.samples, attack.lost
         codes = {n: g.handle(n).stop() for n in NODES}
-    assert silent and not any(codes.values()), codes
-    print(f'{rate:.0f} service calls a second, memory in MB at the end: {used}')
-    command = f'python benchmarks/reliability/attack.py --rounds {args.rounds}'
-    rows = [
-        {
-            'what': f'graph under attack: {what}',
-            'how_often': f'{n:,}',
-            'result': 'all six nodes stay up, answer, and say what they refused'
-            + (f'; {rate:.0f} calls a second by four clients' if 'service' in what else ''),
-            'command': command,
-        }
-        for what, n in attack.counts.items()
-    ]
-    rows.append(
-        {
-            'what': 'graph under attack: `applied_voltage` under all of these',
-            'how_often': f'{samples:,} samples',
-            'result': 'limits and slew kept in every one'
-            + (f'; {lost} messages did not reach the observer' if lost else ''),
-            'command': command,
-        }
-    )
-    write_rows('attack', rows)
+    assert not any(codes.values()), codes
+    rows = []
+    for what, n in attack.counts.items():
+        result = 'all six nodes stay up, answer, and report what they refused'
+        if what == 'service calls':
+            result += f'; {rate:.0f} calls a second by four clients'
+        rows.append((f'graph under attack: {what}', f'{n:,}', result))
+    what = 'graph under attack: `applied_voltage` under all of these'
+    result = 'limits and slew kept in every one'
+    result += f'; {lost} messages did not reach the observer' if lost else ''
+    rows.append((what, f'{samples:,} samples', result))
+    write_rows('attack', rows, f'python benchmarks/reliability/attack.py --rounds {args.rounds}')
     for row in rows:
-        print(f'{row["what"]}: {row["how_often"]}: {row["result"]}')
+        print(': '.join(row))
     return 0
 
 

@@ -16,12 +16,11 @@ import json
 import sys
 from typing import Any
 
-from rows import ROWS
+from rows import KEYS, ROWS
 
 __all__ = ['ORDER', 'main', 'page']
 
 PAGE = ROWS.parents[1] / 'reliability.md'
-KEYS = ('what', 'how_often', 'result', 'command')
 #: studies in the order of the table; any other comes behind
 ORDER = ('safety', 'attack', 'netns', 'crash', 'soak')
 

@@ -331,7 +331,7 @@ def _fill(path: Path) -> None:
 
 def rows_of(
     killed: list[tuple[Job, str]], starved: dict[str, list[tuple[Job, str]]]
-) -> list[dict[str, str]]:
+) -> list[tuple[str, str, str]]:
     """Return the rows of the table."""
     rows = []
     for kind in KILLS:
@@ -344,8 +344,7 @@ def rows_of(
         bad_ones = '; '.join(f'{job.name}: {wrong}' for job, wrong in outcomes if wrong)
         result = bad_ones or (good if outcomes else 'skipped: mounting is not allowed here')
         rows.append((what, f'{len(outcomes)} commands and formats', result))
-    keys = ('what', 'how_often', 'result', 'command')
-    return [dict(zip(keys, (*row, 'make crash'), strict=True)) for row in rows]
+    return rows
 
 
 def main() -> int:
@@ -370,9 +369,9 @@ def main() -> int:
                 print(json.dumps([what, job.name, wrong or 'refused']), flush=True)
     rows = rows_of(killed, starved)
     if args.kills is None:
-        write_rows('crash', rows)
-    for row in rows:
-        print(f'{row["what"]:28s} {row["how_often"]:26s} {row["result"]}')
+        write_rows('crash', rows, 'make crash')
+    for what, how_often, result in rows:
+        print(f'{what:28s} {how_often:26s} {result}')
     print(f'{time.perf_counter() - start:.0f} s')
     is_bad = any(x not in GOOD for _, x in killed)
     return 1 if is_bad or any(x for found in starved.values() for _, x in found) else 0

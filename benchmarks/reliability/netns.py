@@ -16,7 +16,8 @@ Last, with discovery kept to the local machine, each host must see nothing of th
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 import json
@@ -73,7 +74,7 @@ class Hosts:
             'PYTHONPATH': os.pathsep.join(
                 filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')])
             ),
-            'ROS_DOMAIN_ID': '7',  # nobody else is in these namespaces
+            'ROS_DOMAIN_ID': '7',  # no other graph is in these namespaces
             'ROS_AUTOMATIC_DISCOVERY_RANGE': discovery,
             'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILES),
         }
@@ -207,7 +208,7 @@ class Outcome:
 
     @property
     def is_honest(self) -> bool:
-        """Whether all samples are there, or their loss is said."""
+        """Whether all samples are there, or their loss is reported."""
         if self.state == 'done' and self.captured == self.sent:
             return True
         return bool(self.lost or self.faults) or (self.state == 'failed' and bool(self.message))
@@ -250,8 +251,8 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
             hosts.link(up=True)
         text, _ = driver.communicate(timeout=2 * LIMIT + down)
         if driver.returncode:
-            said = (hosts.folder / 'driver.err').read_text()[-1500:]
-            raise RuntimeError(f'the run did not come to an end: {begun} {said}')
+            error = (hosts.folder / 'driver.err').read_text()[-1500:]
+            raise RuntimeError(f'the run did not come to an end: {begun} {error}')
         end = json.loads(text.strip().splitlines()[-1])
         sent = parse_program(program).build(20_000.0).n
         return Outcome(
@@ -278,7 +279,6 @@ def drive(program: str) -> int:
     with Client('driver') as client:
         client.node.create_subscription(DiagnosticArray, '/diagnostics', keep, PREVIEW)
         client.follow('identifier')
-        client.follow('excitation')
         models, reports = client.listen('model'), client.listen('report')
         done, why = client.set('identifier', 'program', Path(program).read_text(), LIMIT)
         if not done:
@@ -318,9 +318,7 @@ def drive(program: str) -> int:
     return 0
 
 
-def seen_from(
-    discovery: str, environment: Mapping[str, str] | None = None
-) -> dict[str, list[str]]:
+def seen_from(discovery: str) -> dict[str, list[str]]:
     """
     Return which nodes each host sees while one stage runs on each of them.
 
@@ -337,9 +335,9 @@ def seen_from(
             for k in (0, 1)
         ]
         found = [look.communicate(timeout=LIMIT)[0] for look in looks]
-        said = [(hosts.folder / f'look{k}.err').read_text()[-500:] for k in (0, 1)]
+        errors = [(hosts.folder / f'look{k}.err').read_text()[-500:] for k in (0, 1)]
     if not all(found):
-        raise RuntimeError(f'nobody looked: {said}')
+        raise RuntimeError(f'no host looked: {errors}')
     return {name: json.loads(text) for name, text in zip('ab', found, strict=True)}
 
 
@@ -365,15 +363,16 @@ def look(host: int) -> int:
     return 0
 
 
-def _told(outcome: Outcome, same: bool) -> Iterator[str]:
-    model = 'the model of the perfect network, bit for bit' if same else 'no model: refused'
-    if outcome.model and not same:
+def _result(outcome: Outcome, perfect: str) -> str:
+    model = 'no model: refused'
+    if outcome.model:
         model = 'another model, with its faults named: ' + ', '.join(outcome.faults)
+    if outcome.model and outcome.model == perfect:
+        model = 'the model of the perfect network, bit for bit'
     missing = outcome.sent - outcome.captured
-    arrived = 'every sample arrived' if not missing else f'{missing} samples missing and said'
-    yield f'{arrived}; {model}'
-    if outcome.state != 'done':
-        yield f'({outcome.message})'
+    arrived = f'{missing} samples missing and reported' if missing else 'every sample arrived'
+    reason = '' if outcome.state == 'done' else f' ({outcome.message})'
+    return f'{arrived}; {model}{reason}'
 
 
 def main() -> int:
@@ -398,36 +397,27 @@ def main() -> int:
     for percent, down in ((0, 0.0), (1, 0.0), (5, 0.0), (0, 10.0)):
         outcomes = [run(percent, down) for _ in range(args.repeat)]
         perfect = perfect or outcomes[0].model
-        results: dict[str, int] = {}
+        results: Counter[str] = Counter()
         for o in outcomes:
             honest &= o.is_honest
-            text = ' '.join(_told(o, bool(o.model) and o.model == perfect))
-            results[text] = results.get(text, 0) + 1
+            text = _result(o, perfect)
+            results[text] += 1
             print(f'{percent} % lost, {down:g} s down: {text}; {o.dropped} packets, {o.seconds} s')
-        what = f'{percent} % of the packets dropped both ways' if not down else ''
-        rows.append(
-            {
-                'what': f'two hosts: {what or f"the link down for {down:g} s in the midst"}',
-                'how_often': f'{len(outcomes)} runs, {sum(o.dropped for o in outcomes)} packets '
-                f'dropped{crowd()}',
-                'result': '; '.join(f'{n} x {text}' for text, n in results.items()),
-                'command': command,
-            }
-        )
+        what = f'{percent} % of the packets dropped both ways'
+        what = f'the link down for {down:g} s during the program' if down else what
+        dropped = sum(o.dropped for o in outcomes)
+        how_often = f'{len(outcomes)} runs, {dropped} packets dropped{crowd()}'
+        result = '; '.join(f'{n} x {text}' for text, n in results.items())
+        rows.append((f'two hosts: {what}', how_often, result))
     kept, open_ = seen_from(''), seen_from('SUBNET')
     print(kept, open_)
     apart = kept == {'a': ['/host0/stage'], 'b': ['/host1/stage']}
     together = len(open_['a']) == len(open_['b']) == 2
-    rows.append(
-        {
-            'what': 'two hosts: who is seen from the other one, as it is shipped and when asked',
-            'how_often': '1 run each',
-            'result': f'{"nothing" if apart else kept} with the default; '
-            f'{"both" if together else open_} with SUBNET',
-            'command': command,
-        }
-    )
-    write_rows('netns', rows)
+    result = f'{"nothing" if apart else kept} with the default; '
+    result += f'{"both" if together else open_} with SUBNET'
+    what = 'two hosts: who is seen from the other one, as it is shipped and when asked'
+    rows.append((what, '1 run each', result))
+    write_rows('netns', rows, command)
     return 0 if honest and apart and together else 1
 
 

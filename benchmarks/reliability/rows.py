@@ -4,36 +4,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
-from typing import Any
 
-__all__ = ['ROWS', 'crowd', 'processors', 'read_rows', 'shares', 'write_rows']
+__all__ = ['KEYS', 'ROWS', 'crowd', 'processors', 'shares', 'write_rows']
 
+KEYS = ('what', 'how_often', 'result', 'command')
 ROWS = Path(__file__).resolve().parents[2] / 'docs' / 'reliability' / 'rows'
 
 
-def read_rows(name: str) -> list[dict[str, Any]]:
-    """Return the rows of a study as it wrote them, none before its first run."""
-    file = ROWS / f'{name}.json'
-    return json.loads(file.read_text(encoding='utf-8')) if file.exists() else []
-
-
-def write_rows(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_rows(name: str, rows: Sequence[tuple[str, str, str]], command: str) -> None:
     """
-    Write the rows of one study, those of an earlier run are replaced.
+    Write the rows of one study in place of those of an earlier run.
 
     Parameters
     ----------
     name : str
         Of the study.
-    rows : sequence of mapping
-        Each with what, how_often, result and command.
+    rows : sequence of (str, str, str)
+        What was tried, how often, and what happened.
+    command : str
+        Does it again.
     """
     ROWS.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(list(rows), indent=1, ensure_ascii=False)
+    data = [dict(zip(KEYS, (*row, command), strict=True)) for row in rows]
+    text = json.dumps(data, indent=1, ensure_ascii=False)
     (ROWS / f'{name}.json').write_text(text + '\n', encoding='utf-8')
 
 

@@ -350,20 +350,14 @@ def main() -> int:
     if args.first == 0:
         from rows import write_rows
 
-        write_rows(
-            'safety',
-            [
-                {
-                    'what': 'the safety property of the drive on generated command sequences: '
-                    'every kind of number and time, gaps, silence, restarts, a second publisher, '
-                    'limits moved',
-                    'how_often': f'{args.count:,} sequences, {met["samples"]:,} applied samples',
-                    'result': 'limits and slew kept in all; silence ends at rest; cut elsewhere, '
-                    'no bit differs',
-                    'command': f'python benchmarks/reliability/safety.py --count {args.count}',
-                }
-            ],
+        what = (
+            'the safety property of the drive on generated command sequences: every kind of '
+            'number and time, gaps, silence, restarts, a second publisher, limits moved'
         )
+        how_often = f'{args.count:,} sequences, {met["samples"]:,} applied samples'
+        result = 'limits and slew kept in all; silence ends at rest; cut elsewhere, no bit differs'
+        command = f'python benchmarks/reliability/safety.py --count {args.count}'
+        write_rows('safety', [(what, how_often, result)], command)
     return 0
 
 

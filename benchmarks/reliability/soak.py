@@ -287,22 +287,16 @@ def main() -> int:
     )
     lost = '; '.join(f'{n} {where}' for where, n in found.lost.items()) or 'no sample lost'
     pace = 'in real time' if args.factor == 1.0 else f'at rate_factor {args.factor:g}'
-    write_rows(
-        'soak',
-        [
-            {
-                'what': f'the whole graph at 20 kHz for {found.seconds / 60:g} min {pace}, '
-                'recording in parts',
-                'how_often': f'1 run, {found.samples:,} samples, {load}',
-                'result': f'{lost}; memory in MB/h: {growth}; sample clock '
-                f'{1e6 * found.drift:+.1f} ± {1e6 * found.drift_error:.1f} µs/s against that of '
-                f'the machine, of whose schedule {found.slipped:.1f} s were lost where blocks '
-                f'came too late ({found.late}); {found.parts} parts',
-                'command': f'python benchmarks/reliability/soak.py --seconds {found.seconds:g}'
-                + (f' --factor {args.factor:g}' if args.factor != 1.0 else ''),
-            }
-        ],
+    what = f'the whole graph at 20 kHz for {found.seconds / 60:g} min {pace}, recording in parts'
+    result = (
+        f'{lost}; memory in MB/h: {growth}; sample clock {1e6 * found.drift:+.1f} ± '
+        f'{1e6 * found.drift_error:.1f} µs/s against that of the machine, of whose schedule '
+        f'{found.slipped:.1f} s were lost where blocks came too late ({found.late}); '
+        f'{found.parts} parts'
     )
+    command = f'python benchmarks/reliability/soak.py --seconds {found.seconds:g}'
+    command += f' --factor {args.factor:g}' if args.factor != 1.0 else ''
+    write_rows('soak', [(what, f'1 run, {found.samples:,} samples, {load}', result)], command)
     return 0
 
 
