@@ -6,7 +6,7 @@ Table I of Gu, Li, Zhu and Su (2016), with a third row: the model that a diagnos
 
     python benchmarks/table_one.py docs/table_one.md
 
-A stage with rate dependence and creep that nobody declares (`truths.table_one`, its parameters
+A stage with rate dependence and creep that no record declares (`truths.table_one`, its parameters
 fixed in table_one.yaml) is identified by the three steps, diagnosed on another record, and
 judged on sines, amplitudes, a minor loop and a hold that neither saw.
 doi:10.1109/TMECH.2015.2465868
@@ -124,8 +124,8 @@ def main() -> None:
         '',
         'Made by `make table-one`. Free-run error, rms(y - y_hat) / (max y - min y) in %, of '
         'v = 5 + 5 sin(2 pi f t) in steady state. The stage has rate dependence and creep that '
-        'the model of the paper lacks; nobody declares them, and their laws are not those of the '
-        'candidates (benchmarks/truths/table_one.py).',
+        'the model of the paper lacks; no record declares them, and their laws are not those of '
+        'the candidates (benchmarks/truths/table_one.py).',
         '',
         f'| | {" | ".join(f"{f} Hz" for f in PAPER)} |',
         f'|---|{"---|" * len(PAPER)}',

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""A DAQ card in the place of the node `stage`, with all that whoever drives an amplifier owes."""
+"""A DAQ card in the place of the node `stage`, with all that a driver of an amplifier must do."""
 
 import sys
 import time
@@ -17,7 +17,7 @@ from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
 RATE = 20_000.0  # Hz, the clock of the card
-PERIOD = 0.01  # s, of what is sent while nobody commands
+PERIOD = 0.01  # s, of what is sent while no command comes
 LIMITS = ('voltage_low', 'voltage_high', 'slew', 'ramp_slew', 'rest')
 
 
@@ -77,8 +77,8 @@ class Driver(LabNode):
         applied = self.guard.process(samples.values, restarted=verdict.kind is Kind.START)
         y = self._move(applied.voltage, samples.segment)
         self.y.publish(to_message(Samples(samples.t, y, samples.segment, 'displacement')))
-        level, said = (WARN, dict(applied.altered)) if applied.altered else (OK, samples.segment)
-        self.report_status('running', 0.0, f'{said}', level)
+        level, text = (WARN, dict(applied.altered)) if applied.altered else (OK, samples.segment)
+        self.report_status('running', 0.0, f'{text}', level)
 
     def _move(self, v: np.ndarray, segment: str) -> np.ndarray:
         y, t = convert(v), np.arange(self.tick, self.tick + v.size) / RATE

@@ -13,8 +13,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'benchmarks'
-#: writes a page of its own
-APART = {'bench_live'}
 
 
 @pytest.fixture(scope='module')
@@ -62,7 +60,7 @@ def write(folder, **modules):
 def test_every_benchmark_keeps_the_contract(run_all):
     found = {path.stem for path in run_all.benchmarks()}
     assert {'bench_growth', 'bench_peers_arx', 'bench_peers_hysteresis'} <= found
-    assert not found & APART
+    assert 'bench_live' not in found
     for path in run_all.benchmarks():
         tree = ast.parse(path.read_text(encoding='utf-8'))
         (function,) = (
@@ -75,10 +73,6 @@ def test_every_benchmark_keeps_the_contract(run_all):
         assert ast.unparse(function.returns) == 'list[tuple[str, str]]', path.name
         guards = [node for node in tree.body if isinstance(node, ast.If)]
         assert any('__main__' in ast.unparse(node.test) for node in guards), path.name
-
-
-def test_the_order_of_the_page_names_no_benchmark_twice(run_all):
-    assert len(set(run_all.ORDER)) == len(run_all.ORDER)
 
 
 def test_page_of_one_benchmark_that_works_and_one_that_does_not(run_all, tmp_path, capsys):
@@ -140,28 +134,10 @@ def test_ratio_of_two_works_is_the_median_over_pairs(load):
     assert one.median == 4.0
 
 
-@pytest.mark.parametrize(
-    ('t', 'text'),
-    [
-        (2.345, '2.35 s'),
-        (0.0123, '12.3 ms'),
-        (4.5e-6, '4.5 µs'),
-        (1.234e-8, '12.3 ns'),
-        (1234.4, '1234 s'),
-    ],
-)
-def test_times_are_told_in_their_units(load, t, text):
-    assert load('side_by_side').seconds(t) == text
-
-
-def test_table_is_markdown(load):
-    table = load('side_by_side').markdown(('a', 'b'), [(1, 'x'), (2, 'y')])
-    assert table == '| a | b |\n|---|---|\n| 1 | x |\n| 2 | y |'
-
-
-def test_version_of_what_is_not_there_is_left_out(load):
-    side = load('side_by_side')
-    assert side.versions('no-such-library-anywhere', 'numpy') == f'numpy {np.__version__}'
+def test_times_have_their_unit(load):
+    seconds = load('side_by_side').seconds
+    texts = [seconds(t) for t in (2.345, 0.0123, 4.5e-6, 1.234e-8, 1234.4)]
+    assert texts == ['2.35 s', '12.3 ms', '4.5 µs', '12.3 ns', '1234 s']
 
 
 def test_exponent_is_the_slope_at_the_large_end(load):
@@ -180,13 +156,6 @@ def test_growth_measures_in_a_process_of_its_own(load, tmp_path):
     assert 10.0 < peak < 4000.0
     with pytest.raises(RuntimeError, match=r'read of 2 s failed: .*short'):
         growth.measured('read', 2.0, tmp_path)
-
-
-def test_measured_record_that_is_not_there_is_said(load, monkeypatch, tmp_path):
-    module = load('bench_peers_hysteresis')
-    monkeypatch.setattr(module, 'DATA', tmp_path)
-    text = module.measured(quick=True)
-    assert text.startswith('Not run: piezo_1hz.csv is not in')
 
 
 def test_order_search_is_judged_on_data_of_its_own(load):

@@ -35,7 +35,3 @@ def test_rows_have_all_they_need(path):
         assert scripts or words[0] == 'make', row['command']
         for script in scripts:
             assert (ROOT / script).is_file(), row['command']
-
-
-def test_what_a_cell_holds_does_not_break_the_table():
-    assert build._cell('a | b\n c') == 'a \\| b c'

@@ -35,7 +35,7 @@ def _rows() -> list[dict[str, Any]]:
     return [row for name in names for row in found[name]]
 
 
-HEAD = """# What it stands
+HEAD = """# Reliability
 
 *Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
 its own rows. Every row can be run again with its command, from the root of the sources, after
@@ -62,7 +62,7 @@ be imported is skipped with a warning.
 
 ## What a kill leaves behind
 
-An output is written under the name `.NAME.RANDOM.tmp` beside its place (`.new.RANDOM.tmp` in a
+An output is written under the name `.NAME.RANDOM.tmp` in the same folder (`.new.RANDOM.tmp` in a
 report folder) and renamed when it is whole; a bag that replaces another changes places with it in
 one step. A process that is killed leaves such a name, which can be deleted, and what stood there
 before. A report is several files: they are put in place one by one, the page last, so that a kill
@@ -88,7 +88,7 @@ DDS finds its peers on other hosts by multicast. Where that is kept to the local
 (`ROS_AUTOMATIC_DISCOVERY_RANGE`, see [SECURITY.md](../SECURITY.md)), both hosts need
 
     export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
-    export ROS_DOMAIN_ID=...                      # the same on both, and nobody else's
+    export ROS_DOMAIN_ID=...                      # the same on both, and of no other graph
     export FASTRTPS_DEFAULT_PROFILES_FILE=$PWD/config/fastdds_two_hosts.xml
 
 before any node starts. The file makes socket buffers of 4 MiB, so that a burst of blocks survives

@@ -153,10 +153,3 @@ def test_it_ends_at_rest(lab, begin):
     driver = lab.handle('stage')
     assert driver.stop(signal.SIGTERM) == 0 and driver.log == ''
     lab.wait(lambda: at_rest(lab), 'rest')
-
-
-def test_the_page_shows_this_file():
-    page = (ROOT / 'docs/driver.md').read_text(encoding='utf-8')
-    code = EXAMPLE.read_text(encoding='utf-8').partition('Apache-2.0\n')[2]
-    shown = page.partition('```python\n')[2].partition('```')[0]
-    assert shown.strip() == code.strip()
