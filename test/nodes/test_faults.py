@@ -52,16 +52,6 @@ def warned(g: Graph, node: str, said: str, since: int) -> None:
     )
 
 
-def identified(g: Graph, name: str = 'identifier') -> dict[str, str]:
-    """Identify, and return the status at the end."""
-    seen = len(g.statuses(name))
-    ok, reason = g.call(f'{name}/identify')
-    assert ok, reason
-    ends = ('done', 'failed', 'cancelled')
-    g.wait(lambda: any(s['state'] in ends for s in g.statuses(name)[seen:]), 'the end of the work')
-    return g.status(name)
-
-
 class Rig:
     """Stage, identifier and model; the test plays the excitation."""
 
@@ -287,7 +277,7 @@ def test_what_is_wrong_with_the_stream_is_said_and_makes_no_bad_model(rig, name)
     if not fault.said:
         for node in ('stage', 'identifier', 'model'):
             assert {s['level'] for s in rig.g.statuses(node)[rig.since[node] + 1 :]} <= {'0'}, node
-    end = identified(rig.g)
+    end = rig.g.finish('identifier/identify')
     if fault.failure:
         assert end['state'] == 'failed' and end['level'] == '2'
         assert fault.failure in end['message'] and '\n' not in end['message']
@@ -335,7 +325,7 @@ def test_blocks_of_a_second_publisher_change_nothing(rig):
     finally:
         g.forget(second)
     models = len(rig.models)
-    end = identified(g)
+    end = g.finish('identifier/identify')
     assert (end['state'], end['level']) == ('done', '1'), end
     g.wait(lambda: len(rig.models) > models, 'the model')
     assert {f['name'] for f in json.loads(rig.reports[-1])['data_faults']} == {'unmatched'}
@@ -356,7 +346,7 @@ def test_a_stage_that_stops_answering_and_answers_late(rig):
         rig.settle()
         assert len(rig.answers) == count
         models = len(rig.models)
-        end = identified(rig.g)
+        end = rig.g.finish('identifier/identify')
         assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
     finally:
         stage.send(signal.SIGCONT)
@@ -365,7 +355,7 @@ def test_a_stage_that_stops_answering_and_answers_late(rig):
     rig.settle()
     rig.is_safe()
     assert len(rig.models) == models
-    end = identified(rig.g)
+    end = rig.g.finish('identifier/identify')
     assert (end['state'], end['level']) == ('done', '0'), end
 
 
@@ -407,7 +397,7 @@ def test_a_stage_that_is_killed_and_comes_back_joins_by_a_ramp(rig):
     rig.send(shifted(BLOCKS[K:], tick))
     rig.settle()
     rig.warned('identifier', 'samples of displacement are missing')
-    end = identified(g)
+    end = g.finish('identifier/identify')
     assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
     assert len(rig.models) == models
 
@@ -416,7 +406,7 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     g = rig.g
     rig.send(BLOCKS)
     rig.settle()
-    assert identified(g)['state'] == 'done'
+    assert g.finish('identifier/identify')['state'] == 'done'
     rig.rest()
     rig.send(BLOCKS[:K])
     g.handle('model').kill()

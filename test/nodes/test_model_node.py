@@ -296,20 +296,6 @@ def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
     np.testing.assert_array_equal(y, whole[1000:])
 
 
-@pytest.mark.parametrize(
-    ('name', 'value', 'reason'),
-    [
-        ('warn_ratio', 0.5, 'warn_ratio'),
-        ('window', float('nan'), 'window'),
-        ('preview_rate', 10.0, 'read'),
-        ('model', '/nowhere.yaml', 'no such file'),
-    ],
-)
-def test_bad_parameters_are_refused(fast, name, value, reason):
-    ok, said = fast.set('model', name, value)
-    assert not ok and reason in said
-
-
 def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     file, other = tmp_path / 'one.yaml', tmp_path / 'other.yaml'
     file.write_text(paper())

@@ -63,24 +63,6 @@ def same(got: list[Samples], want: list[Samples]) -> bool:
     )
 
 
-def wait_for(graph: Graph, state: str, name: str = 'player', since: int = 0) -> dict[str, str]:
-    """Wait for a state that comes after so many others, and return the status then."""
-
-    def found() -> list[dict[str, str]]:
-        return [s for s in graph.statuses(name)[since:] if s['state'] == state]
-
-    graph.wait(found, state)
-    return found()[-1]
-
-
-def replay(graph: Graph, name: str) -> dict[str, str]:
-    """Replay a bag to its end, and return the status then."""
-    since = len(graph.statuses(name))
-    ok, message = graph.call(f'{name}/start')
-    assert ok, message
-    return {**wait_for(graph, 'done', name, since), 'answer': message}
-
-
 @pytest.fixture(scope='module')
 def lab(tmp_path_factory):
     """Return a graph with players in namespaces of their own."""
@@ -108,8 +90,7 @@ def test_replay(lab, tmp_path):
     def all_of_it(messages: str) -> tuple[np.ndarray, float]:
         """Replay it, and return when each block of voltage came, and what the clock slipped."""
         first = len(voltage)
-        status = replay(lab, 'b/player')
-        assert status['answer'].startswith('replaying ')
+        status = lab.finish('b/player/start')
         assert (status['messages'], status['progress']) == (messages, '100')
         for blocks in (voltage, displacement):
             lab.wait(lambda b=blocks: len(b) >= first + 200, 'all blocks')
@@ -187,14 +168,14 @@ def test_refusals_and_waiting(lab, tmp_path):
     assert lab.set('c/player', 'topics', ['voltage', 'displacement'])[0]
     # nobody listens
     assert lab.call('c/player/start')[0]
-    assert '/c/voltage (0 of 1)' in wait_for(lab, 'failed', 'c/player')['message']
+    assert '/c/voltage (0 of 1)' in lab.until('c/player', 'failed')['message']
     # somebody comes while it waits
     assert lab.set('c/player', 'wait_limit', 60.0)[0]
     since = len(lab.statuses('c/player'))
     assert lab.call('c/player/start')[0]
-    wait_for(lab, 'waiting', 'c/player', since)
+    lab.until('c/player', 'waiting', since=since)
     voltage, displacement = lab.collect('/c/voltage'), lab.collect('/c/displacement')
-    wait_for(lab, 'done', 'c/player', since)
+    lab.until('c/player', 'done', since=since)
     lab.wait(lambda: len(voltage) >= 20 and len(displacement) >= 20, 'all blocks')
     assert len(voltage) == len(displacement) == 20
 
@@ -202,12 +183,11 @@ def test_refusals_and_waiting(lab, tmp_path):
 def test_record_and_replay(lab, tmp_path):
     bag(tmp_path / 'bag', 100)
     first, second = lab.collect('/d/voltage'), lab.collect('/d/displacement')
-    wait_for(lab, 'recording', 'd/recorder')
+    lab.until('d/recorder', 'recording')
     assert lab.set('d/player', 'bag', str(tmp_path / 'bag'))[0]
-    replay(lab, 'd/player')
+    assert lab.finish('d/player/start')['state'] == 'done'
     lab.wait(lambda: lab.status('d/recorder')['messages'] == '200', 'all in the bag')
-    assert lab.call('d/recorder/stop')[0]
-    wait_for(lab, 'done', 'd/recorder')
+    assert lab.finish('d/recorder/stop')['state'] == 'done'
     lab.wait(lambda: len(first) >= 100 and len(second) >= 100, 'all blocks')
     assert lab.set('d/player', 'subscribers', 1)[0]
     assert lab.set('d/player', 'bag', lab.status('d/recorder')['path'])[0]

@@ -81,12 +81,9 @@ class Source:
             k += 1
 
 
-def start(graph: Graph, folder: Path, name: str = 'recorder', **params) -> str:
-    """Call start, wait until it records, and return the path."""
-    ok, message = graph.call(f'{name}/start')
-    assert ok, message
-    graph.wait(lambda: graph.status(name)['state'] == 'recording', 'recording')
-    return graph.status(name)['path']
+def start(graph: Graph, name: str = 'recorder') -> str:
+    """Start a recording, and return its path."""
+    return graph.finish(f'{name}/start', 'recording')['path']
 
 
 def contents(path: Path | str) -> dict[str, list[bytes]]:
@@ -108,7 +105,7 @@ def test_record_stop_and_refusals(tmp_path):
         model.publish(String(data='the first'))
         g.start('recorder', {'output': str(tmp_path / 'bag'), 'sample_rate': RATE}, 'a')
         assert g.call('a/recorder/stop') == (False, 'not recording; call start first')
-        path = start(g, tmp_path, 'a/recorder')
+        path = start(g, 'a/recorder')
         assert path == str(tmp_path / 'bag')
         ok, message = g.call('a/recorder/start')
         assert not ok and 'recording already' in message
@@ -132,9 +129,8 @@ def test_record_stop_and_refusals(tmp_path):
         assert int(status['messages']) == 2 * len(source.sent) + 2 >= seen
         assert int(status['bytes']) == (tmp_path / 'bag' / 'bag.mcap').stat().st_size
         # a second one beside it
-        assert start(g, tmp_path, 'a/recorder') == str(tmp_path / 'bag_1')
-        assert g.call('a/recorder/stop')[0]
-        g.wait(lambda: g.status('a/recorder')['state'] == 'done', 'closed bag')
+        assert start(g, 'a/recorder') == str(tmp_path / 'bag_1')
+        assert g.finish('a/recorder/stop')['state'] == 'done'
         # a place that cannot be
         (tmp_path / 'file').write_text('')
         for place in (tmp_path / 'file' / 'bag', tmp_path / ('x' * 300)):
@@ -188,12 +184,11 @@ def test_a_long_recording_is_cut_into_parts_and_loses_nothing(tmp_path):
     with Graph() as g:
         source = Source(g)
         g.start('recorder', {'output': str(tmp_path / 'bag'), 'max_bag_size': 500_000})
-        assert start(g, tmp_path) == str(tmp_path / 'bag')
+        assert start(g) == str(tmp_path / 'bag')
         with source:
             g.wait(lambda: (tmp_path / 'bag_3').exists(), 'the fourth part')
         source.has_arrived()
-        assert g.call('recorder/stop')[0]
-        g.wait(lambda: g.status('recorder')['state'] == 'done', 'closed bag')
+        assert g.finish('recorder/stop')['state'] == 'done'
         status = g.status('recorder')
     parts = sorted(tmp_path.glob('bag*'), key=lambda p: (len(p.name), p.name))
     assert int(status['messages']) == 2 * len(source.sent) and status['lost'] == '0'
@@ -214,15 +209,14 @@ def test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said(tmp_path):
         with source:
             for flush in (0.5, 0.05):
                 assert g.set('recorder', 'flush', flush) == (True, '')
-                start(g, tmp_path)
+                start(g)
                 seen, sent, begin = len(g.statuses('recorder')), len(source.sent), time.monotonic()
                 g.wait(lambda sent=sent: len(source.sent) > sent + 400, '2 s of blocks')
                 sizes = {s['bytes'] for s in g.statuses('recorder')[seen:]}
                 # a second, however long it was looked at
                 flushes[flush] = len(sizes) / (time.monotonic() - begin)
-                assert g.call('recorder/stop')[0]
-                g.wait(lambda: g.status('recorder')['state'] == 'done', 'the bag')
-            path = start(g, tmp_path)
+                assert g.finish('recorder/stop')['state'] == 'done'
+            path = start(g)
             shutil.rmtree(path)
             assert g.call('recorder/stop')[0]
         assert flushes[0.5] <= 4.0 < flushes[0.05], flushes
@@ -249,7 +243,7 @@ def killed(tmp_path, storage, capsys):
     with Graph() as g:
         source = Source(g)
         recorder = g.start('recorder', {'output': str(tmp_path / 'bag'), 'storage': storage})
-        start(g, tmp_path)
+        start(g)
         with source:
             g.wait(lambda: len(source.sent) > 500, '2.5 s of blocks')
             before = len(source.sent)
@@ -277,7 +271,7 @@ def test_other_topics_types_and_qos(tmp_path):
         effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         voltage = g.node.create_publisher(Float64MultiArray, '/voltage', effort)
         g.start('recorder', params, remaps={'drive': '/lab/drive'})
-        start(g, tmp_path)
+        start(g)
         drive = g.node.create_publisher(Float64MultiArray, '/lab/drive', STREAM)
         pose = g.node.create_publisher(JointState, '/else/pose', 10)
         for publisher in (voltage, drive, pose):
@@ -292,8 +286,7 @@ def test_other_topics_types_and_qos(tmp_path):
         g.wait(both, 'messages')
         for publisher in (drive, pose):
             assert publisher.wait_for_all_acked(Duration(seconds=60.0))
-        assert g.call('recorder/stop')[0]
-        g.wait(lambda: g.status('recorder')['state'] == 'done', 'closed bag')
+        assert g.finish('recorder/stop')['state'] == 'done'
     got = contents(tmp_path / 'bag')
     assert set(got) == {'/voltage', '/lab/drive', '/else/pose'}
     assert len(got['/lab/drive']) == len(got['/else/pose']) == 1

@@ -7,7 +7,7 @@ import re
 import signal
 
 from course import column, FS, HIGH, model_of, PROGRAM, QUICK, simulated
-from graph import Graph
+from graph import ENDS, Graph
 import numpy as np
 from piezo_ident.record.bags.write import write_bag
 import pytest
@@ -51,14 +51,9 @@ def run(g: Graph, program: str) -> int:
 
 def ended(g: Graph, seen: int, state: str) -> str:
     """Wait for the end of a run, and return its message."""
-
-    def over() -> list[dict[str, str]]:
-        new = g.statuses('identifier')[seen:]
-        return [s for s in new if s['state'] in ('done', 'failed', 'cancelled')]
-
-    g.wait(over, 'the end of the run')
-    assert over()[0]['state'] == state, over()
-    return over()[0]['message']
+    end = g.until('identifier', *ENDS, since=seen)
+    assert end['state'] == state, end
+    return end['message']
 
 
 def at_nine_volts(g: Graph) -> None:
@@ -207,20 +202,10 @@ def test_a_bag_that_ends_early(graph, tmp_path):
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     assert graph.set('replay/player', 'bag', str(tmp_path / 'bag'))[0]
     assert graph.set('replay/player', 'rate', 4.0)[0]
-    seen = len(graph.statuses('replay/player'))
-    ok, reason = graph.call('replay/player/start')
-    assert ok, reason
-    ends = ('done', 'failed')
-    graph.wait(
-        lambda: any(s['state'] in ends for s in graph.statuses('replay/player')[seen:]),
-        'the end of the bag',
-    )
-    end = graph.status('replay/player')
+    end = graph.finish('replay/player/start')
     assert (end['state'], end['level']) == ('done', '1')
     assert 'the bag ends early: truncated_bag' in end['message']
-    assert graph.call('replay/identifier/identify')[0]
-    graph.wait(lambda: graph.status('replay/identifier')['state'] in ends, 'the end of the work')
-    end = graph.status('replay/identifier')
+    end = graph.finish('replay/identifier/identify')
     assert (end['state'], end['level']) == ('done', '1'), end
     graph.wait(lambda: graph.texts('replay/model'), 'the model')
     said = ' '.join(model_of(graph.texts('replay/model')[-1]).identification['warnings'])

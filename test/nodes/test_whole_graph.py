@@ -41,15 +41,6 @@ def whole(tmp_path_factory):
         yield g
 
 
-def ended(g, node, call, states=('done', 'failed')):
-    """Call a service, wait for the end of what it began, and return the status then."""
-    seen = len(g.statuses(node))
-    ok, reason = g.call(call)
-    assert ok, reason
-    g.wait(lambda: any(s['state'] in states for s in g.statuses(node)[seen:]), f'end of {call}')
-    return next(s for s in g.statuses(node)[seen:] if s['state'] in states)
-
-
 def publishers(g, topic):
     """Return who publishes a topic, as the middleware tells."""
     found = g.node.get_publishers_info_by_topic(topic)
@@ -63,17 +54,17 @@ def subscribers(g, topic):
 
 
 def test_a_run_through_the_whole_graph(whole):
-    assert ended(whole, 'recorder', 'recorder/start', ('recording',))['state'] == 'recording'
+    assert whole.finish('recorder/start', 'recording')['state'] == 'recording'
     # the recorder is the fourth
     assert whole.set('excitation', 'subscribers', 4)[0]
-    end = ended(whole, 'identifier', 'identifier/run')
+    end = whole.finish('identifier/run')
     assert (end['state'], end['level'], end['progress']) == ('done', '0', '100'), end
     whole.wait(lambda: whole.texts('model') and whole.texts('report'), 'model and report')
     report = json.loads(whole.texts('report')[-1])
     assert report['data_faults'] == [] and report['delay']['samples'] == 3
     assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
     whole.wait(lambda: whole.status('model')['message'] == 'with topic model', 'the model')
-    assert ended(whole, 'recorder', 'recorder/stop')['state'] == 'done'
+    assert whole.finish('recorder/stop')['state'] == 'done'
     assert whole.set('excitation', 'subscribers', 3)[0]
     record = pi.read(whole.output / 'bag')
     assert record.n == round(3.37 * 20_000) and record.faults == ()
@@ -87,8 +78,8 @@ def test_live_replayed_and_offline_models_are_equal(whole):
         whole.start('player', {'bag': str(bag), 'rate': 4.0}, 'replay', wait=False),
         whole.start('identifier', QUICK, 'replay', wait=False),
     ]
-    assert ended(whole, 'replay/player', 'replay/player/start')['state'] == 'done'
-    assert ended(whole, 'replay/identifier', 'replay/identifier/identify')['state'] == 'done'
+    assert whole.finish('replay/player/start')['state'] == 'done'
+    assert whole.finish('replay/identifier/identify')['state'] == 'done'
     whole.wait(lambda: replayed, 'the replayed model')
     models.append(replayed[-1])
     for handle in players:
@@ -126,7 +117,7 @@ def test_topics_are_those_of_the_table(whole):
             assert found, name
     # some values are there only while a stream comes
     whole.wait(lambda: 'head_room' in whole.diagnostics('model'), 'the head-room')
-    assert ended(whole, 'excitation', 'excitation/stop', ('stopped',))['state'] == 'stopped'
+    assert whole.finish('excitation/stop', 'stopped')['state'] == 'stopped'
     # a replay on its way
     assert whole.call('player/start')[0]
     for t in of_one:
@@ -138,7 +129,7 @@ def test_topics_are_those_of_the_table(whole):
             ),
             f'the player on {t.name}',
         )
-    assert ended(whole, 'player', 'player/stop', ('stopped',))['state'] == 'stopped'
+    assert whole.finish('player/stop', 'stopped')['state'] == 'stopped'
 
 
 @pytest.mark.parametrize('node', NODES)
