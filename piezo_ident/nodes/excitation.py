@@ -34,7 +34,7 @@ from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.pacing import Schedule, SLIP
-from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import cut_blocks, Samples
@@ -102,7 +102,7 @@ class ExcitationNode(LabNode):
         self._playing: Playing | None = None
         self._thread: threading.Thread | None = None
         self._second = ''
-        self._rate = (time.monotonic(), 0)
+        self._rate = Rate()
         super().__init__(**kwargs)
         self._build(self.values['program'])
         self._guard_settings()
@@ -145,14 +145,8 @@ class ExcitationNode(LabNode):
 
     def _guard_settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
         v = values or self.values
-        return GuardSettings(
-            v['voltage_low'],
-            v['voltage_high'],
-            math.inf,
-            v['ramp_slew'],
-            v['rest'],
-            v['sample_rate'],
-        )
+        # a program keeps to its own slew
+        return guard_settings({**v, 'slew': math.inf}, v['sample_rate'])
 
     # services
 
@@ -170,7 +164,7 @@ class ExcitationNode(LabNode):
             Float64MultiArray, 'voltage', self._on_other, STREAM
         )
         self._playing = playing
-        self._rate = (time.monotonic(), 0)
+        self._rate = Rate()
         self.report_status('waiting', 0.0, 'waiting for subscribers')
         self._thread = threading.Thread(
             target=self._run, args=(playing,), name='playing', daemon=True
@@ -334,11 +328,9 @@ class ExcitationNode(LabNode):
         values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
         if playing is None:
             return (WARN if foreign else OK), self._second or 'nothing played yet', values
-        now = time.monotonic()
-        (then, before), self._rate = self._rate, (now, playing.tick)
         clock = playing.clock
         values |= {
-            'rate': f'{(playing.tick - before) / max(now - then, 1e-9):.1f}',
+            'rate': f'{self._rate.of(playing.tick):.1f}',
             'samples': playing.tick,
             'segment': playing.segment,
         }

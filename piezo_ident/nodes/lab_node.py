@@ -16,6 +16,7 @@ from pathlib import Path
 import signal
 import sys
 import threading
+import time
 import traceback
 from typing import Any
 
@@ -24,6 +25,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -42,13 +44,35 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-__all__ = ['LabNode', 'run']
+__all__ = ['LabNode', 'Rate', 'guard_settings', 'run']
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
 SWITCH = 2e-4
 #: callbacks in a row that fail before a node gives up
 MOST_FAILURES = 1000
+
+
+def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettings:
+    """Return the settings of a guard from the parameters of a node that drives."""
+    v = values
+    return GuardSettings(
+        v['voltage_low'], v['voltage_high'], v['slew'], v['ramp_slew'], v['rest'], sample_rate
+    )
+
+
+class Rate:
+    """How fast a count grows, from one look to the next."""
+
+    def __init__(self) -> None:
+        self._at, self._count = time.monotonic(), 0.0
+
+    def of(self, count: float) -> float:
+        """Return the growth a second since the last look; 0 where it started over."""
+        now = time.monotonic()
+        rate = max(0.0, count - self._count) / max(now - self._at, 1e-3)
+        self._at, self._count = now, count
+        return rate
 
 
 class LabNode(Node):

@@ -64,12 +64,7 @@ EXCITATION = (
     Declaration('program', 'identification', 'program to play: a name, a path, or YAML text'),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
-        'rate_factor',
-        1.0,
-        'how many times faster than real time blocks are sent',
-        '1',
-        0.1,
-        4.0,
+        'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0
     ),
     Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
     Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),

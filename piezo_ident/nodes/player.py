@@ -23,7 +23,7 @@ from typing import Any
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Schedule, SLIP
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
@@ -58,7 +58,6 @@ class Replay:
     progress: float = 0.0
     slipped: float = 0.0
     names: str = ''
-    thread: threading.Thread | None = None
 
 
 class PlayerNode(LabNode):
@@ -68,8 +67,9 @@ class PlayerNode(LabNode):
 
     def __init__(self, **kwargs: Any) -> None:
         self._replay: Replay | None = None
+        self._thread: threading.Thread | None = None
         self._senders: dict[tuple[str, str, bool, bool, int], Any] = {}
-        self._last_count = (time.monotonic(), 0)
+        self._rate = Rate()
         super().__init__(**kwargs)
         self.offer('start', self.start)
         self.offer('stop', self.stop)
@@ -84,27 +84,26 @@ class PlayerNode(LabNode):
 
     def start(self) -> str:
         """
-        Replay the bag from its beginning, also when it is being replayed; see ``~/status``.
+        Replay the bag from its beginning; see ``~/status``.
 
         Raises
         ------
         PiezoIdentError
-            When no bag is named, or there is none.
+            When no bag is named, there is none, or one is being replayed.
         """
         bag = self.values['bag']
         if not bag:
             raise PiezoIdentError('no bag is named; set the parameter bag')
         if not Path(bag).exists():
             raise PiezoIdentError(f'{bag} does not exist; set the parameter bag')
-        before, replay = self._replay, Replay(bag, tuple(self.values['topics']))
-        if before is not None:
-            before.stop.set()
+        if self._is_replaying():
+            raise PiezoIdentError('replaying already; call stop, and wait until it has ended')
+        self._replay = Replay(bag, tuple(self.values['topics']))
         # a daemon: while a large bag is looked through nothing is lost by an end
-        replay.thread = threading.Thread(
-            target=self._work, args=(replay, before), name='replay', daemon=True
+        self._thread = threading.Thread(
+            target=self._work, args=(self._replay,), name='replay', daemon=True
         )
-        self._replay = replay
-        replay.thread.start()
+        self._thread.start()
         return f'replaying {bag}; see ~/status'
 
     def stop(self) -> str:
@@ -116,26 +115,24 @@ class PlayerNode(LabNode):
         PiezoIdentError
             When there is none.
         """
-        replay = self._replay
-        if replay is None or replay.thread is None or not replay.thread.is_alive():
+        if self._replay is None or not self._is_replaying():
             raise PiezoIdentError('not replaying; call start first')
-        replay.stop.set()
+        self._replay.stop.set()
         return 'stopping'
+
+    def _is_replaying(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
 
     def close(self) -> None:
         """End the replay before the node ends."""
-        replay = self._replay
-        if replay is not None and replay.thread is not None:
-            replay.stop.set()
-            replay.thread.join(PATIENCE)
+        if self._replay is not None and self._thread is not None:
+            self._replay.stop.set()
+            self._thread.join(PATIENCE)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return how fast it goes."""
-        now, replay = time.monotonic(), self._replay
-        messages = replay.messages if replay else 0
-        then, before = self._last_count
-        self._last_count = (now, messages)
-        rate = max(0, messages - before) / max(now - then, 1e-3)
+        replay = self._replay
+        rate = self._rate.of(replay.messages if replay else 0)
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
         if replay is not None and replay.failure:
             return ERROR, replay.failure, values
@@ -145,9 +142,7 @@ class PlayerNode(LabNode):
 
     # the replay, in a thread of its own
 
-    def _work(self, replay: Replay, before: Replay | None) -> None:
-        if before is not None and before.thread is not None:
-            before.thread.join()
+    def _work(self, replay: Replay) -> None:
         prepared = False
         try:
             with opened_bag(replay.bag) as bag:

@@ -25,7 +25,7 @@ from typing import Any
 
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
 
@@ -65,7 +65,7 @@ class RecorderNode(LabNode):
         self._inputs: RawSubscriptions | None = None
         self._recording: Recording | None = None
         self._thread: threading.Thread | None = None
-        self._last_count = (time.monotonic(), 0)
+        self._rate = Rate()
         super().__init__(**kwargs)
         self.offer('start', self.start)
         self.offer('stop', self.stop)
@@ -129,11 +129,8 @@ class RecorderNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return what the recording takes in."""
-        now, recording = time.monotonic(), self._recording
-        messages = recording.messages if recording else 0
-        then, before = self._last_count
-        self._last_count = (now, messages)
-        rate = max(0, messages - before) / max(now - then, 1e-3)
+        recording = self._recording
+        rate = self._rate.of(recording.messages if recording else 0)
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
         if recording is not None and recording.failure:
             return ERROR, recording.failure, values

@@ -55,7 +55,7 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
@@ -106,8 +106,7 @@ class StageNode(LabNode):
         self._state = 'idle'
         self._last = self._ramp_begin = time.monotonic()
         self._ramped = 0
-        self._rate = (self._last, 0, 0.0)
-        self._busy = 0.0
+        self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
         self._displacement = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
         self._applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
         self._input = self.create_subscription(
@@ -126,15 +125,7 @@ class StageNode(LabNode):
     # parameters
 
     def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
-        v = values or self.values
-        return GuardSettings(
-            v['voltage_low'],
-            v['voltage_high'],
-            v['slew'],
-            v['ramp_slew'],
-            v['rest'],
-            self.sample_rate,
-        )
+        return guard_settings(values or self.values, self.sample_rate)
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse limits that are crossed, and a rest outside of them."""
@@ -270,15 +261,13 @@ class StageNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost, altered and refused, and head-room."""
-        now, samples = time.monotonic(), self._counts['samples']
-        (then, before, busy), self._rate = self._rate, (now, samples, self._busy)
-        count = samples - before
-        worked, span = self._busy - busy, count / self.sample_rate
+        samples = self._counts['samples']
+        rate, worked = self._rate.of(samples), self._work_rate.of(self._busy)
         faults = self._recent_faults()
         refused = ('malformed', 'repeat', 'late', 'second')
         altered = ('not_finite', 'outside_limits', 'too_fast', 'joining')
         values: dict[str, object] = {
-            'rate': f'{count / max(now - then, 1e-9):.1f}',
+            'rate': f'{rate:.1f}',
             'samples': samples,
             'blocks': self._counts['blocks'],
             'lost': self._counts['lost'],
@@ -291,8 +280,8 @@ class StageNode(LabNode):
             'publishers': self._input.get_publisher_count(),
             'applied': f'{self._guard.applied:.6f}',
         }
-        if span:
-            values['head_room'] = f'{max(0.0, 1.0 - worked / span):.3f}'
+        if rate:
+            values['head_room'] = f'{max(0.0, 1.0 - worked * self.sample_rate / rate):.3f}'
         return (WARN if faults else OK), faults or self._state, values
 
     def close(self) -> None:

@@ -20,21 +20,14 @@ from typing import Any
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import ArrivalClock
 from piezo_ident.nodes.wire import LATCHED, LATCHED_TOPICS, SAMPLE_TOPICS, STREAM
-from piezo_ident.record.bags.write import knows_type
+from piezo_ident.record.bags.write import knows_type, SAMPLE_QOS
 from piezo_ident.record.stream import LossCount
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from std_msgs.msg import Float64MultiArray
 
 __all__ = [
@@ -344,20 +337,9 @@ def _ignore(_: object) -> None:
 def _offer(profile: QoSProfile) -> Qos:
     """Return a profile as it stands in a bag."""
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    # discovery carries no history, so it says what the graph agrees on
-    depth = LATCHED.depth if latched else STREAM.depth
-    times = (profile.deadline, profile.lifespan, profile.liveliness_lease_duration)
-    deadline, lifespan, lease = (
-        QosTime(*divmod(min(t.nanoseconds, 2**63 - 1), 1_000_000_000)) for t in times
-    )
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=depth,
+    return SAMPLE_QOS._replace(
+        # discovery carries no history, so it says what the graph agrees on
+        depth=LATCHED.depth if latched else STREAM.depth,
         reliability=QosReliability(int(profile.reliability)),
         durability=QosDurability(int(profile.durability)),
-        deadline=deadline,
-        lifespan=lifespan,
-        liveliness=QosLiveliness(int(profile.liveliness)),
-        liveliness_lease_duration=lease,
-        avoid_ros_namespace_conventions=bool(profile.avoid_ros_namespace_conventions),
     )

@@ -30,7 +30,7 @@ from piezo_ident.nodes.identifier.jobs import (
     warm_up,
 )
 from piezo_ident.nodes.identifier.worker import Worker
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message, LATCHED
 from piezo_ident.record.join import APPLIED
@@ -73,7 +73,7 @@ class IdentifierNode(LabNode):
             # at the start nothing waits, and a bad file ends the node
             load(path)
             self._session.take(path, {})
-        self._counted, self._counted_at = 0, time.monotonic()
+        self._rate = Rate()
         self._passed: dict[str, int] = {}
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
@@ -385,13 +385,10 @@ class IdentifierNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""
-        now, passed = time.monotonic(), self._passed.get('voltage', 0)
-        rate = (passed - self._counted) / max(now - self._counted_at, 1e-3)
-        self._counted, self._counted_at = passed, now
-        capture = self._capture
+        passed, capture = self._passed.get('voltage', 0), self._capture
         values: dict[str, object] = {
             'state': self._state,
-            'rate': f'{rate:.0f}',
+            'rate': f'{self._rate.of(passed):.0f}',
             'samples': min(passed, self._passed.get('displacement', 0)),
             'captured': f'{capture.seconds:.3f}',
             'topics': self._kept(),
