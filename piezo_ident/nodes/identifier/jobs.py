@@ -97,6 +97,14 @@ class IdentificationOutcome:
     identification: Identification | None = None
     model: str = ''
 
+    @property
+    def sentence(self) -> str:
+        """The message, with the number of warnings."""
+        if not self.warnings:
+            return self.message
+        plural = 's' * (self.warnings > 1)
+        return f'{self.message.rstrip(".")}; {self.warnings} warning{plural} in the report'
+
 
 def settings_of(values: dict[str, object]) -> Settings:
     """

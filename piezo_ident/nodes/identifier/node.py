@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 import functools
 from pathlib import Path
@@ -31,6 +31,7 @@ from piezo_ident.nodes.identifier.jobs import (
 )
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
+from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message, LATCHED
 from piezo_ident.record.join import APPLIED
@@ -74,7 +75,7 @@ class IdentifierNode(LabNode):
             load(path)
             self._session.take(path, {})
         self._rate = Rate()
-        self._passed: dict[str, int] = {}
+        self._passed: Counter[str] = Counter()
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
@@ -87,14 +88,11 @@ class IdentifierNode(LabNode):
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
-        self.offer('run', self._run)
         self.offer('identify', functools.partial(self._identify, 'all'))
         for step in ('delay', 'dynamics', 'hysteresis'):
             self.offer(f'identify_{step}', functools.partial(self._identify, step))
-        self.offer('diagnose', self._diagnose)
-        self.offer('cancel', self._cancel)
-        self.offer('clear', self._clear)
-        self.offer('save', self._save)
+        for name in ('run', 'diagnose', 'cancel', 'clear', 'save'):
+            self.offer(name, getattr(self, f'_{name}'))
 
     def offer(self, name: str, handler: Callable[[], str]) -> None:
         """Offer a service; samples sent before the call count as captured."""
@@ -131,7 +129,7 @@ class IdentifierNode(LabNode):
             return
         arrival = info.get('received_timestamp') or time.time_ns()
         self._capture.add(key or samples.quantity, samples, arrival)
-        self._passed[topic] = self._passed.get(topic, 0) + samples.t.size
+        self._passed[topic] += samples.t.size
 
     def _streams(self) -> Streams:
         c = self._capture
@@ -140,9 +138,9 @@ class IdentifierNode(LabNode):
             # the stage sends both, one after the other: a run ends with the later one
             answered = min(answered, c.last_time(APPLIED))
         return Streams(
-            self._passed.get('voltage', 0),
+            self._passed['voltage'],
             c.last_time('voltage'),
-            self._passed.get('displacement', 0),
+            self._passed['displacement'],
             answered,
         )
 
@@ -167,7 +165,8 @@ class IdentifierNode(LabNode):
             self._report_capture('exciting', self._excitation.progress, message)
         elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
             self._reported_at = time.monotonic()
-            self._report_capture('idle', 0.0, self._listening())
+            kept = f'{self._kept()} captured' if self._capture.keys else 'ready'
+            self._report_capture('idle', 0.0, kept)
 
     def _report_capture(self, state: str, progress: float, message: str) -> None:
         problems = self._capture.problems
@@ -177,9 +176,6 @@ class IdentifierNode(LabNode):
     def _kept(self) -> str:
         keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
         return ', '.join(f'{self._capture.seconds_of(key):.3f} s of {key}' for key in keys)
-
-    def _listening(self) -> str:
-        return f'{self._kept()} captured' if self._capture.keys else 'ready'
 
     def _is_busy(self) -> bool:
         # parameters are declared before the rest exists
@@ -192,10 +188,8 @@ class IdentifierNode(LabNode):
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse values that the settings would refuse later."""
         if name == 'thresholds':
-            defaults = {'solver': 'least_squares', 'max_order': 15, 'seed': 0}
-            swarm = {'swarm_size': 40, 'swarm_iterations': 1000}
             try:
-                settings_of({**defaults, **swarm, 'thresholds': value})
+                settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
             except PiezoIdentError as error:
                 return str(error)
         if name.endswith('program') and not value.strip():
@@ -221,25 +215,18 @@ class IdentifierNode(LabNode):
     def _run(self) -> str:
         self._refuse_when_busy()
         settings_of(self.values)
-        self._task = 'excitation'
-        self._excitation.start(
-            self.values['program'],
-            self.values['excitation_limit'],
-            self._run_ended,
-            # older data may come from another stage, or another day
-            self._forget,
-        )
-        self._set_state('exciting', 0.0, 'requesting the program from the excitation')
+        # older data may come from another stage, or another day
+        self.excite(self.values['program'], 'excitation', self._run_ended, self._forget)
         return 'the program is requested; see ~/status'
 
     def _run_ended(self, reason: str | None) -> None:
         if reason is not None:
-            self._set_state('failed', 0.0, reason, ERROR)
+            self.fail(reason)
             return
         try:
             self._identify('all')
         except PiezoIdentError as error:
-            self._set_state('failed', 0.0, str(error), ERROR)
+            self.fail(str(error))
 
     def _identify(self, which: str) -> str:
         self._refuse_when_busy()
@@ -306,10 +293,16 @@ class IdentifierNode(LabNode):
         """Return whether an excitation and a stage are there."""
         return self._excitation.is_possible
 
-    def excite(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
+    def excite(
+        self,
+        program: str,
+        why: str,
+        ended: Callable[[str | None], None],
+        begin: Callable[[], None] | None = None,
+    ) -> None:
         """Play a program of the excitation."""
         self._task = why
-        self._excitation.start(program, self.values['excitation_limit'], ended)
+        self._excitation.start(program, self.values['excitation_limit'], ended, begin)
         self._set_state('exciting', 0.0, why)
 
     def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
@@ -356,12 +349,8 @@ class IdentifierNode(LabNode):
             self._session.drop()
         if isinstance(error, Cancelled):
             self._set_state('cancelled', 0.0, f'{self._task} was cancelled; nothing was changed')
-        elif isinstance(error, PiezoIdentError):
-            self._set_state('failed', 0.0, ' '.join(str(error).split()), ERROR)
         elif error is not None:
-            reason = f'{self._task}: {type(error).__name__}: {error}'
-            self.get_logger().error(reason)
-            self._set_state('failed', 0.0, ' '.join(reason.split()), ERROR)
+            self.fail(' '.join(self.reason(error).split()))
         elif isinstance(result, IdentificationOutcome):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
@@ -369,13 +358,8 @@ class IdentifierNode(LabNode):
                 self._identified = result.identification
                 self._session.take(result.identification.model, self._using)
                 self._publish_model(result.model)
-            count = result.warnings
-            message = result.message
-            if count:
-                message = (
-                    f'{message.rstrip(".")}; {count} warning{"s" * (count > 1)} in the report'
-                )
-            self._set_state('done', 100.0, message, WARN if count else OK)
+            level = WARN if result.warnings else OK
+            self._set_state('done', 100.0, result.sentence, level)
         elif isinstance(result, DiagnosisOutcome):
             self._session.take_outcome(result)
         else:
@@ -385,11 +369,11 @@ class IdentifierNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""
-        passed, capture = self._passed.get('voltage', 0), self._capture
+        passed, capture = self._passed['voltage'], self._capture
         values: dict[str, object] = {
             'state': self._state,
             'rate': f'{self._rate.of(passed):.0f}',
-            'samples': min(passed, self._passed.get('displacement', 0)),
+            'samples': min(passed, self._passed['displacement']),
             'captured': f'{capture.seconds:.3f}',
             'topics': self._kept(),
             'segments': ' '.join(capture.segments),
@@ -397,9 +381,8 @@ class IdentifierNode(LabNode):
             'lost': sum(capture.lost.values()),
         }
         problems = capture.problems
-        if problems:
-            return WARN, '; '.join(problems), values
-        return OK, self._task if self._worker.is_busy else 'listening', values
+        message = self._task if self._worker.is_busy else 'listening'
+        return (WARN if problems else OK), '; '.join(problems) or message, values
 
     def close(self) -> None:
         """Cancel the work and have the excitation ramp to rest."""

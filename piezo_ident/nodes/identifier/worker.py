@@ -49,21 +49,15 @@ class Worker:
         ended: Callable[[Any, Exception | None], None],
     ) -> None:
         """
-        Start a job.
+        Start a job; see `piezo_ident.common.process.WorkerProcess.run`.
 
         Parameters
         ----------
         job : callable
-            Goes to the process; see `piezo_ident.common.process.WorkerProcess.run`.
         progress : callable
             Called with the step and its share done, some times a second, in another thread.
         ended : callable
             Called with the result and None, or None and the error, in another thread.
-
-        Raises
-        ------
-        PiezoIdentError
-            When another job runs.
         """
         if self.is_busy:
             raise PiezoIdentError('another job runs; wait for its end or cancel it')
