@@ -24,6 +24,7 @@ from piezo_ident.diagnosis.cross_validation import (
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.effects.trials import number_of
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
@@ -69,8 +70,9 @@ class FreeParameter:
         """Return its value."""
         if self.effect is None:
             return state.retuning[self.index or 0]
-        value = state.effects[self.effect].values[self.record or 0][self.name]
-        return float(value if self.index is None else value[self.index])
+        return number_of(
+            state.effects[self.effect].values[self.record or 0], self.name, self.index
+        )
 
     def moved(self, state: State, delta: float) -> State:
         """Return the state after a step within the bounds; relative if logarithmic."""
@@ -117,7 +119,7 @@ def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
             per_record = effect.time_driven and p.step > 0.0
             for k in range(records) if per_record else (None,):
                 for index in range(np.size(value)) if p.vector else (None,):
-                    number = float(value if index is None else value[index])
+                    number = number_of(added.values[0], p.name, index)
                     if np.isfinite(number) and not (is_log and number <= 0.0):
                         found.append(
                             FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)

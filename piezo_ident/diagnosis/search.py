@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import means, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
+from piezo_ident.effects.trials import number_of
 
 __all__ = ['Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
 
@@ -301,22 +301,15 @@ def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
 
 def started(rows: Rows, scored: Scored) -> Added:
     """Return the effect with the amplitudes of its score, where a joint fit may start."""
-    count = len(rows.names)
-    records = range(count) if scored.effect.time_driven else [0]
-    values: list[dict[str, Any]] = [dict(scored.trial.values) for _ in range(count)]
-    known = {p.name: p for p in scored.effect.parameters}
-    c = iter(scored.coefficients)
-    for (name, index), step in zip(scored.trial.moves, scored.trial.steps, strict=True):
-        for k in records:
-            amount = float(next(c)) * step
-            for j in [k] if scored.effect.time_driven else range(count):
-                if index is None:
-                    values[j][name] = float(known[name].clip(values[j][name] + amount))
-                else:
-                    vector = np.array(values[j][name], dtype=np.float64)
-                    vector[index] = known[name].clip(vector[index] + amount)
-                    values[j][name] = vector
-    return Added(scored.effect.name, tuple(values))
+    effect, trial = scored.effect, scored.trial
+    added = Added(effect.name, (trial.values,) * len(rows.names))
+    known = {p.name: p for p in effect.parameters}
+    steps = iter(scored.coefficients)
+    for (name, index), step in zip(trial.moves, trial.steps, strict=True):
+        for k in range(len(rows.names)) if effect.time_driven else (None,):
+            value = number_of(added.values[k or 0], name, index) + float(next(steps)) * step
+            added = added.changed(k, name, index, float(known[name].clip(value)))
+    return added
 
 
 def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:

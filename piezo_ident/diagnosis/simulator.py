@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
+from piezo_ident.effects.trials import with_number
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
@@ -55,18 +56,13 @@ class Added:
 
     def changed(self, record: int | None, name: str, index: int | None, value: float) -> Added:
         """Return the effect with one number changed, in one record or in all."""
-        values = []
-        for k, old in enumerate(self.values):
-            if record not in (None, k):
-                values.append(old)
-                continue
-            if index is None:
-                values.append({**old, name: value})
-            else:
-                vector = np.array(old[name], dtype=np.float64)
-                vector[index] = value
-                values.append({**old, name: vector})
-        return Added(self.name, tuple(values))
+        return Added(
+            self.name,
+            tuple(
+                with_number(old, name, index, value) if record in (None, k) else old
+                for k, old in enumerate(self.values)
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)

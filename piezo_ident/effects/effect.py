@@ -124,16 +124,11 @@ class Effect:
 
     Attributes
     ----------
-    name : str
-        In verdicts and files.
-    slot : str
-        Its place in the chain.
+    name, slot : str
+        In verdicts and files, and its place in the chain.
     parameters : tuple of Parameter
-        Its parameters.
-    description : str
-        One line for the catalogue, with the typical size.
-    needs : str
-        The excitation that would show it.
+    description, needs : str
+        A line for the catalogue, with the typical size, and the excitation that would show it.
     time_driven : bool
         Whether it depends on time alone and not on the command: then its amplitudes differ from
         record to record.
@@ -184,14 +179,7 @@ class Effect:
 
     @classmethod
     def check(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """
-        Return the values as floats, vectors and texts, defaults filled in.
-
-        Raises
-        ------
-        ModelError
-            As the class says.
-        """
+        """Return the values as floats, vectors and texts, defaults filled in."""
         where, known = f'effect {cls.name}', {p.name: p for p in cls.parameters}
         unknown = sorted(set(values) - set(known))
         missing = sorted(k for k, p in known.items() if k not in values and p.default is None)
@@ -210,13 +198,7 @@ class Effect:
 
     @classmethod
     def agree(cls, values: Mapping[str, Value]) -> None:
-        """
-        Refuse values that contradict each other: lists must be of one length.
-
-        Raises
-        ------
-        ModelError
-        """
+        """Refuse values that contradict each other: lists must be of one length."""
         lengths = {k: x.size for k, x in values.items() if isinstance(x, np.ndarray)}
         if len(set(lengths.values())) > 1:
             each = ', '.join(f'{name} has {n}' for name, n in lengths.items())
@@ -263,11 +245,6 @@ class Effect:
 
         By default each combination of the `tries` of the parameters that are no amplitudes, with
         all amplitudes moved; no trials when such a parameter has neither `tries` nor a default.
-
-        Parameters
-        ----------
-        view : View
-            Properties of the data.
         """
         shapes = [p for p in cls.parameters if not p.is_amplitude]
         choices = [p.tries or (() if p.default is None else (p.default,)) for p in shapes]

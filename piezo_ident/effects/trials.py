@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Trial', 'View', 'ladder']
+__all__ = ['Trial', 'View', 'ladder', 'number_of', 'with_number']
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,16 +100,26 @@ class Trial:
         """Return one complete set of parameters for each column."""
         if not self.moves:
             return [dict(self.values)]
-        settings = []
-        for (name, index), step in zip(self.moves, self.steps, strict=True):
-            values = dict(self.values)
-            if index is None:
-                values[name] = values[name] + step
-            else:
-                values[name] = np.array(values[name], dtype=np.float64)
-                values[name][index] += step
-            settings.append(values)
-        return settings
+        return [
+            with_number(self.values, name, i, number_of(self.values, name, i) + step)
+            for (name, i), step in zip(self.moves, self.steps, strict=True)
+        ]
+
+
+def number_of(values: Mapping[str, Any], name: str, index: int | None) -> float:
+    """Return one number; an index is its place in a list."""
+    return float(values[name] if index is None else values[name][index])
+
+
+def with_number(
+    values: Mapping[str, Any], name: str, index: int | None, number: float
+) -> dict[str, Any]:
+    """Return values with one number replaced."""
+    if index is None:
+        return {**values, name: number}
+    vector = np.array(values[name], dtype=np.float64)
+    vector[index] = number
+    return {**values, name: vector}
 
 
 def ladder(low: float, high: float, count: int) -> list[float]:

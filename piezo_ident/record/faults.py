@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
-__all__ = ['line_error', 'misspelt', 'suspicions', 'without_faults']
+__all__ = ['line_error', 'misspelt', 'quantum_of', 'suspicions', 'without_faults']
 
 Vector = NDArray[np.float64]
 Runs = list[tuple[int, int]]
@@ -31,6 +31,8 @@ MOVED = 0.01
 LEAST, FAR, AROUND = 2e-3, 8.0, 8
 #: readings of one value in a row that may be a sensor that hangs
 HELD = 10
+#: samples in which the step of a converter is looked for, in rows of so many
+MOST, MOST_ROW = 2**17, 2**10
 #: where more of a record than this looks wrong, it is the way of the data
 MAX_FAULTY = 0.05
 
@@ -264,3 +266,46 @@ def _constant(x: Vector, least: int = STUCK) -> Runs:
     edges = np.flatnonzero(same[1:] != same[:-1]).reshape(-1, 2)
     edges = edges[edges[:, 1] + 1 - edges[:, 0] >= least]
     return [(int(a), int(b) + 1) for a, b in edges]
+
+
+def quantum_of(y: Vector) -> float:
+    """Return the step of which all readings y, shape (n,), are multiples; 0 for none."""
+    span = float(np.ptp(y))
+    if span == 0.0:
+        return 0.0
+    # neighbours in time differ by few steps, so the rounding of numbers does not add up
+    some = _pieces(y)
+    jumps = np.abs(np.diff(some))
+    # the ends of a clipped range need not be codes
+    inner = (some > y.min()) & (some < y.max())
+    jumps = jumps[(jumps > 1e-9 * span) & inner[1:] & inner[:-1]]
+    total = jumps.size
+    jumps = np.unique(np.round(jumps, 18))
+    if jumps.size and total > 20 and np.ptp(jumps) < 1e-6 * jumps[0]:
+        return float(jumps.mean())
+    if jumps.size < 2 or jumps.size > y.size // 4 + 50:
+        return 0.0
+    small = jumps[: max(20, jumps.size // 10)]
+    step = float(small[0])
+    for _ in range(4):
+        ratio = small / step
+        off = np.abs(ratio - np.rint(ratio))
+        near = np.rint(ratio) < 50
+        if near.sum() >= 2 and np.mean(off[near] < 0.03) > 0.97:
+            whole = np.rint(ratio)[near]
+            return float(np.sum(small[near] * whole) / np.sum(whole * whole))
+        # a code in between was never hit: the step divides the differences of differences
+        gaps = np.diff(small)
+        gaps = gaps[gaps > 0.03 * step]
+        if gaps.size == 0 or float(gaps.min()) > 0.97 * step:
+            return 0.0
+        step = float(gaps.min())
+    return 0.0
+
+
+def _pieces(y: Vector) -> Vector:
+    """Return some whole stretches of a long signal, which tell the step as well."""
+    if y.size <= MOST:
+        return y
+    rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
+    return np.asarray(rows[:: max(1, y.size // MOST)].ravel())

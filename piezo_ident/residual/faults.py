@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data beside a model: missed samples, jitter, steps, outliers, clipping."""
+"""Faults of the data that show beside a model: missed samples, jitter, outliers, clipping."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.model.metrics import percent
+from piezo_ident.record.faults import quantum_of
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, runs_of, strokes_of
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-__all__ = ['FaultSearch', 'find_faults', 'quantum_of']
+__all__ = ['FaultSearch', 'find_faults']
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,8 +37,6 @@ FLAT, LEFT = 5, 6.0
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
 #: jitter is read where the fast part of the motion has at most this share of the scatter's power
 SMOOTH = 1.0
-#: samples in which a quantum is looked for, in rows of so many
-MOST, MOST_ROW = 2**17, 2**10
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,49 +132,6 @@ class _Noise:
     rms: float
     quantum: float
     rest: float
-
-
-def quantum_of(y: Array) -> float:
-    """Return the step of which all readings y, shape (n,), are multiples; 0 for none."""
-    span = float(np.ptp(y))
-    if span == 0.0:
-        return 0.0
-    # neighbours in time differ by few steps, so the rounding of numbers does not add up
-    some = _pieces(y)
-    jumps = np.abs(np.diff(some))
-    # the ends of a clipped range need not be codes
-    inner = (some > y.min()) & (some < y.max())
-    jumps = jumps[(jumps > 1e-9 * span) & inner[1:] & inner[:-1]]
-    total = jumps.size
-    jumps = np.unique(np.round(jumps, 18))
-    if jumps.size and total > 20 and np.ptp(jumps) < 1e-6 * jumps[0]:
-        return float(jumps.mean())
-    if jumps.size < 2 or jumps.size > y.size // 4 + 50:
-        return 0.0
-    small = jumps[: max(20, jumps.size // 10)]
-    step = float(small[0])
-    for _ in range(4):
-        ratio = small / step
-        off = np.abs(ratio - np.rint(ratio))
-        near = np.rint(ratio) < 50
-        if near.sum() >= 2 and np.mean(off[near] < 0.03) > 0.97:
-            whole = np.rint(ratio)[near]
-            return float(np.sum(small[near] * whole) / np.sum(whole * whole))
-        # a code in between was never hit: the step divides the differences of differences
-        gaps = np.diff(small)
-        gaps = gaps[gaps > 0.03 * step]
-        if gaps.size == 0 or float(gaps.min()) > 0.97 * step:
-            return 0.0
-        step = float(gaps.min())
-    return 0.0
-
-
-def _pieces(y: Array) -> Array:
-    """Return some whole stretches of a long signal, which tell the step as well."""
-    if y.size <= MOST:
-        return y
-    rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
-    return np.asarray(rows[:: max(1, y.size // MOST)].ravel())
 
 
 def _noise_of(part: ResidualPart) -> _Noise:
