@@ -25,8 +25,9 @@ from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
+from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Rows', 'centred', 'make_rows', 'means']
+__all__ = ['Rows', 'centred', 'make_rows']
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -109,7 +110,7 @@ class Rows:
         low = min(float(run.u.min()) for run in self.runs)
         high = max(float(run.u.max()) for run in self.runs)
         # over rows, so that converter steps and noise are no travel
-        travel = sum(float(np.abs(np.diff(means(run.u, self.m))).sum()) for run in self.runs)
+        travel = sum(float(np.abs(np.diff(block_means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
 
     def time(self, i: int) -> Array:
@@ -157,15 +158,8 @@ class Rows:
 
     def of(self, signals: Sequence[Array]) -> Array:
         """Return the rows, shape (n,), of signals given at the full rate, one a run."""
-        parts = [means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
+        parts = [block_means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
         return np.concatenate(parts)
-
-
-def means(x: Array, m: int) -> Array:
-    """Return the means over each m neighbours; what is left at the end is dropped."""
-    n = x.size // m
-    # a product with a vector is several times faster than a mean along a short axis
-    return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
 def centred(x: Array, of_record: Integers) -> Array:
@@ -222,7 +216,7 @@ def make_rows(
                     labels.append(label)
                     first += 1
         blocks.append(number[good])
-    x = [means(run.x, m)[good] for run, good in zip(runs, keep, strict=True)]
+    x = [block_means(run.x, m)[good] for run, good in zip(runs, keep, strict=True)]
     record = np.array([names.index(run.record) for run in runs])
     of_record = np.concatenate(
         [np.full(int(good.sum()), k) for good, k in zip(keep, record, strict=True)]

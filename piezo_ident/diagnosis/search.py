@@ -36,10 +36,11 @@ from piezo_ident.diagnosis.cross_validation import (
     with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.rows import means, Rows
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
+from piezo_ident.residual.stretches import block_means
 
 __all__ = ['Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
 
@@ -318,7 +319,7 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     channels: dict[str, list[Array]] = {}
     for run in rows.runs:
         # over a row, so that converter steps do not count as speed
-        speeds.append(np.abs(np.diff(means(run.u, rows.m))) * model.sample_rate / rows.m)
+        speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
         top = max(top, _highest_frequency(run.u, model.sample_rate))
         for name, x in run.piece.channels.items():
             channels.setdefault(name, []).append(x)

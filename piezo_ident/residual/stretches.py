@@ -145,10 +145,9 @@ def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
 
 def block_means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
     """Return the means of whole blocks of m samples, shape (n // m,)."""
-    if m == 1:
-        return x
-    n = x.size // m * m
-    return np.asarray(x[:n].reshape(-1, m).mean(axis=1))
+    n = x.size // m
+    # a product with a vector is several times faster than a mean along a short axis
+    return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
 def all_stretches(parts: Sequence[ResidualPart]) -> list[Stretch]:
