@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.live.block_clock import BlockClock
+from piezo_ident.live.sample_clock import Kind
 from piezo_ident.record.blocks import Samples
 
 __all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
@@ -89,14 +90,14 @@ class Matcher:
         return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
 
     def _match(self, new: Samples, own: _Side, other: _Side) -> list[tuple[Samples, Samples]]:
-        restarts = own.clock.restarts
-        if np.isnan(own.clock.last):
-            own.run = other.run
-        own.clock.judge(new.t)
-        if own.clock.restarts > restarts:
+        kind, _ = own.clock.judge(new.t)
+        if kind is Kind.START:
             own.waiting.clear()
-            # the second of the two to restart has only caught up
-            own.run = other.run if other.run > own.run else own.run + 1
+            if not own.clock.restarts or other.run > own.run:
+                # the second of the two to start or restart has only caught up
+                own.run = other.run
+            else:
+                own.run += 1
         pairs, rest = [], new
         if own.run != other.run and own.span > CATCH_UP:
             # one of them was silent when the clock restarted
@@ -161,6 +162,7 @@ class Preview:
     def __init__(self, rate: float = 50.0) -> None:
         self.rate = rate
         self._newest: dict[str, int] = {}
+        self._clocks: dict[str, BlockClock] = {}
         self._bins: dict[int, dict[str, tuple[int, float, float, float]]] = {}
 
     def add(self, name: str, t: NDArray[np.float64], x: NDArray[np.float64]) -> list[PreviewBin]:
@@ -178,10 +180,16 @@ class Preview:
             t, x = t[finite], x[finite]
         if not t.size:
             return []
+        kind, late = self._clocks.setdefault(name, BlockClock()).judge(t)
+        if kind is Kind.LATE:
+            t, x = t[late:], x[late:]
+            if not t.size:
+                return []
         # rounding may put a sample just before its bin
         k = np.floor(t * self.rate + 1e-6).astype(np.int64)
         done: list[PreviewBin] = []
-        if k[0] < self._newest.get(name, k[0]):
+        # the first quantity that restarts ends the bins of all
+        if kind is Kind.START and name in self._newest:
             done = self._take(sorted(self._bins))
             self._newest.clear()
         starts = np.concatenate([[0], np.flatnonzero(np.diff(k)) + 1])
@@ -220,6 +228,7 @@ class LiveError:
 
     def __init__(self, window: float) -> None:
         self.window = window
+        self._clock = BlockClock()
         self.clear()
 
     def clear(self) -> None:
@@ -232,7 +241,10 @@ class LiveError:
         e = residual[np.isfinite(residual)]
         if not e.size:
             return
-        if self._parts and t[0] <= self._parts[-1][1]:
+        kind, _ = self._clock.judge(t)
+        if kind is Kind.LATE:
+            return
+        if kind is Kind.START:
             self.clear()
         self._parts.append((float(t[0]), float(t[-1]), e.size, float(e @ e)))
         while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
