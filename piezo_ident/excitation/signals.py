@@ -68,18 +68,9 @@ def _below_nyquist(frequency: float, sample_rate: float) -> None:
 
 def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[np.float64]:
     """
-    Return a soft way from one level to another; `stop` is the sample after the last.
+    Return a soft way from one level to another [V]; `stop` is the sample after the last.
 
-    The speed is a raised cosine, so it starts and ends at zero and its largest value is `slew`.
-
-    Parameters
-    ----------
-    start, stop : float
-        Levels [V].
-    slew : float
-        Largest speed [V/s].
-    sample_rate : float
-        [Hz]
+    The speed is a raised cosine, so it starts and ends at zero; its largest value is `slew` [V/s].
     """
     seconds = max(1.0 / sample_rate, 2.0 * abs(stop - start) / slew)
     sample_count(seconds, sample_rate)
@@ -89,18 +80,7 @@ def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[
 
 
 def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDArray[np.float64]:
-    """
-    Return levels that are jumped to and held.
-
-    Parameters
-    ----------
-    levels : sequence of float
-        [V]
-    hold : sequence of float
-        Time on each level [s].
-    sample_rate : float
-        [Hz]
-    """
+    """Return levels [V] that are jumped to, each held for its time [s]."""
     n = [sample_count(t, sample_rate) for t in hold]
     sample_count(sum(n) / sample_rate, sample_rate)
     return np.repeat(np.asarray(levels, dtype=np.float64), n)
@@ -108,19 +88,10 @@ def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDA
 
 def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np.float64]:
     """
-    Return straight lines through a list of levels.
+    Return straight lines through levels [V], all with the same magnitude of slope [V/s].
 
     Every leg takes a whole number of samples, so that each corner is met exactly; the slope is
     met within that rounding.
-
-    Parameters
-    ----------
-    levels : sequence of float
-        Corners [V], the first and last included.
-    slope : float
-        Magnitude of the speed on every leg [V/s].
-    sample_rate : float
-        [Hz]
     """
     v = np.asarray(levels, dtype=np.float64)
     seconds = np.abs(np.diff(v)) / slope
@@ -206,10 +177,8 @@ def noise(
         Mean and largest deviation from it [V].
     cutoff : float
         End of the flat band [Hz]; a raised cosine leads to nothing at 1.2 times this frequency.
-    duration : float
-        [s]
-    sample_rate : float
-        [Hz]
+    duration, sample_rate : float
+        [s], [Hz]
     rng : numpy.random.Generator
         Draws the noise.
     crest : float, optional
@@ -275,10 +244,8 @@ def multisine(
         Mean and largest deviation from it [V].
     lines : ndarray of int
         Harmonic numbers of ``1 / period``; see `odd_lines`.
-    period : float
-        [s], rounded to a sample.
-    periods : int
-        How often the period is repeated.
+    period, periods : float, int
+        Its length, rounded to a sample [s], and how often it is repeated.
     sample_rate : float
         [Hz]
     rng : numpy.random.Generator

@@ -165,9 +165,7 @@ def _follow(
 
 class Guard:
     """
-    Makes of a command what may be applied; keeps its state from block to block.
-
-    The result does not depend on how the command is cut into blocks.
+    Makes of a command what may be applied; how it is cut into blocks changes no bit.
 
     Parameters
     ----------

@@ -133,31 +133,14 @@ def _without(samples: Samples, rows: NDArray[np.intp]) -> Samples:
 
 @dataclass(frozen=True)
 class PreviewBin:
-    """
-    Mean, smallest and largest of each quantity over a stretch of sample time.
-
-    Attributes
-    ----------
-    t : float
-        Begin of the stretch [s].
-    values : dict of str to (mean, min, max)
-    """
+    """Mean, smallest and largest of each quantity over a stretch that begins at `t` [s]."""
 
     t: float
     values: dict[str, tuple[float, float, float]]
 
 
 class Preview:
-    """
-    Bins on the grid of sample time.
-
-    A bin is complete when every quantity has samples after it.
-
-    Parameters
-    ----------
-    rate : float
-        Bins a second [Hz].
-    """
+    """Bins of sample time, `rate` a second; each waits until every quantity has passed it."""
 
     def __init__(self, rate: float = 50.0) -> None:
         self.rate = rate
@@ -169,11 +152,7 @@ class Preview:
         """
         Take samples of a quantity; return the bins that are complete now, in order.
 
-        Parameters
-        ----------
-        name : str
-        t, x : ndarray, shape (n,)
-            Time [s], rising, and values; what is not a finite number is left out.
+        What is not a finite number is left out.
         """
         finite = np.isfinite(x) & np.isfinite(t)
         if not finite.all():
@@ -217,14 +196,7 @@ class Preview:
 
 
 class LiveError:
-    """
-    Rms of the residual over the last stretch of sample time.
-
-    Parameters
-    ----------
-    window : float
-        [s]
-    """
+    """Rms of the residual over a window of sample time [s]."""
 
     def __init__(self, window: float) -> None:
         self.window = window

@@ -32,6 +32,9 @@ from piezo_ident.record.clock import has_restarted
 
 __all__ = ['Kind', 'SampleClock', 'Verdict']
 
+#: returns the ids of all publishers of a topic
+Publishers = Callable[[], Collection[Hashable]]
+
 #: blocks whose repetition is recognised, gaps into which a late block may belong, and other
 #: publishers whose count is known
 MEMORY = 8
@@ -53,19 +56,7 @@ class Kind(enum.Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    What a block is.
-
-    Attributes
-    ----------
-    kind : Kind
-    tick : int
-        Of its first sample.
-    missing : int
-        Samples between the last block and this one.
-    reason : str
-        For people; empty for `Kind.NEXT`.
-    """
+    """What a block is: its first tick, the samples missing before it, and a reason for people."""
 
     kind: Kind
     tick: int = 0
@@ -140,10 +131,7 @@ class SampleClock:
             self._note_other(sequence)
 
     def judge(
-        self,
-        samples: Samples,
-        sequence: int | None = None,
-        publishers: Callable[[], Collection[Hashable]] = tuple,
+        self, samples: Samples, sequence: int | None = None, publishers: Publishers = tuple
     ) -> Verdict:
         """
         Return what the next block is.
@@ -216,12 +204,7 @@ class SampleClock:
                 self._others.remove(sequence)
             self._others.append(sequence + 1)
 
-    def _is_foreign(
-        self,
-        tick: int,
-        sequence: int | None,
-        publishers: Callable[[], Collection[Hashable]],
-    ) -> bool:
+    def _is_foreign(self, tick: int, sequence: int | None, publishers: Publishers) -> bool:
         """Return whether a block is another publisher's, or may be."""
         if self.head is None and not self._is_silent:
             return False  # any publisher is followed
@@ -243,12 +226,7 @@ class SampleClock:
             return not self._is_silent
         return not numbered or sequence is None or not self._is_next(sequence)
 
-    def _start(
-        self,
-        tick: int,
-        sequence: int | None,
-        publishers: Callable[[], Collection[Hashable]],
-    ) -> None:
+    def _start(self, tick: int, sequence: int | None, publishers: Publishers) -> None:
         """Begin a stream, of the same publisher or of a new one."""
         if self.head is None:
             ids = publishers()

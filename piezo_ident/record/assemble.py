@@ -119,9 +119,6 @@ def assemble(
     """
     Make a record of raw columns.
 
-    What makes a restart, a repeat or disorder is said in `piezo_ident.record.ordering`; how the
-    sampling rate is found, in `piezo_ident.record.clock`.
-
     Parameters
     ----------
     t, v, y : array_like, shape (n,)

@@ -43,16 +43,8 @@ def without_faults(record: Record) -> Record:
 
     Up to three wild or lost readings in a row, among quiet neighbours, are bridged by a straight
     line.  Longer ones, where the sensor hangs or drops out, are cut out as samples without a
-    number are.  What is found is counted in the faults of the record.
-
-    Parameters
-    ----------
-    record : Record
-
-    Returns
-    -------
-    Record
-        The same record where there is nothing to leave out.
+    number are.  What is found is counted in the faults of the record; where nothing is, the same
+    record is returned.
     """
     stroke, span = record.stroke, float(np.ptp(record.voltage_range))
     if stroke == 0.0:
@@ -195,13 +187,7 @@ def _cut_out(piece: Piece, runs: Runs) -> list[Piece]:
 
 
 def line_error(pieces: Iterable[Piece]) -> float:
-    """
-    Return the error of the best straight line from v to y, rms in % of stroke.
-
-    Parameters
-    ----------
-    pieces : iterable of Piece
-    """
+    """Return the error of the best straight line from v to y, rms in % of stroke."""
     parts = list(pieces)
     v, y = (np.concatenate(x) for x in ([p.v for p in parts], [p.y for p in parts]))
     stroke = float(np.ptp(y))
@@ -225,13 +211,7 @@ def misspelt(labels: Sequence[str]) -> list[str]:
 
 
 def suspicions(record: Record) -> list[str]:
-    """
-    Return what a record makes one suspect: a sensor at its stop, columns that were swapped.
-
-    Parameters
-    ----------
-    record : Record
-    """
+    """Return what a record makes one suspect: a sensor at its stop, columns swapped."""
     span = float(np.ptp(record.voltage_range))
     levels: list[float] = []
     stuck = noisy = 0

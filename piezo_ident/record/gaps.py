@@ -32,13 +32,8 @@ class Bridged:
     """
     A piece with its gaps filled.
 
-    Attributes
-    ----------
-    piece : Piece
-    sound : ndarray of bool, shape (n,)
-        Samples that were measured, and at which a gap before them has died away.
-    gaps, filled : int
-        Number of gaps, and of samples in them.
+    `sound` are the samples that were measured, and at which a gap before them has died away;
+    `gaps` and `filled` are the number of gaps, and of samples in them.
     """
 
     piece: Piece
@@ -60,17 +55,7 @@ def follows(one: Piece, other: Piece) -> int | None:
 
 
 def bridged(record: Record) -> list[Bridged]:
-    """
-    Join the pieces of a record over short gaps.
-
-    Parameters
-    ----------
-    record : Record
-
-    Returns
-    -------
-    list of Bridged
-    """
+    """Join the pieces of a record over short gaps."""
     groups: list[list[Piece]] = []
     for piece in record:
         connects = groups and follows(groups[-1][-1], piece) is not None

@@ -31,20 +31,10 @@ _ALL = '*'
 
 def read_variables(path: Path, wanted: str) -> tuple[tuple[str, ...], dict[str, NDArray[Any]]]:
     """
-    Read variables of a MATLAB file of version 4 to 7.
+    Return the names of all variables of a MATLAB file of version 4 to 7, and the wanted ones.
 
-    Parameters
-    ----------
-    path : Path
-    wanted : str
-        Regular expression for the names that are wanted.
-
-    Returns
-    -------
-    tuple of str
-        The names of all variables.
-    dict of str to ndarray
-        The wanted ones: numbers in their shape, texts and cells of texts as arrays of str.
+    `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
+    arrays of str.
 
     Raises
     ------

@@ -64,11 +64,7 @@ def blocks_of(record: Record, **further: Sequence[Vector]) -> Blocks:
     """
     Return the columns of a record, its pieces below each other, as the writers take them.
 
-    Parameters
-    ----------
-    record : Record
-    **further : sequence of ndarray
-        Columns in place of the channels, one array a piece.
+    Further columns, one array a piece, stand in place of the channels.
     """
 
     def blocks() -> Iterator[Mapping[str, Vector]]:

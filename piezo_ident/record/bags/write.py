@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import sqlite3
-from typing import Any
+from typing import Any, cast
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output, unwritable
@@ -38,11 +38,6 @@ from rosbags.rosbag2.errors import WriterError
 __all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'knows_type', 'write_bag']
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-#: what `flush` uses inside of rosbags: storage -> attribute -> what that must have
-INTERNALS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
-    'mcap': {'chunk': ('bio',), 'bio': ('flush',), 'close_chunk': ()},
-    'sqlite3': {'conn': ('commit',)},
-}
 #: how many numbered names are tried
 NAMES = 10_000
 
@@ -118,16 +113,16 @@ class BagWriter:
     def _begin(self) -> None:
         """Open the next bag."""
         self._writer = self._opened()
-        self._inside: Any = self._writer.storage
         self._connections: dict[str, Connection] = {}
-        for name, parts in INTERNALS[self._storage].items():
-            inner = getattr(self._inside, name, None)
-            if not all(hasattr(inner, part) for part in parts or ('__call__',)):
-                self.abort()
-                raise DataError(
-                    f'{self.path}: this version of rosbags cannot be told to put messages on '
-                    'disk; install one that setup.py names'
-                )
+        try:
+            self._hand_over = _hand_over(self._writer.storage, self._storage)
+        except AttributeError:
+            with suppress(Exception):
+                self._writer.abort()
+            raise DataError(
+                f'{self.path}: this version of rosbags cannot be told to put messages on disk; '
+                'install one that setup.py names'
+            ) from None
         custom = dict(self._custom_data)
         if self.max_size:
             name = self.parts[0].name if self.parts else ''
@@ -166,7 +161,8 @@ class BagWriter:
     @property
     def file(self) -> Path:
         """The file that is being written."""
-        return Path(self._inside.path)
+        storage: Any = self._writer.storage
+        return Path(storage.path)
 
     @property
     def size(self) -> int:
@@ -234,14 +230,6 @@ class BagWriter:
             self._begin()
             self._closed_size, self._closed_messages = size, self.messages
 
-    def _hand_over(self) -> None:
-        if self._storage == 'sqlite3':
-            self._inside.conn.commit()
-            return
-        if self._inside.chunk.bio.tell():
-            self._inside.close_chunk()
-        self._inside.bio.flush()
-
     def close(self) -> None:
         """
         Finish the bag: index and metadata.yaml.
@@ -275,6 +263,20 @@ class BagWriter:
                 f'{self.path}: cannot be written any more ({reason}); make room, and convert it: '
                 'what was written can be recovered'
             ) from None
+
+
+def _hand_over(storage: Any, name: str) -> Callable[[], None]:
+    """Return what puts all messages on disk; AttributeError where this rosbags cannot."""
+    if name == 'sqlite3':
+        return cast(Callable[[], None], storage.conn.commit)
+    close_chunk, flush, _ = storage.close_chunk, storage.bio.flush, storage.chunk.bio.tell
+
+    def hand_over() -> None:
+        if storage.chunk.bio.tell():
+            close_chunk()
+        flush()
+
+    return hand_over
 
 
 def write_bag(
