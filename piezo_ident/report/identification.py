@@ -201,7 +201,7 @@ def dynamics_tables(result: Identification) -> list[Table]:
 
 
 def hysteresis_tables(result: Identification) -> list[Table]:
-    """Return the weights, the scaling and the losses of both solvers."""
+    """Return the weights and the losses of both solvers."""
     model, fit = result.model, result.hysteresis
     h, s, m = model.hysteresis, model.scaling, model.hysteresis.thresholds.size
     std = fit.std if fit.std.size == m + 2 else np.full(m + 2, math.nan)
@@ -230,15 +230,6 @@ def hysteresis_tables(result: Identification) -> list[Table]:
             'Normalised, for white residuals. The play at r = 0 is v itself, so p2 holds its '
             'weight too. H carries the static gain here; the last column is in the split of the '
             f'paper, where G(1) = {PAPER_GAIN}.',
-        ),
-        Table(
-            'Scaling',
-            ('', 'zero', 'span'),
-            (
-                ('voltage u = (v - v0) / V', f'{s.v0:.6g} V', f'{s.V:.6g} V'),
-                ('displacement (y - y0) / Y', f'{1e6 * s.y0:.6g} µm', f'{1e6 * s.Y:.6g} µm'),
-            ),
-            'A negative Y belongs to a stage that retracts as the voltage rises.',
         ),
         Table(
             'Solver of the weights',
@@ -292,7 +283,7 @@ def identification_page(
                 'Delay and dynamics',
                 [*named(pictures, 'delay', 'response', 'orders'), *dynamics_tables(result)],
             ),
-            Section('Hysteresis', [*named(pictures, 'weights'), *hysteresis_tables(result)]),
+            Section('Hysteresis', hysteresis_tables(result)),
             Section(
                 'Origin',
                 [

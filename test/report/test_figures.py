@@ -23,7 +23,6 @@ from piezo_ident.report.figures.residual import (
     residual_spectrum_figure,
 )
 from piezo_ident.report.figures.style import axis_limit, envelope, NothingToDraw, safe
-from piezo_ident.report.figures.three_steps import weights_figure
 from piezo_ident.report.table import length, number
 from piezo_ident.residual import analyse, ResidualPart
 import pytest
@@ -75,13 +74,11 @@ def test_overview_shows_measurement_and_model(runs):
     assert np.abs(lines['model'][:, 1]).max() == pytest.approx(1e9 * error)
 
 
-def test_sines_and_weights_are_those_of_the_result(identified, runs):
+def test_sines_are_those_of_the_result(runs):
     errors = sines_of(runs)
     lines = lines_of(sines_figure(errors))
     expected = [(e.frequency, e.percent) for e in errors]
     assert np.allclose(lines['model with dynamics'], expected)
-    bars = weights_figure(identified).axes[0].patches
-    assert [bar.get_height() for bar in bars] == list(identified.model.hysteresis.weights)
 
 
 def test_bars_are_the_errors_of_the_diagnosis():

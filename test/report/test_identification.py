@@ -59,7 +59,7 @@ def test_error_table_holds_the_errors(identified):
 
 def test_both_solvers_are_shown(identified):
     fit = identified.hysteresis
-    weights, _, solvers = hysteresis_tables(identified)
+    weights, solvers = hysteresis_tables(identified)
     assert [float(row[1]) for row in solvers.rows] == [
         pytest.approx(fit.swarm_loss, rel=1e-4),
         pytest.approx(fit.optimum_loss, rel=1e-4),
@@ -68,7 +68,7 @@ def test_both_solvers_are_shown(identified):
     h = identified.model.hysteresis
     assert [row[3] for row in weights.rows] == [number(x, 4) for x in (*h.weights, h.p1, h.p2)]
     alone = replace(identified, hysteresis=replace(fit, swarm=None, swarm_loss=None))
-    assert len(hysteresis_tables(alone)[2].rows) == 1
+    assert len(hysteresis_tables(alone)[1].rows) == 1
 
 
 def test_dynamics_tables_hold_the_coefficients(identified):

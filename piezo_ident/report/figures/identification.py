@@ -12,6 +12,11 @@ import numpy as np
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
+from piezo_ident.report.figures.delay_and_dynamics import (
+    delay_figure,
+    orders_figure,
+    response_figure,
+)
 from piezo_ident.report.figures.free_run import (
     loops_figure,
     overview_figure,
@@ -19,12 +24,6 @@ from piezo_ident.report.figures.free_run import (
     sines_figure,
 )
 from piezo_ident.report.figures.style import draw_each, Drawn, Wanted
-from piezo_ident.report.figures.three_steps import (
-    delay_figure,
-    orders_figure,
-    response_figure,
-    weights_figure,
-)
 
 __all__ = ['draw_identification']
 
@@ -99,12 +98,6 @@ def draw_identification(
             'Orders of G',
             'Free-run error on held-out noise of least squares at every order; grey: unstable.',
             lambda: orders_figure(identification),
-        ),
-        (
-            'weights',
-            'Weights of the plays',
-            'Bars: standard deviation for white residuals.',
-            lambda: weights_figure(identification),
         ),
     ]
     return draw_each(wanted, tick)

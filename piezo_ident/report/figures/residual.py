@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -35,8 +34,8 @@ STATES = (
     ('before', 'H refitted, nothing added', COLOURS['static']),
     ('after', 'refined', COLOURS['model']),
 )
-#: segments named above a picture, and characters of such a name, at most
-NAMED, SHORT = 14, 20
+#: segments named above a picture, at most
+NAMED = 14
 #: two segments side by side
 TINTS = ('#E9EEF3', '#F4F0E6')
 #: so many times smaller, the rest is drawn once more on a scale of its own
@@ -115,24 +114,15 @@ def _trace(
 
 
 def _shade(axes: Sequence[Axes], piece: Piece) -> None:
-    """Shade the segments that drive the stage, and name them above the first of the axes."""
-    stretches = [(s.label, s.start, s.stop) for s in piece.segments]
-    if len(stretches) > NAMED:
-        # many short ones of a kind are shown as one
-        groups = [list(group) for _, group in groupby(piece.segments, key=lambda s: s.kind)]
-        stretches = [
-            (g[0].label if len(g) == 1 else f'{len(g)} × {g[0].kind}', g[0].start, g[-1].stop)
-            for g in groups
-        ]
-    longest = sorted(stretches, key=lambda s: s[1] - s[2])[:NAMED]
-    driven = [s for s in stretches if s[0].partition(':')[0] not in ('idle', 'ramp')]
-    for i, (label, start, stop) in enumerate(driven):
-        first, last = piece.t[start], piece.t[stop - 1] + piece.dt
+    """Shade the segments that drive the stage, and name the longest above the first axes."""
+    driven = [s for s in piece.segments if s.kind not in ('idle', 'ramp')]
+    named = sorted(driven, key=lambda s: -s.n)[:NAMED]
+    for i, s in enumerate(driven):
+        first, last = piece.t[s.start], piece.t[s.stop - 1] + piece.dt
         for each in axes:
             each.axvspan(first, last, color=TINTS[i % 2], linewidth=0.0, zorder=0)
-        if (label, start, stop) in longest:
-            short = label if len(label) <= SHORT else f'{label[: SHORT - 1]}…'
-            style.name_above(axes[0], short, 0.5 * (first + last))
+        if s in named:
+            style.name_above(axes[0], s.label, 0.5 * (first + last))
 
 
 def _both(

@@ -247,4 +247,4 @@ def name_above(axes: Axes, text: str, x: float, rotation: float = 30.0, **option
     at: dict[str, Any] = {'xycoords': ('data', 'axes fraction'), 'textcoords': 'offset points'}
     at |= {'xytext': (0, 2), 'ha': 'left' if rotation else 'center', 'va': 'bottom'}
     at |= {'rotation': rotation, 'rotation_mode': 'anchor', 'fontsize': SMALL}
-    axes.annotate(safe(text), (x, 1.0), **at, **options)
+    axes.annotate(safe(text, 20), (x, 1.0), **at, **options)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of the three steps: delay, frequency response, orders of G, weights of H."""
+"""Pictures of the first two steps: delay, frequency response, orders of G."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from piezo_ident.model.free_run import PieceRun
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
-__all__ = ['delay_figure', 'orders_figure', 'response_figure', 'weights_figure']
+__all__ = ['delay_figure', 'orders_figure', 'response_figure']
 
 #: samples shown ahead of the delay, and behind it
 BEFORE, AFTER = 10, 15
@@ -262,41 +262,4 @@ def orders_figure(identification: Identification) -> Figure:
     bar.set_label('held-out free-run error / smallest', fontsize=style.NORMAL)
     place: dict[str, Any] = {'loc': 'lower center', 'bbox_to_anchor': (0.5, 1.0), 'ncols': 2}
     style.legend(axes, frameon=False, handletextpad=0.4, columnspacing=1.2, **place)
-    return fig
-
-
-def weights_figure(identification: Identification) -> Figure:
-    """
-    Draw the weights of the plays over their thresholds, with their standard deviations.
-
-    Raises
-    ------
-    NothingToDraw
-        When the model has no plays.
-    """
-    model = identification.model
-    std: NDArray[np.float64] | None = identification.hysteresis.std
-    h = model.hysteresis
-    if h.thresholds.size == 0:
-        raise NothingToDraw('the hysteresis has no plays')
-    r = h.thresholds * model.scaling.V
-    fig = style.figure(2.8)
-    axes = fig.subplots()
-    gaps = np.diff(np.concatenate([[0.0], r]))
-    bars: dict[str, Any] = {'ecolor': COLOURS['measured'], 'elinewidth': 1.0, 'capsize': 2.5}
-    std = std[: r.size] if std is not None and std.size >= r.size else None
-    width, colour = 0.7 * float(gaps.min()), COLOURS['model']
-    axes.bar(r, h.weights, width=width, color=colour, yerr=std, error_kw=bars)
-    bound = r[h.weights == 0.0]
-    if bound.size:
-        mark: dict[str, Any] = {'markersize': 4, 'clip_on': False, 'zorder': 4}
-        mark |= {'markerfacecolor': 'white', 'markeredgecolor': style.GREY}
-        axes.plot(bound, np.zeros(bound.size), 'o', label='on the bound q = 0', **mark)
-        style.legend(axes)
-    tidy(axes, 'threshold r / V', 'weight q (normalised)')
-    title = f'plus  $p_1 v^3 + p_2 v$  with  $p_1 = {h.p1:.4f}$,  $p_2 = {h.p2:.4f}$'
-    axes.set_title(title, fontsize=style.NORMAL, loc='left')
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    axes.set_xlim(left=0.0)
-    axes.grid(False, axis='x')
     return fig
