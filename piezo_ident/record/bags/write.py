@@ -83,6 +83,8 @@ class BagWriter:
     ----------
     parts : list of Path
         The folders so far; the last one is being written.
+    file : Path
+        The file that is being written.
     messages : int
         How many were written, all parts together.
 
@@ -114,8 +116,10 @@ class BagWriter:
         """Open the next bag."""
         self._writer = self._opened()
         self._connections: dict[str, Connection] = {}
+        storage: Any = self._writer.storage
+        self.file = Path(storage.path)
         try:
-            self._hand_over = _hand_over(self._writer.storage, self._storage)
+            self._hand_over = _hand_over(storage, self._storage)
         except AttributeError:
             with suppress(Exception):
                 self._writer.abort()
@@ -157,12 +161,6 @@ class BagWriter:
     def path(self) -> Path:
         """The folder that is being written."""
         return self._writer.path
-
-    @property
-    def file(self) -> Path:
-        """The file that is being written."""
-        storage: Any = self._writer.storage
-        return Path(storage.path)
 
     @property
     def size(self) -> int:
