@@ -21,15 +21,13 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.sines import sine_frequency
-from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
-from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Fault, Piece, Record, Segment
+from programs import SLOW, slow_model
 
 #: what a name in somebody's file may hold
 HOSTILE = '<script>alert("$x^$")</script>\x1b[31m'
 
-RATE = 2000.0
 NOISE = 4e-9
 PROGRAM = """
 limits: [0, 10]
@@ -45,31 +43,17 @@ CREEP = {'gain': [0.012, 0.01], 'time_constant': [0.1, 1.0]}
 
 
 @cache
-def base_model() -> StageModel:
-    """Return a stage with one slow mode, without any effect."""
-    return StageModel(
-        sample_rate=RATE,
-        scaling=Scaling(0.0, 10.0, 0.0, 75e-6, (0.0, 10.0)),
-        hysteresis=Hysteresis(
-            np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.2, 0.1]), p1=-0.2, p2=0.9
-        ),
-        dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
-        delay=Delay(2),
-    )
-
-
-@cache
 def refined_model() -> StageModel:
     """Return the same stage with creep."""
-    return replace(base_model(), effects=(EffectSetting('creep', CREEP),))
+    return replace(slow_model(), effects=(EffectSetting('creep', CREEP),))
 
 
 @cache
 def measured(name: str = 'val.npz') -> Record:
     """Return a record of the stage that creeps."""
-    sequence = parse_program(PROGRAM, 'program').build(RATE)
+    sequence = parse_program(PROGRAM, 'program').build(SLOW)
     segments = tuple(Segment(s.label, s.start, s.stop) for s in sequence.segments)
-    piece = Piece(sequence.v, np.zeros(sequence.n), RATE, segments=segments)
+    piece = Piece(sequence.v, np.zeros(sequence.n), SLOW, segments=segments)
     y = refined_model().predict_piece(piece)
     noise = NOISE * np.random.default_rng(3).standard_normal(y.size)
     return Record((replace(piece, y=y + noise),), name)
@@ -104,7 +88,7 @@ def example(verdict: str = 'named') -> Diagnosis:
     """
     record = measured()
     (piece,) = record.pieces
-    given = piece.y - base_model().predict_piece(piece)
+    given = piece.y - slow_model().predict_piece(piece)
     before = given - given.mean()
     added = verdict in ('named', 'class', 'partly_explained')
     after = piece.y - refined_model().predict_piece(piece) if added else before
@@ -131,8 +115,8 @@ def example(verdict: str = 'named') -> Diagnosis:
     return Diagnosis(
         verdict=verdict,
         sentence=sentences[verdict],
-        given=base_model(),
-        model=refined_model() if added else base_model(),
+        given=slow_model(),
+        model=refined_model() if added else slow_model(),
         effects=(effect,) if added else (),
         group=group if verdict == 'class' else None,
         unexplained=Unexplained(

@@ -6,6 +6,7 @@
 from pathlib import Path
 
 from piezo_ident.cli import main
+from programs import SLOW_PROGRAM
 import pytest
 
 # a stage with one slow mode at 2 kHz, so that an identification takes a moment only
@@ -20,17 +21,6 @@ dynamics: {a: [-1.2, 0.5], b: [0.2, 0.1]}
 sensor: {noise_rms: 1.0e-9}
 seed: 7
 """
-PROGRAM = """\
-limits: [0, 10]
-seed: 1
-segments:
-  - {signal: idle, duration: 0.3}
-  - {signal: step, bias: 5, size: 1, hold: 0.06, count: 8}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 12, frequency: 20}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 600, duration: 3}
-  - {signal: triangle, slope: 10}
-  - {signal: idle, duration: 0.3}
-"""
 SINE = """\
 limits: [0, 10]
 segments:
@@ -43,7 +33,7 @@ def made(tmp_path_factory) -> Path:
     """Return a folder with a stage, its record, a record of a sine and the model."""
     folder = tmp_path_factory.mktemp('made')
     (folder / 'stage.yaml').write_text(STAGE)
-    (folder / 'program.yaml').write_text(PROGRAM)
+    (folder / 'program.yaml').write_text(SLOW_PROGRAM)
     (folder / 'sine.yaml').write_text(SINE)
     for program, out in (('program.yaml', 'record.npz'), ('sine.yaml', 'sine.csv')):
         files = ['--config', folder / 'stage.yaml', '--program', folder / program, folder / out]

@@ -12,7 +12,7 @@ import sys
 import time
 
 from command_line import refuse, run, succeed
-from diagnosis_examples import base_model, example, measured, RATE, refined_model
+from diagnosis_examples import example, measured, refined_model
 import jsonschema
 import numpy as np
 import piezo_ident as pi
@@ -23,6 +23,7 @@ from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run
 from piezo_ident.record.record import Record
 from piezo_ident.report.to_json import diagnosis_schema
+from programs import SLOW, slow_model
 import pytest
 
 ONLY = ('--only', 'creep')
@@ -31,12 +32,12 @@ ONLY = ('--only', 'creep')
 @pytest.fixture
 def made(tmp_path) -> Path:
     """Return a folder with a model that knows no creep, and records of a stage that creeps."""
-    base_model().save(tmp_path / 'model.yaml')
+    slow_model().save(tmp_path / 'model.yaml')
     record = measured('val.npz')
     pi.write(record, tmp_path / 'val.npz')
     (piece,) = record.pieces
     # another part of the same stage's life
-    late = piece.cut(round(2.6 * RATE), piece.n)
+    late = piece.cut(round(2.6 * SLOW), piece.n)
     pi.write(Record((late,), 'unseen.npz'), tmp_path / 'unseen.npz')
     return tmp_path
 
@@ -75,7 +76,7 @@ def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
     assert (report / 'model.yaml').read_bytes() == refined.read_bytes()
     record = measured()
     assert free_run(model, record).errors.percent < 0.01
-    assert free_run(base_model(), record).errors.percent > 0.5
+    assert free_run(slow_model(), record).errors.percent > 0.5
     (row,) = [line for line in text.splitlines() if line.startswith('unseen.npz  ')]
     before, after = map(float, row.split()[1:3])
     assert after < 0.2 * before

@@ -13,7 +13,6 @@ import importlib
 from pathlib import Path
 import sys
 
-from diagnosis_examples import base_model
 from diagnosis_examples import measured as example_record
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
@@ -31,25 +30,14 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
+from programs import identification_program, slow_model
 import pytest
 
 # the name of the package is that of the function
 diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 ROOT = Path(__file__).resolve().parents[2]
 RATE = 20_000.0
-IDENTIFICATION = """
-limits: [0, 10]
-sample_rate: 20000
-seed: 1
-slew: 40
-segments:
-  - {signal: idle, duration: 0.1}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 16}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 2}
-  - {signal: triangle, slope: 12}
-  - {signal: idle, duration: 0.1}
-"""
+IDENTIFICATION = identification_program(noise=2, slope=12)
 
 
 @pytest.fixture(scope='module')
@@ -303,7 +291,7 @@ def test_a_singular_fit_is_an_error_of_ours(scale):
     (piece,) = example_record()
     huge = Record((replace(piece, y=scale * piece.y),), 'huge')
     with pytest.raises(IdentificationError, match='singular'):
-        diagnose(base_model(), huge, DiagnosisSettings(effects=('creep',)))
+        diagnose(slow_model(), huge, DiagnosisSettings(effects=('creep',)))
 
 
 def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatch):
@@ -316,7 +304,7 @@ def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatc
 
     monkeypatch.setattr(search, 'fit_jointly', fails_for_drift)
     few = DiagnosisSettings(effects=('creep', 'thermal_drift', 'gain_drift'))
-    result = diagnose(base_model(), example_record(), few)
+    result = diagnose(slow_model(), example_record(), few)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     assert 'thermal_drift was not judged: singular' in result.warnings
 

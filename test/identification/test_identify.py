@@ -22,6 +22,7 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, Scaling
 from piezo_ident.record.record import Piece, Record, Segment
+from programs import identification_program
 import pytest
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
@@ -31,19 +32,7 @@ DATA = Path(os.environ.get('PIEZO_IDENT_DATA', ROOT.parent / 'shared/data'))
 PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
 DENSE = SimulatedStage.load(ROOT / 'config/stage_dense.yaml')
 FULL = Program.load(ROOT / 'config/program_identification.yaml')
-SHORT = """
-limits: [0, 10]
-sample_rate: 20000
-seed: 1
-slew: 40
-segments:
-  - {signal: idle, duration: 0.1}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 16}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1.5}
-  - {signal: triangle, slope: 20}
-  - {signal: idle, duration: 0.1}
-"""
+SHORT = identification_program()
 #: the search over orders has tests of its own
 QUICK = Settings(order=(10, 10), thresholds=10)
 FREQUENCIES = (1, 10, 50, 80, 100, 120)

@@ -17,23 +17,14 @@ from piezo_ident.identification.three_steps import first_step, second_step, tria
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
+from programs import identification_program
 import pytest
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
-PROGRAM = """
-limits: [0, 10]
-sample_rate: 20000
-slew: 40
-segments:
-  - {signal: idle, duration: 0.05}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 12}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 24, frequency: 60}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
-  - {signal: triangle, slope: 30}
-"""
+PROGRAM = identification_program(steps=12, noise=1, slope=30)
 
 
 def runs(*records):

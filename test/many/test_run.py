@@ -14,7 +14,7 @@ import sys
 import time
 from types import SimpleNamespace
 
-from diagnosis_examples import base_model, measured
+from diagnosis_examples import measured
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main
@@ -25,46 +25,27 @@ from piezo_ident.many.run import Diagnose, Identify, run_many
 from piezo_ident.many.table import csv_text, Row
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
-from piezo_ident.model.stage_model import Scaling, StageModel
-from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.assemble import ReadOptions
+from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-RATE = 2000.0
-PROGRAM = """\
-limits: [0, 10]
-seed: 1
-segments:
-  - {signal: idle, duration: 0.3}
-  - {signal: step, bias: 5, size: 1, hold: 0.06, count: 8}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 12, frequency: 20}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 600, duration: 2}
-  - {signal: triangle, slope: 10}
-"""
 FAST = Identify(Settings(order=(2, 2), thresholds=5, solver='least_squares'))
 STROKES = {'stage_1': 70e-6, 'stage_2': 72e-6, 'stage_10': 74e-6}
 
 
 def stage(stroke: float) -> SimulatedStage:
-    model = StageModel(
-        sample_rate=RATE,
-        scaling=Scaling(0.0, 10.0, 0.0, stroke, (0.0, 10.0)),
-        hysteresis=Hysteresis(
-            np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.2, 0.1]), p1=-0.2, p2=0.9
-        ),
-        dynamics=Dynamics(np.array([-1.2, 0.5]), np.array([0.2, 0.1])),
-        delay=Delay(2),
+    model = slow_model()
+    return SimulatedStage(
+        replace(model, scaling=replace(model.scaling, Y=stroke)), Sensor(noise_rms=1e-9)
     )
-    return SimulatedStage(model, Sensor(noise_rms=1e-9))
 
 
 @pytest.fixture(scope='module')
 def records(tmp_path_factory) -> list[Path]:
     """Three records and a file that is none."""
     folder = tmp_path_factory.mktemp('line')
-    sequence = parse_program(PROGRAM).build(RATE)
+    sequence = parse_program(SLOW_PROGRAM).build(SLOW)
     for i, (name, stroke) in enumerate(STROKES.items()):
         record = stage(stroke).play(sequence, np.random.default_rng(i))
         pi.write(record, folder / f'{name}.npz')
@@ -161,7 +142,7 @@ def test_diagnosis_with_a_model_for_each(tmp_path):
     paths = [tmp_path / 'records' / f'{name}.npz' for name in ('a', 'b')]
     for path in paths:
         pi.write(record, path)
-    base_model().save(tmp_path / 'given/a.yaml')
+    slow_model().save(tmp_path / 'given/a.yaml')
     first, second = run_many(paths, tmp_path / 'out', Diagnose(tmp_path / 'given'), jobs=1)
     assert first.is_good, first.reason
     assert first.values['verdict'] and first.values['model'] == 'a.yaml'

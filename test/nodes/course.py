@@ -24,24 +24,12 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Record
+from programs import identification_program
 import yaml
 
 FS = 20_000.0
 #: three seconds with all that the three steps stand on
-PROGRAM = """
-limits: [0, 10]
-sample_rate: 20000
-seed: 1
-rest: 0
-slew: 40
-segments:
-  - {signal: idle, duration: 0.1}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 8}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 8, frequency: 20}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
-  - {signal: triangle, slope: 40}
-  - {signal: idle, duration: 0.1}
-"""
+PROGRAM = identification_program(steps=8, cycles=8, frequency=20, noise=1, slope=40)
 #: a second of this and that
 SHORT = """
 limits: [0, 10]

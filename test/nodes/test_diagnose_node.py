@@ -11,8 +11,9 @@ identified and then diagnosed from nothing: what data that takes, the identifier
 import json
 import time
 
-from course import paper, PROGRAM, SETTINGS
+from course import paper, SETTINGS
 import numpy as np
+from programs import identification_program
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
@@ -27,7 +28,9 @@ import yaml
 TRUTHS = ('creep', 'rate_dependent_hysteresis')
 #: a quarter of the usual rate is enough for what is told apart here
 FS = 5000.0
-LEARN = PROGRAM.replace('20000', '5000').replace('cutoff: 3000', 'cutoff: 1500')
+LEARN = identification_program(
+    rate=5000, steps=8, cycles=8, frequency=20, cutoff=1500, noise=1, slope=40
+)
 #: eight seconds with two amplitudes, minor loops and a multisine, but no hold
 SWEEPS = """
 limits: [0, 10]

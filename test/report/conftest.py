@@ -10,20 +10,12 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.record.record import Fault
+from programs import identification_program
 import pytest
 
-IDENTIFICATION = """
-limits: [0, 10]
-seed: 1
-slew: 100
-segments:
-  - {signal: idle, duration: 0.1}
-  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 6}
-  - {signal: settle, bias: 5, amplitude: 0.48, cycles: 8, frequency: 20}
-  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
-  - {signal: triangle, slope: 30}
-  - {signal: idle, duration: 0.1}
-"""
+IDENTIFICATION = identification_program(
+    slew=100, steps=6, cycles=8, frequency=20, noise=1, slope=30
+)
 
 VALIDATION = """
 limits: [0, 10]

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from diagnosis_examples import base_model, example, hostile, measured, refined_model
+from diagnosis_examples import example, hostile, measured, refined_model
 import numpy as np
 from piezo_ident.diagnosis.results import Errors, FoundParameter
 from piezo_ident.model.free_run import free_run
@@ -23,6 +23,7 @@ from piezo_ident.report.diagnosis import (
 )
 from piezo_ident.report.html import page_html
 from piezo_ident.report.table import number
+from programs import slow_model
 import pytest
 
 
@@ -81,7 +82,7 @@ def test_records_that_took_no_part():
     other = measured('other')
     result = validated(example('named'), [other])
     (unseen,) = result.unseen
-    runs = [free_run(model, other) for model in (base_model(), refined_model())]
+    runs = [free_run(model, other) for model in (slow_model(), refined_model())]
     errors = [(run.errors_after_start or run.errors).percent for run in runs]
     assert [unseen.before, unseen.after] == errors
     assert errors[1] < 0.1 * errors[0]
@@ -118,7 +119,7 @@ def test_residual_near_the_reversals():
 
 
 def test_what_changed_in_a_model():
-    given, refined = base_model(), refined_model()
+    given, refined = slow_model(), refined_model()
     assert changes(given, given) == ()
     assert changes(given, refined) == ('with creep',)
     assert changes(refined, given) == ('without creep',)

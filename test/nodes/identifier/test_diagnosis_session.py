@@ -5,7 +5,7 @@
 
 import itertools
 
-from diagnosis_examples import base_model, example, measured
+from diagnosis_examples import example, measured
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis.next_experiment import Experiment
@@ -16,6 +16,7 @@ from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.to_json import json_text
+from programs import slow_model
 import pytest
 
 HOLDS = Experiment('holds', 'this and that cannot be told apart')
@@ -75,7 +76,7 @@ class Lab:
 @pytest.fixture
 def lab():
     lab = Lab()
-    lab.session.take(base_model(), {})
+    lab.session.take(slow_model(), {})
     return lab
 
 
@@ -100,11 +101,11 @@ def test_without_a_model_or_data_and_an_excitation_it_refuses(lab):
 
 def test_what_the_model_was_made_from_does_not_judge_it(lab):
     feed(lab.capture, measured())
-    lab.session.take(base_model(), lab.capture.mark())
+    lab.session.take(slow_model(), lab.capture.mark())
     assert lab.session.begin().startswith('asking for sweeps')
     lab.play()
     (snapshot, given, asked, _), seconds = lab.jobs[-1]
-    assert given is base_model() and asked == ('sweeps',)
+    assert given is slow_model() and asked == ('sweeps',)
     assert seconds == pytest.approx(measured().duration, abs=0.01)
     assert snapshot.record().n == measured().n
 
@@ -117,7 +118,7 @@ def test_it_judges_asks_judges_everything_and_concludes(lab):
     assert lab.end is None and lab.answers[-1][0] == 'holds'
     lab.play()
     (snapshot, given, asked, _), _ = lab.jobs[-1]
-    assert given is base_model() and asked == ('holds',)
+    assert given is slow_model() and asked == ('holds',)
     assert snapshot.record().n == 2 * measured().n
     last = outcome_of('named')
     lab.session.take_outcome(last)
@@ -170,7 +171,7 @@ def test_a_capture_without_motion_asks_and_fails_where_nobody_can_be_asked(lab):
     (piece,) = measured()
     still = Record((Piece(np.zeros(4000), piece.y[:4000], piece.sample_rate),))
     feed(lab.capture, still)
-    found = diagnose_capture(lab.capture.snapshot(), base_model(), (), None, lambda *_: None)
+    found = diagnose_capture(lab.capture.snapshot(), slow_model(), (), None, lambda *_: None)
     assert found.diagnosis is None and found.wanted.kind == 'sweeps'
     lab.session.begin()
     lab.session.take_outcome(found)
@@ -185,7 +186,7 @@ def test_another_model_forgets_the_verdict(lab):
     feed(lab.capture, measured())
     lab.session.begin()
     lab.session.take_outcome(outcome_of('named'))
-    lab.session.take(base_model(), lab.capture.mark())
+    lab.session.take(slow_model(), lab.capture.mark())
     assert lab.session.diagnosis is None and not lab.session.seconds
     lab.capture.clear()
     lab.session.forget()
