@@ -87,6 +87,11 @@ class ArxFactor:
         theta[:na] *= -1.0
         return theta, loss
 
+    def dynamics(self, na: int, nb: int, d: int) -> Dynamics:
+        """Return one order by least squares, possibly unstable."""
+        theta, _ = self.fit(na, nb, d)
+        return Dynamics(a=theta[:na], b=theta[na:])
+
     def fits(self, na: int, nb_max: int, d: int) -> list[tuple[NDArray[np.float64], float]]:
         """
         Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.

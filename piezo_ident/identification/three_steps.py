@@ -202,8 +202,7 @@ def _orders(
         )
     found = []
     for i, (na, nb) in enumerate(orders):
-        theta, _ = factor.fit(na, nb, delay)
-        ls = Dynamics(a=theta[:na], b=theta[na:])
+        ls = factor.dynamics(na, nb, delay)
         iv = instrumental_variables(u, y, ls, delay)
         errors = {'least squares': held_error(ls), 'instrumental variables': held_error(iv)}
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls

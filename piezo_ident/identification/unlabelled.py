@@ -73,17 +73,9 @@ class JointFit:
     """
     What one unlabelled run gave.
 
-    Attributes
-    ----------
-    delay : DelayResult
-    dynamics : DynamicsResult
-    G : Dynamics
-    memory : ndarray or None
-        Play outputs before the first sample, for the thresholds of `hysteresis`.
-    hysteresis : Hysteresis
-        The H that went with the search for G.
-    not_identified : tuple of (str, str)
-        What stayed at its neutral value, and why.
+    `memory` gives the play outputs before the first sample for any thresholds; `hysteresis` is the
+    H that went with the search for G; `not_identified` says what stayed at its neutral value, and
+    why.
     """
 
     delay: DelayResult
@@ -104,6 +96,12 @@ def _memory_rule(
         return np.asarray(np.clip(curve, u0 - r, u0))
 
     return rule
+
+
+def _known(run: Run, n_fit: int) -> NDArray[np.bool_]:
+    """Return the samples without the unknown start; all of a record that hardly comes back."""
+    known = run.known[:n_fit]
+    return known if known.sum() >= n_fit // 5 else np.ones(n_fit, dtype=bool)
 
 
 def _windows(run: Run, n_fit: int) -> NDArray[np.bool_]:
@@ -175,8 +173,7 @@ def _search_order(
         return None
     factor = arx_factor(u, y, na_max, nb_max)
     for i, (na, nb) in enumerate(orders):
-        theta, _ = factor.fit(na, nb, 0)
-        ls = Dynamics(a=theta[:na], b=theta[na:])
+        ls = factor.dynamics(na, nb, 0)
         starts = [stabilised(ls), stabilised(instrumental_variables(u, y, ls, 0))]
         for start in starts:
             fit = output_error([stretch], start, maxiter=20)
@@ -195,24 +192,11 @@ def joint_fit(
     """
     Fit delay, low-order dynamics and the memory of the start on the first part of a run.
 
-    Parameters
-    ----------
-    run : Run
-    n_fit : int
-        Samples that may be used.
-    scaling : Scaling
-    settings : Settings
-    progress : callable
-
     Raises
     ------
     IdentificationError
-        When the fitted part is too short, or its voltage hardly moves.
+        When its voltage hardly moves.
     """
-    if n_fit < 100:
-        raise IdentificationError(
-            f'{run.record}: {n_fit} samples to fit are too few; at least 100 are needed'
-        )
     u, x = run.u[:n_fit], run.x[:n_fit]
     swing = float(np.ptp(u))
     if swing < 0.02:
@@ -227,10 +211,7 @@ def joint_fit(
     delay = Delay(found.samples)
     rate = run.piece.sample_rate
     r = even_thresholds(swing, 40)
-    known = run.known[:n_fit]
-    # a record that never comes back over its range has no part without the unknown start
-    if known.sum() < n_fit // 5:
-        known = np.ones(n_fit, dtype=bool)
+    known = _known(run, n_fit)
     G = Dynamics.unit()
     rule: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     windows = _windows(run, n_fit)
@@ -336,9 +317,7 @@ def fit_unlabelled(
     joint = joint_fit(run, n_fit, scaling, settings, progress)
     delay = Delay(joint.delay.samples)
     u, x = run.u[:n_fit], run.x[:n_fit]
-    use = run.known[:n_fit].copy()
-    if use.sum() < n_fit // 5:
-        use[:] = True
+    use = _known(run, n_fit)
     # what chooses the thresholds is a part of what is fitted in the end, never the held-out end
     late = np.zeros(n_fit, dtype=bool)
     late[n_fit - int(0.25 * use.sum()) :] = True
