@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .cores import plays, Row
 from .stage import Base, Stage, VOLTS
 
-__all__ = ['base_of', 'difference', 'left_over']
+__all__ = ['base_of', 'left_over']
 
 Array = NDArray[np.float64]
 
@@ -21,10 +21,6 @@ Array = NDArray[np.float64]
 THRESHOLDS = 40
 #: one sample in so many is compared
 STRIDE = 8
-
-
-def _play(u: Array, r: float) -> Array:
-    return plays(u, Row(np.array([r]), np.ones(1)))
 
 
 def base_of(base: Base, v: ArrayLike) -> Array:
@@ -41,30 +37,15 @@ def base_of(base: Base, v: ArrayLike) -> Array:
     """
     u = np.ascontiguousarray(v, dtype=np.float64) / VOLTS
     parts = [u, u**3]
-    parts += [_play(u, r) for r in (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS]
+    for r in (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS:
+        parts.append(plays(u, Row(np.array([r]), np.ones(1))))
     columns = [np.ones(u.size), *(base.carry(part) for part in parts)]
     Q, _ = np.linalg.qr(np.stack([c[::STRIDE] for c in columns], axis=1))
     return np.asarray(Q)
 
 
-def difference(
-    stage: Stage,
-    t: ArrayLike,
-    v: ArrayLike,
-    channels: Mapping[str, ArrayLike] | None = None,
-) -> tuple[Array, float]:
-    """Return what the effects change [m], shape (n,), and the stroke without them [m]."""
-    with_them = stage.respond(t, v, channels=channels, clean=True)
-    without = stage.without_effects().respond(t, v, clean=True)
-    return with_them - without, float(np.ptp(without))
-
-
 def left_over(
-    stage: Stage,
-    t: ArrayLike,
-    v: ArrayLike,
-    channels: Mapping[str, ArrayLike] | None = None,
-    basis: Array | None = None,
+    stage: Stage, t: ArrayLike, v: ArrayLike, channels: Mapping[str, ArrayLike], basis: Array
 ) -> tuple[float, float]:
     """
     Return the rms of what the effects change, before and after a refit [% of stroke].
@@ -74,13 +55,13 @@ def left_over(
     stage : Stage
     t, v : array_like, shape (n,)
         [s] and [V], at 20 kHz.
-    channels : mapping, optional
-    basis : ndarray, optional
-        From `base_of`, when it is there already.
+    channels : mapping
+    basis : ndarray
+        From `base_of`.
     """
-    change, stroke = difference(stage, t, v, channels)
-    Q = base_of(stage.base, v) if basis is None else basis
-    some = change[::STRIDE]
-    rest = some - Q @ (Q.T @ some)
+    without = stage.without_effects().respond(t, v, clean=True)
+    change = (stage.respond(t, v, channels=channels, clean=True) - without)[::STRIDE]
+    rest = change - basis @ (basis.T @ change)
+    stroke = float(np.ptp(without))
     raw, left = (100.0 * float(np.sqrt(np.mean(x**2))) / stroke for x in (change, rest))
     return raw, left

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import laws
 from .cores import Density, everett, plays
 from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
-from .sizes import gain_of
-from .table import EFFECTS, LATER, OUTSIDE, VARIANTS
+from .table import EFFECTS, gain_of, LATER, OUTSIDE, VARIANTS
 
 __all__ = ['SPAN', 'VOLTS', 'Base', 'Stage', 'make_base', 'make_stage']
 
