@@ -63,7 +63,7 @@ FURTHER = 0.6
 LEAST_GAIN = 0.10
 #: factor by which an effect may raise the rms of any kind of excitation
 HARM = 1.25
-#: a rival that leaves less than this times what the best leaves is not told from it
+#: a rival that leaves less than this times what the best leaves is not separated from it
 AHEAD = 1.6
 #: a rival with more parameters must leave less than this times what a law that fits leaves
 RICHER_AHEAD = 0.95

@@ -266,7 +266,7 @@ def _base(simulator: Simulator, given: State) -> Fitted:
 
 
 def _lines_and_floor(simulator: Simulator, state: State) -> tuple[LineSearch, NoiseFloor]:
-    """Return the lines in the residual of a state, and the noise floor beside them."""
+    """Return the lines in the residual of a state, and the noise floor without them."""
     parts = _parts(simulator, state)
     found = find_lines(parts, all_stretches(parts))
     # hum is no noise: it can be explained

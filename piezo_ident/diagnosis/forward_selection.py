@@ -237,7 +237,7 @@ def _polished(
     """
     Fit several effects again, each from fresh starts now that the others are known.
 
-    An effect that was found beside others not yet in the model took a law that made up for them.
+    An effect that was found before others were in the model took a law that made up for them.
     """
     for i in range(len(fitted.state.effects)):
         for fresh in _afresh(simulator, fitted, i, lines, tick):
@@ -259,7 +259,7 @@ def _afresh(
     lines: Sequence[float],
     tick: Callable[[], None],
 ) -> Iterator[Fitted]:
-    """Yield fits in which effect i starts anew, from its best trials beside the others."""
+    """Yield fits in which effect i starts again from its best trials."""
     rows, own = simulator.rows, fitted.state.effects[i]
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)

@@ -75,10 +75,10 @@ def warnings_of(
 def _of_time_driven(added: Added, beside_lasting: bool) -> str:
     effect = added.effect
     is_off = all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
-    # beside a lasting effect H was fitted to the mean of what wanders
+    # with a lasting effect H was fitted to the mean of what wanders
     kept = 'its mean' if beside_lasting and not is_off else 'it switched off'
     if not beside_lasting:
-        kept += ' beside the hysteresis as it was given'
+        kept += ' with the hysteresis as it was given'
     return (
         f'{added.name} follows time and not the voltage: what was found holds in its own '
         f'record alone, so the refined model carries {kept}'
@@ -102,7 +102,7 @@ def sentence(
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
     missed = 'what the model missed'
     if findings.effects and refit < (1.0 - WORTH_REFIT_IN_DOUBT) * before:
-        # shares are of what a refit leaves: a sensor set to zero anew is no effect
+        # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
         fall += f', with the refit alone to {refit:.3g} %'
     share = f'{100.0 * findings.share:.0f} % of {missed}'

@@ -73,7 +73,7 @@ def next_experiment(
     """
     Return the experiment that would decide what is open, None when nothing is or none would.
 
-    First comes what was found or could not be told apart, then what could not be tested at all.
+    First comes what was found or could not be separated, then what could not be tested at all.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def next_experiment(
     'sweeps'
     """
     if diagnosis is None:
-        reason = 'no motion was captured beside what the model was identified from'
+        reason = 'no motion was captured but that of the identification'
         return None if 'sweeps' in asked else Experiment('sweeps', reason)
     low, high = diagnosis.given.scaling.range
     span = max(high - low, *(float(np.ptp(r.voltage_range)) for r in records), 1e-12)
@@ -108,7 +108,7 @@ def next_experiment(
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[tuple[tuple[str, ...], str, str]]:
     """Yield names in doubt, the gravest first, which a motion must show ('': any), and how."""
-    alike, untested = 'cannot be told apart', 'cannot be tested'
+    alike, untested = 'cannot be separated', 'cannot be tested'
     if diagnosis.group is not None:
         yield diagnosis.group.names, '', alike
     for effect in diagnosis.effects:

@@ -59,7 +59,7 @@ def refine(
     ):
         return Refined(model, given, is_given=True)
     if findings.effects and not lasting(findings.effects):
-        # H was refitted beside a drift that another record will not repeat
+        # H was refitted together with a drift that another record will not repeat
         effects = tuple(
             Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
             for added in fitted.state.effects

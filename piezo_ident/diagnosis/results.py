@@ -168,7 +168,7 @@ class Unseen:
         Of the model as given and of the refined one; of a record that does not start at rest,
         behind the part from which its start is estimated.
     before_centred, after_centred : float
-        The same without the mean of the error: a sensor may have been set to zero anew.
+        The same without the mean of the error: a sensor may have been set to zero again.
     n : int
         Samples judged.
     sines : tuple of (float, float, float)
@@ -221,7 +221,7 @@ class Diagnosis(Showable):
         Best first.
     before, refit, after : Errors
         Of the model as given, of the base model refitted (held out), of the refined model (held
-        out); what follows time counts as it was found in these records, with H refitted beside
+        out); what follows time counts as it was found in these records, and H as refitted with
         it, though the model leaves both out where there is nothing else.
     noise_floor : float or None
         Rms of single samples, % of stroke.

@@ -5,7 +5,7 @@
 One round of the search: which candidate lowers the error on data that were not fitted.
 
 Every candidate is tried by finite differences of the whole model, the effect switched slightly
-on.  Its columns are scored by what they gain on held-out blocks beside everything that is in the
+on.  Its columns are scored by what they gain on held-out blocks in addition to all that is in the
 model already, against what chance gains on circular-shift surrogates of the residual.  The most
 promising ones are fitted together with everything else.
 """

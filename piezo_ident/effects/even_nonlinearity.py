@@ -15,7 +15,7 @@ __all__ = ['EvenNonlinearity']
 
 class EvenNonlinearity(Effect):
     """
-    Even powers of the voltage beside H.
+    Even powers of the voltage, added to H.
 
     ``w = H[v] + p0 v^2 + p4 v^4 + p6 v^6``.  The static part of H is ``p1 v^3 + p2 v``, odd
     about v = 0; electrostriction, which goes with the square of the field, and the unequal
@@ -23,7 +23,7 @@ class EvenNonlinearity(Effect):
 
     Notes
     -----
-    Electrostriction as a square beside the linear piezoelectric effect: D. Damjanovic,
+    Electrostriction as a square added to the linear piezoelectric effect: D. Damjanovic,
     "Ferroelectric, dielectric and piezoelectric properties of ferroelectric thin films and
     ceramics", Rep. Prog. Phys. 61, 1998, doi:10.1088/0034-4885/61/9/002.  H without even terms:
     Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, eqs. 3 and 6.

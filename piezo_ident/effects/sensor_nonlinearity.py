@@ -19,7 +19,7 @@ class SensorNonlinearity(Effect):
 
     ``y = x + c2 x^2 + c3 x^3 + c4 x^4``, with x and y as shares of the output span.  The error
     is one and the same function of the displacement at every frequency, behind G and the delay;
-    close to a resonance that tells it from a curvature in front of G.
+    close to a resonance that separates it from a curvature in front of G.
 
     Notes
     -----

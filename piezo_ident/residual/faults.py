@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data that show beside a model: missed samples, jitter, outliers, clipping."""
+"""Faults of the data that a model shows: missed samples, jitter, outliers, clipping."""
 
 from __future__ import annotations
 
@@ -257,7 +257,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
     sigma^2 + jitter^2 (dy/dt)^2.  Third differences keep what a model misses out of it, where
     the motion is smooth; what is left of it grows with the motion's own third differences, which
-    are a cause beside, and where they are large nothing is read.
+    are a second cause, and where they are large nothing is read.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)
@@ -297,7 +297,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
 
 
 def _slope(x: Array, other: Array, y: Array) -> tuple[float, float]:
-    """Return the slope of y over x beside another cause, and its robust standard deviation."""
+    """Return the slope of y over x next to another cause, and its robust standard deviation."""
     scale = max(float(other.max(initial=0.0)), 1e-300)
     A = np.column_stack([x / float(x.max()), np.ones(x.size), other / scale])
     if other.max(initial=0.0) <= 0.0:

@@ -24,7 +24,7 @@ TOP, RATE = 0.8, 2500.0
 SHORTEST = 0.3
 #: neighbours on either side that a line is held against, and fewest of them [bins]
 NEIGHBOURS, FEWEST = 31, 7
-#: a median of exponential variables tells as much about their scale as this share as a mean
+#: a median of exponential variables is worth this share of a mean as an estimate of their scale
 MEDIAN_WORTH = 0.48
 
 

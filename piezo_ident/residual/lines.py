@@ -94,7 +94,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     found: list[Line] = []
     for _ in range(2 * LINES):
         score, gain = search.score()
-        # strong lines are significant beside themselves too; the strongest is where it is
+        # strong lines are significant at their neighbours, too; the strongest is where it is
         significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
             break

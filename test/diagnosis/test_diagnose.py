@@ -198,7 +198,7 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
 
 def test_a_share_is_of_what_a_refit_leaves(truths):
     model, record, _ = measured('creep', 0.3, 1)
-    # the sensor was set to zero anew
+    # the sensor was set to zero again
     (piece,) = record.pieces
     moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
     result = diagnose(model, moved, DiagnosisSettings(effects=('creep',)))
@@ -210,7 +210,7 @@ def test_a_share_is_of_what_a_refit_leaves(truths):
 def test_hum_stays_in_its_record(truths):
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     result = diagnose(model, record, FEW)
-    assert 'switched off beside the hysteresis as it was given' in ' '.join(result.warnings)
+    assert 'switched off with the hysteresis as it was given' in ' '.join(result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
     frequency = result.effects[0].parameters['frequency'].value
@@ -350,7 +350,7 @@ def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     stroke = make_rows(model, [record]).stroke
-    # the sensor was set to zero anew in between
+    # the sensor was set to zero again in between
     moved = Record((replace(piece, y=piece.y + 500e-6),), 'moved')
     assert make_rows(model, [record, moved]).stroke == pytest.approx(stroke, rel=1e-9)
     glitch = piece.y.copy()

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rules of a verdict, on made-up errors of blocks: what is told apart, and what is kept."""
+"""The rules of a verdict, on made-up errors of blocks: what is separated, and what is kept."""
 
 from types import SimpleNamespace
 
@@ -57,7 +57,7 @@ def rivals(rows, *contenders):
     return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE)]
 
 
-# -- which candidates are told apart -----------------------------------------------------------
+# -- which candidates are separated -------------------------------------------------------------
 
 
 def test_a_clear_lead_tells_apart(rows):

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The noise floor: rest and repeats are found, and noise is told from creep and misfit."""
+"""The noise floor: rest and repeats are found, and noise is separated from creep and misfit."""
 
 import numpy as np
 from piezo_ident.common.errors import DataError
