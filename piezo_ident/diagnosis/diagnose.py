@@ -327,7 +327,7 @@ def _effects(
         return ()
     fitted = selected.fitted
     std = standard_deviations(rows, fitted)
-    steps = [this.contenders[0].fitted.mean_square for this in selected.taken[:-1]]
+    steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
     levels = [base.mean_square, *steps, fitted.mean_square]
     found = []
     for i, (added, level, left) in enumerate(

@@ -108,7 +108,7 @@ class ForwardSelection:
         return max(fitted.mean_square - self._noise, 0.0)
 
     def _left(self, this: Round) -> float:
-        return self._beyond_noise(this.contenders[0].fitted if this.contenders else this.before)
+        return self._beyond_noise(this.contenders[0] if this.contenders else this.before)
 
     def _round(self, fitted: Fitted) -> Round:
         have = self._have | {added.name for added in fitted.state.effects}
@@ -130,9 +130,7 @@ class ForwardSelection:
         explainable = self._beyond_noise(start)
         while self._takes(this, explainable, first=not taken):
             taken.append(this)
-            fitted, dropped = _without_needless(
-                self._simulator, this.contenders[0].fitted, self._least
-            )
+            fitted, dropped = _without_needless(self._simulator, this.contenders[0], self._least)
             for i in dropped:
                 del taken[i]
             if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
@@ -164,18 +162,18 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
     if not this.contenders:
         return False
     best = this.contenders[0]
-    before, after = this.before.mean_square, best.fitted.mean_square
+    before, after = this.before.mean_square, best.mean_square
     gain, left = before - after, max(before - noise, 1e-300)
     if rows.percent(gain) < criteria.SMALLEST_EFFECT or gain < criteria.LEAST_GAIN * explainable:
         return False
     # what follows time alone fits a shifted residual as well; its lines and trends have tests
     # of their own
-    chance = 0.0 if best.effect.time_driven else this.chance.get(best.name, 0.0)
+    chance = 0.0 if find_effect(best.name).time_driven else this.chance.get(best.name, 0.0)
     if gain < criteria.BEYOND_CHANCE * chance:
         return False
     if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
         return False
-    return not _harms(rows, this.before, best.fitted, noise)
+    return not _harms(rows, this.before, best, noise)
 
 
 def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:

@@ -172,6 +172,11 @@ class Fitted:
     transfer: Array
 
     @property
+    def name(self) -> str:
+        """Name of the effect that was added last."""
+        return self.state.effects[-1].name
+
+    @property
     def mean_square(self) -> float:
         """Mean square error of the blocks held out in spread sets, normalised."""
         return float(self.errors.sum() / self.e.size)

@@ -13,7 +13,7 @@ promising ones are fitted together with everything else.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Contender', 'Round', 'Scored', 'score_trials', 'search_round', 'started']
+__all__ = ['Round', 'Scored', 'score_trials', 'search_round', 'started']
 
 Array = NDArray[np.float64]
 
@@ -86,19 +86,6 @@ class Scored:
 
 
 @dataclass(frozen=True, eq=False)
-class Contender:
-    """A candidate that was fitted together with everything else."""
-
-    effect: type[Effect]
-    fitted: Fitted
-
-    @property
-    def name(self) -> str:
-        """The effect's name."""
-        return self.effect.name
-
-
-@dataclass(frozen=True, eq=False)
 class Round:
     """
     One round of the search.
@@ -109,8 +96,8 @@ class Round:
         What the candidates were added to.
     best : dict of str to Scored
         The best trial of every candidate that could be tried.
-    contenders : tuple of Contender
-        Those that were fitted jointly, best first.
+    contenders : tuple of Fitted
+        Candidates that were fitted jointly with everything else, best first.
     chance : dict of str to float
         Mean square that a candidate gains on surrogates of the residual, at best.
     visible : dict of str to float
@@ -121,7 +108,7 @@ class Round:
 
     before: Fitted
     best: dict[str, Scored]
-    contenders: tuple[Contender, ...]
+    contenders: tuple[Fitted, ...]
     chance: dict[str, float]
     visible: dict[str, float]
     warnings: tuple[str, ...] = ()
@@ -180,9 +167,9 @@ def _contenders(
     before: Fitted,
     promising: Sequence[Sequence[Scored]],
     tick: Tick,
-) -> tuple[list[Contender], list[str]]:
+) -> tuple[list[Fitted], list[str]]:
     """Return the promising candidates fitted jointly, best first, and the fits that failed."""
-    contenders, warnings = [], []
+    contenders, warnings = list[Fitted](), list[str]()
     at = 0.5
 
     def alive() -> None:
@@ -205,29 +192,29 @@ def _contenders(
             except IdentificationError as error:
                 failure = f'{effect.name} was not judged: {error}'
         if fits:
-            contenders.append(Contender(effect, min(fits, key=lambda f: f.mean_square)))
+            contenders.append(min(fits, key=lambda f: f.mean_square))
         elif failure:
             warnings.append(failure)
-    contenders.sort(key=lambda c: c.fitted.mean_square)
+    contenders.sort(key=lambda c: c.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
-        state = contender.fitted.state
+        state = contender.state
         try:
             better = fit_jointly(simulator, state, base_at(simulator, state), tick=alive)
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
         else:
-            contenders[i] = replace(contender, fitted=better)
-    contenders.sort(key=lambda c: c.fitted.mean_square)
+            contenders[i] = better
+    contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
 
 
-def _simplest_first(contenders: list[Contender], noise: float) -> list[Contender]:
+def _simplest_first(contenders: list[Fitted], noise: float) -> list[Fitted]:
     """Move the effect with the fewest parameters to the front of those that fit as well."""
     if not contenders:
         return contenders
-    limit = SIMPLER * max(contenders[0].fitted.mean_square - noise, 0.0) + noise
-    good = [c for c in contenders if c.fitted.mean_square <= limit]
-    simplest = min(good, key=lambda c: len(c.fitted.parameters))
+    limit = SIMPLER * max(contenders[0].mean_square - noise, 0.0) + noise
+    good = [c for c in contenders if c.mean_square <= limit]
+    simplest = min(good, key=lambda c: len(c.parameters))
     return [simplest, *(c for c in contenders if c is not simplest)]
 
 

@@ -30,7 +30,7 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Contender, Round
+from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import catalogue, find_effect
 
 __all__ = [
@@ -96,7 +96,7 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
     for i, this in enumerate(taken):
         contenders = (*this.contenders, *(bent.contenders[:1] if bent and i == 0 else ()))
         # what the effects after it account for is held against none of them
-        rest_of = max(this.contenders[0].fitted.mean_square - fitted.mean_square, 0.0) + noise
+        rest_of = max(this.contenders[0].mean_square - fitted.mean_square, 0.0) + noise
         whole = (base if i == 0 else this.before).mean_square
         rivals = rivals_of(rows, contenders, rest_of, whole - rest_of)
         names = tuple(dict.fromkeys((effects[i], *(c.name for c in rivals))))
@@ -117,10 +117,10 @@ def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:
 
 
 def rivals_of(
-    rows: Rows, contenders: Sequence[Contender], noise: float, explainable: float
-) -> tuple[Contender, ...]:
+    rows: Rows, contenders: Sequence[Fitted], noise: float, explainable: float
+) -> tuple[Fitted, ...]:
     """
-    Return the contenders that the data do not tell from the first one, which was added.
+    Return the contenders that the data do not separate from the first one, which was added.
 
     `noise` and `explainable` are mean squares: of the noise, and of what there was to explain.
     """
@@ -129,16 +129,14 @@ def rivals_of(
     return tuple(c for c in others if _as_good(c, best, noise, explainable, floor))
 
 
-def _as_good(
-    rival: Contender, best: Contender, noise: float, explainable: float, floor: float
-) -> bool:
+def _as_good(rival: Fitted, best: Fitted, noise: float, explainable: float, floor: float) -> bool:
     def fits(left: float) -> bool:
         return left <= max((1.0 - criteria.LAW_FITS) * explainable, floor)
 
-    left = max(best.fitted.mean_square - noise, 0.0)
-    other = max(rival.fitted.mean_square - noise, 0.0)
+    left = max(best.mean_square - noise, 0.0)
+    other = max(rival.mean_square - noise, 0.0)
     ratio = (other + floor) / (left + floor)
-    more = len(rival.fitted.parameters) - len(best.fitted.parameters)
+    more = len(rival.parameters) - len(best.parameters)
     if more > 0 and (fits(left) or best.name in CONTAINS.get(rival.name, ())):
         # nothing is left that a richer law is needed for
         return ratio <= criteria.RICHER_AHEAD
@@ -148,7 +146,7 @@ def _as_good(
         return False
     if more < 0 and fits(other):
         return True
-    difference = rival.fitted.errors - best.fitted.errors
+    difference = rival.errors - best.errors
     return standard_errors(difference) < criteria.STANDARD_ERRORS
 
 
@@ -168,7 +166,7 @@ def candidates_of(
         for name, s in first.best.items()
     }
     for c in first.contenders:
-        gain = (first.before.mean_square - c.fitted.mean_square) / left
+        gain = (first.before.mean_square - c.mean_square) / left
         shares[c.name] = max(shares[c.name], gain)
     found = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):

@@ -45,8 +45,7 @@ def fitted(mean_square, shape=FLAT, parameters=3):
 
 
 def contender(name, share_left, **kwargs):
-    fit = fitted(share_left * WHOLE, **kwargs)
-    return SimpleNamespace(name=name, effect=find_effect(name), fitted=fit)
+    return SimpleNamespace(name=name, **vars(fitted(share_left * WHOLE, **kwargs)))
 
 
 def a_round(*contenders, before=WHOLE):
