@@ -13,7 +13,6 @@ from course import (
     model_of,
     numbers,
     pairs_of,
-    PROGRAM,
     SETTINGS,
     simulated,
 )
@@ -395,91 +394,3 @@ def test_no_more_is_kept_than_the_limit(empty, blocks):
     assert float(empty.diagnostics('identifier')['room']) <= 0.1
     end = empty.finish('identifier/identify_delay')
     assert end['level'] != '0', end
-
-
-@pytest.fixture(scope='module')
-def course():
-    """Return a graph to drive a stage in; stage and excitation come when they are needed."""
-    with Graph() as g:
-        g.start('identifier', {**SETTINGS, 'program': PROGRAM, 'excitation_limit': 1.0})
-        yield g
-
-
-def test_run_without_an_excitation_fails_with_the_reason(course):
-    end = course.finish('identifier/run')
-    assert end['state'] == 'failed'
-    assert "no excitation offers 'excitation/start' within 1 s" in end['message']
-
-
-def test_run_without_a_stage_fails_with_the_reason(course):
-    course.start('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 2})
-    said = 'no publisher of displacement within 1 s'
-    # it may take a moment to know of the excitation
-    course.wait(lambda: said in course.finish('identifier/run')['message'], said)
-    assert state(course) == 'failed' and course.status('identifier')['level'] == '2'
-
-
-def test_run_drives_the_excitation_and_identifies(course):
-    course.start('stage', {'seed': 3})
-    assert course.set('identifier', 'excitation_limit', 20.0)[0]
-    assert course.set('identifier', 'program', 'nonsense')[0]
-    end = course.finish('identifier/run')
-    assert end['state'] == 'failed' and 'the excitation refuses the program' in end['message']
-    assert course.set('identifier', 'program', PROGRAM)[0]
-    end = course.finish('identifier/run')
-    assert (end['state'], end['level']) == ('done', '0'), end
-    states = [s['state'] for s in course.statuses('identifier')]
-    assert states.index('exciting') < states.index('identifying') < states.index('done')
-    course.wait(lambda: course.texts('model'), 'the model')
-    assert course.diagnostics('identifier')['lost'] == '0'
-
-
-def settling(g):
-    """Run a program that sweeps the bias for long enough to be met at it."""
-    assert g.set('identifier', 'program', PROGRAM.replace('cycles: 8', 'cycles: 1600'))[0]
-    seen = len(g.statuses('excitation'))
-    assert g.call('identifier/run')[0]
-    g.wait(
-        lambda: any(s.get('segment') == 'settle' for s in g.statuses('excitation')[seen:]),
-        'settle',
-    )
-    return seen
-
-
-def test_cancel_during_the_excitation_ramps_to_rest(course):
-    voltage = course.collect('voltage')
-
-    def attempt():
-        seen, begun = settling(course), len(course.statuses('identifier'))
-        for what in ('identify', 'run', 'clear', 'save'):
-            ok, reason = course.call(f'identifier/{what}')
-            assert not ok and 'busy: excitation' in reason
-        begin = time.monotonic()
-        assert course.call('identifier/cancel')[0]
-        answered = time.monotonic() - begin
-        course.wait(
-            lambda: any(s['state'] == 'cancelled' for s in course.statuses('identifier')[begun:]),
-            'cancelled',
-        )
-        ended = time.monotonic() - begin
-        course.wait(
-            lambda: any(s['state'] == 'stopped' for s in course.statuses('excitation')[seen:]),
-            'stopped',
-        )
-        course.wait(lambda: voltage and voltage[-1].values[-1] == 0.0, 'rest')
-        in_time(answered, 0.5, 'answer to a cancel during the excitation')
-        in_time(ended, 2.0, 'end after a cancel during the excitation')
-
-    course.call('identifier/cancel')
-    best_of_three(attempt)
-
-
-def test_the_end_of_the_node_ends_the_excitation(course):
-    voltage, seen = course.collect('voltage'), settling(course)
-    assert course.handle('identifier').stop() == 0
-    course.wait(
-        lambda: any(s['state'] == 'stopped' for s in course.statuses('excitation')[seen:]),
-        'stopped',
-    )
-    course.wait(lambda: voltage and voltage[-1].values[-1] == 0.0, 'rest')
-    assert voltage[-1].segment == 'ramp:stop'
