@@ -105,7 +105,8 @@ class ExcitationNode(LabNode):
         self._rate = Rate()
         super().__init__(**kwargs)
         self._build(self.values['program'])
-        self._guard_settings()
+        # loads the kernel: the ramp of a stop, or of the end, must not wait for it
+        Guard(self._guard_settings())
         self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
         self._born = time.monotonic()
         self._listener: Any = None
@@ -356,7 +357,7 @@ class ExcitationNode(LabNode):
         if playing is not None and self._thread is not None:
             playing.hurry = True
             playing.stop.set()
-            self._thread.join(LAST_RAMP + 0.4)
+            self._thread.join(LAST_RAMP + 0.9)
             self._voltage.wait_for_all_acked(Duration(seconds=0.1))
 
 
