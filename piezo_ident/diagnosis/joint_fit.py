@@ -23,16 +23,13 @@ from piezo_ident.diagnosis.cross_validation import (
     normal_equations,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.effects.trials import number_of
+from piezo_ident.diagnosis.simulator import free_parameters, FreeParameter, Simulator, State
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.optimize import lsq_linear
 
 __all__ = [
-    'RETUNING',
     'BaseColumns',
     'Fitted',
-    'FreeParameter',
     'base_at',
     'base_thresholds',
     'fit_base',
@@ -43,88 +40,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
-#: finite differences of a weight of H, normalised, and of the logarithm of a parameter
-WEIGHT_STEP, LOG_STEP = 1e-3, 1e-2
-#: how far G may be retuned: about samples of delay, their squares, and two relaxations
-RETUNING = (20.0, 800.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class FreeParameter:
-    """
-    One number that the fit may move, in one record or (None) in all.
-
-    It belongs to an effect, by its place in the state, or (None) to the retuning of G.
-    """
-
-    effect: int | None
-    record: int | None
-    name: str
-    index: int | None
-    logarithmic: bool
-    step: float
-    lower: float
-    upper: float
-
-    def get(self, state: State) -> float:
-        """Return its value."""
-        if self.effect is None:
-            return state.retuning[self.index or 0]
-        return number_of(
-            state.effects[self.effect].values[self.record or 0], self.name, self.index
-        )
-
-    def moved(self, state: State, delta: float) -> State:
-        """Return the state after a step within the bounds; relative if logarithmic."""
-        value = self.get(state)
-        if self.logarithmic:
-            value *= float(np.exp(np.clip(delta, -1.0, 1.0)))
-        else:
-            value += delta
-        value = float(np.clip(value, self.lower, self.upper))
-        if self.effect is None:
-            retuning = list(state.retuning)
-            retuning[self.index or 0] = value
-            return replace(state, retuning=tuple(retuning))
-        effects = list(state.effects)
-        effects[self.effect] = effects[self.effect].changed(
-            self.record, self.name, self.index, value
-        )
-        return replace(state, effects=tuple(effects))
-
-    def room(self, state: State) -> tuple[float, float]:
-        """Return the largest steps down and up."""
-        value = self.get(state)
-        if self.logarithmic:
-            down = max(-1.0, np.log(max(self.lower, 1e-300) / value))
-            return min(down, 0.0), max(min(1.0, np.log(self.upper / value)), 0.0)
-        return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
-
-
-def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
-    """Return every number of G's retuning and of the effects that the fit may move."""
-    found = [
-        FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
-        for i, size in enumerate(RETUNING[: len(state.retuning)])
-    ]
-    for i, added in enumerate(state.effects):
-        effect = added.effect
-        for p in effect.parameters:
-            value = added.values[0][p.name]
-            if p.scale == 'fixed' or p.kind == 'text':
-                continue
-            is_log = p.scale == 'log'
-            step = LOG_STEP if is_log else (p.step or 1e-3)
-            # the amplitude of what follows time is another one in each record
-            per_record = effect.time_driven and p.step > 0.0
-            for k in range(records) if per_record else (None,):
-                for index in range(np.size(value)) if p.vector else (None,):
-                    number = number_of(added.values[0], p.name, index)
-                    if np.isfinite(number) and not (is_log and number <= 0.0):
-                        found.append(
-                            FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)
-                        )
-    return tuple(found)
+#: finite difference of a weight of H, normalised
+WEIGHT_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
