@@ -31,7 +31,7 @@ import numpy as np
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[2]
-sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes'), str(ROOT / 'examples')]
+sys.path[:0] = [str(HERE.parent), *(str(ROOT / x) for x in ('test', 'test/nodes', 'examples'))]
 
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.record.blocks import Samples

@@ -33,7 +33,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[2]
-sys.path[:0] = [str(HERE.parent), str(ROOT / 'test/nodes'), str(ROOT / 'examples')]
+sys.path[:0] = [str(HERE.parent), *(str(ROOT / x) for x in ('test', 'test/nodes', 'examples'))]
 from course import PROGRAM
 
 PROFILES = ROOT / 'config/fastdds_two_hosts.xml'
