@@ -165,7 +165,8 @@ def _hold(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 @_signal('step', bias=_LEVEL, size=_SIZE, hold=_TIME, count=_COUNT)
 def _step(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     # before as many levels are listed
-    excitation.sample_count(o['hold'] * (o['count'] + 1), s.sample_rate)
+    n = excitation.sample_count(o['hold'], s.sample_rate)
+    excitation.sample_count(n * (o['count'] + 1) / s.sample_rate, s.sample_rate)
     levels = [o['bias'] + (k % 2 - 0.5) * o['size'] for k in range(o['count'] + 1)]
     v = excitation.staircase(levels, [o['hold']] * len(levels), s.sample_rate)
     return [Part(v, float(v[-1]))]
