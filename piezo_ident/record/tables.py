@@ -176,7 +176,7 @@ def _parse_csv(lines: Iterator[str], path: Path) -> RecordTable:
     names: list[str] = []
     starts: list[int] = []
     n = 0
-    while chunk := list(itertools.islice(lines, _ROWS)):
+    while chunk := _whole_rows(lines):
         if any(map(str.strip, chunk)):
             try:
                 part = np.loadtxt(
@@ -199,6 +199,24 @@ def _parse_csv(lines: Iterator[str], path: Path) -> RecordTable:
         starts,
         tuple(c for c in header if c and c not in wanted and c != 'segment'),
     )
+
+
+def _whole_rows(lines: Iterator[str]) -> list[str]:
+    """Return the next lines, up to the end of a quoted cell; csv.Error where that never comes."""
+    chunk = list(itertools.islice(lines, _ROWS))
+
+    def further() -> Iterator[str]:
+        for line in lines:
+            chunk.append(line)
+            yield line
+
+    # numpy takes all up to the end for a cell whose quote is missing
+    if any('"' in line for line in chunk):
+        n = len(chunk)
+        reader = csv.reader(itertools.chain(chunk[:], further()), strict=True)
+        while reader.line_num < n and next(reader, None) is not None:
+            pass
+    return chunk
 
 
 def _header(lines: Iterator[str], path: Path) -> tuple[int, list[str]]:

@@ -238,6 +238,8 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('# one\n\n# two\nt,v,y\n0,1,2\n1,oops,3\n', ['line 6, column v', "'oops'"]),
         ('# one\n# t,v,y\n0,1,2\n1,oops,3\n', ['line 4, column v', "'oops'"]),
         ('t,v,y\n0,1,2\n1,"2,3\n', ['no CSV file']),
+        ('t,v,y,segment\n0,1,2,"a\n1,2,3,b\n2,3,4,b\n', ['no CSV file']),
+        ('t,v,y,segment\n0,1,2,"a"b\n1,2,3,b\n', ['no CSV file']),
         ('t,v,y\n0,1,2\n1,\0,3\n', ['r.csv']),
         ('t,v,y,segment\n0,1,2,größe\n', ['UTF-8']),
     ],
@@ -270,6 +272,16 @@ def test_error_beyond_the_first_rows(tmp_path):
     lines[69000] = '69,nothing,1e-6'
     path.write_text('\n'.join(['t,v,y', *lines]))
     refuse(path, 'line 69002, column v', 'nothing')
+
+
+def test_a_quoted_cell_may_go_on_over_the_rows_that_are_read_together(tmp_path):
+    path = tmp_path / 'r.csv'
+    cells = ['-'] * 70000
+    cells[65535] = '"one\ntwo"'
+    lines = [f'{k / 1000},{k % 10},{k % 10}e-6,{cell}' for k, cell in enumerate(cells)]
+    path.write_text('\n'.join(['t,v,y,note', *lines]))
+    (piece,) = pi.read(path).pieces
+    assert piece.n == 70000
 
 
 # --- npz and mat
