@@ -242,7 +242,8 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return True
+    # float takes 1_000 and digits of other scripts too, numpy does not
+    return '_' not in text and text.strip().isascii()
 
 
 def _culprit(chunk: list[str], line: int, header: list[str], path: Path) -> DataError:

@@ -229,6 +229,7 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('t,v,y,v\n0,1,2,3\n', ['column v stands there twice']),
         ('t,v,y\n0,1,2\n\n1,oops,3\n', ['line 4, column v', "'oops'"]),
         ('t,v,y\n0,1,2\n1,,3\n', ['line 3, column v', "''"]),
+        ('t,v,y\n0,1,2\n1,1_000,3\n', ['line 3, column v', "'1_000'"]),
         ('t,v,y\n0,1,2\n1,2\n', ['line 3 has 2 columns, the header has 3; mend']),
         ('t,v,y\n0,0,1,5,2,25e-6\n', ['line 2 has 6 columns', 'decimal commas', 'points']),
         ('t,v,y\n0,0,0\n0,1,1,5,-2,2\n', ['line 3 has 6 columns', 'decimal commas']),
