@@ -61,6 +61,8 @@ class BlockStream:
 
     def append(self, samples: Samples, arrival: int) -> None:
         """Add a block that arrived at a time [ns] of a clock that all streams share."""
+        if not samples.t.size:
+            return
         self._newest.append(np.column_stack([samples.t, samples.values]))
         self.n += samples.t.size
         self._sizes.append(samples.t.size)

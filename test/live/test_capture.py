@@ -229,14 +229,16 @@ def test_what_is_kept_is_bounded_whatever_the_times_say(monkeypatch):
     monkeypatch.setattr('piezo_ident.live.capture.MOST_BLOCKS', 100)
     monkeypatch.setattr('piezo_ident.live.capture.MOST_SAMPLES', 1000)
     monkeypatch.setattr('piezo_ident.live.capture.MOST_LABELS', 20)
-    lone, dense = Capture(), Capture()
+    lone, dense, empty = Capture(), Capture(), Capture()
     for k in range(500):
         # single samples have no period, so that no time adds up
         lone.add('voltage', Samples(np.array([k / RATE]), np.zeros(1), f'sine:{k}'), k)
         t = 1e-9 * np.arange(100 * k, 100 * (k + 1))
         dense.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
+        empty.add('voltage', Samples(t[:0], t[:0], 'hold'), k)
     assert 80 <= lone.n <= 101
     assert 800 <= dense.n <= 1100
+    assert empty.snapshot().streams['voltage'].blocks <= 101
     assert len(lone.segments) == 21 and 'others' in lone.segments
     # the newest part is what is left
     assert lone.last_time('voltage') == 499 / RATE
