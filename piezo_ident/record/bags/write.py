@@ -168,7 +168,10 @@ class BagWriter:
         return self._closed_size + self._size_here()
 
     def _size_here(self) -> int:
-        return self.file.stat().st_size if self.file.exists() else 0
+        try:
+            return self.file.stat().st_size
+        except OSError:
+            return 0
 
     def __contains__(self, topic: str) -> bool:
         """Return whether a topic was added."""

@@ -180,6 +180,14 @@ def test_more_parts_than_names_are_tried(tmp_path, monkeypatch):
     assert [p.name for p in writer.parts[:3]] == ['bag', 'bag_2', 'bag_3']
 
 
+def test_a_file_that_cannot_be_looked_at_has_no_size(tmp_path):
+    writer = recorded(tmp_path / 'bag', 'mcap', 0, blocks=5)
+    # a failing disk gives other errors than that of a file that is not there
+    writer.file = tmp_path / ('x' * 300)
+    assert writer.size == 0
+    writer.abort()
+
+
 def test_a_part_that_cannot_be_made_leaves_those_before_it(tmp_path):
     writer = recorded(tmp_path / 'bag', 'mcap', 10**9, blocks=20)
     (tmp_path / 'file').write_text('')
