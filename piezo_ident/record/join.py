@@ -273,16 +273,25 @@ def _shared(one: Vector, other: Vector) -> Iterator[tuple[int, int, int]]:
     """Yield where two rising columns of times go on alike."""
     i = j = 0
     while i < one.size and j < other.size:
-        if one[i] == other[j]:
-            n = min(one.size - i, other.size - j, _CHUNK)
-            differ = one[i : i + n] != other[j : j + n]
-            n = int(np.argmax(differ)) if differ.any() else n
+        n = min(one.size - i, other.size - j, _CHUNK)
+        part = one[i : i + n]
+        if np.array_equal(part, other[j : j + n]):
             yield i, j, n
-            i, j = i + n, j + n
-        elif one[i] < other[j]:
-            i += int(np.searchsorted(one[i:], other[j]))
+            end = j + n
         else:
-            j += int(np.searchsorted(other[j:], one[i]))
+            end = j + int(np.searchsorted(other[j:], part[-1], 'right'))
+            _, rows, partners = np.intersect1d(
+                part, other[j:end], assume_unique=True, return_indices=True
+            )
+            yield from _stretches(rows + i, partners + j)
+        i, j = i + n, end
+
+
+def _stretches(rows: NDArray[np.intp], partners: NDArray[np.intp]) -> Matches:
+    """Return rising rows and their partners as stretches in which both go on."""
+    cuts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(partners) != 1)) + 1
+    bounds = itertools.pairwise([0, *cuts.tolist(), rows.size])
+    return [(int(rows[a]), int(partners[a]), b - a) for a, b in bounds if a < b]
 
 
 def _merged(matches: Iterable[tuple[int, int, int]]) -> Matches:
@@ -307,10 +316,7 @@ def _matches(
     mutual = np.flatnonzero((nearest >= 0) & (nearest[nearest] == np.arange(by.size)))
     mutual = mutual[by[mutual] < ta.size]
     order = np.argsort(by[mutual])
-    rows, partners = by[mutual][order], by[nearest[mutual]][order] - ta.size
-    cuts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(partners) != 1)) + 1
-    bounds = itertools.pairwise([0, *cuts.tolist(), rows.size])
-    return [(int(rows[a]), int(partners[a]), b - a) for a, b in bounds if a < b]
+    return _stretches(by[mutual][order], by[nearest[mutual]][order] - ta.size)
 
 
 def _nearest(t: Vector, arrived: NDArray[np.int64], in_b: NDArray[np.bool_]) -> NDArray[np.int64]:
