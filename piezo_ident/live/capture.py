@@ -79,7 +79,7 @@ class _Topic:
         self.stream, self.clock = BlockStream(), BlockClock()
         # counts of samples at which the clock restarted, and samples that are no longer kept
         self._runs: list[int] = []
-        self.dropped = 0
+        self.dropped = self._newest = 0
 
     def add(self, samples: Samples, arrival: int) -> None:
         """Take a block; where one with impossible times lies, the record will say."""
@@ -89,6 +89,7 @@ class _Topic:
             if self.clock.restarts > restarts:
                 self._runs.append(self.total)
         self.stream.append(samples, arrival)
+        self._newest = t.size
 
     @property
     def total(self) -> int:
@@ -105,7 +106,8 @@ class _Topic:
         if not n:
             share = 0.1 * limit / self.clock.period if self.seconds(self.stream.n) > limit else 0
             n = round(share) or self.stream.n // 10
-        n = self.stream.drop(n)
+        # the newest block stays, however long it is
+        n = self.stream.drop(min(n, self.stream.n - self._newest))
         self.dropped += n
         return self.seconds(n)
 

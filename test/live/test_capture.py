@@ -148,6 +148,14 @@ def test_a_run_without_end_keeps_its_newest_part(record):
     assert piece.segments[-1].label == 'triangle'
 
 
+def test_a_block_longer_than_the_limit_is_kept_until_the_next():
+    capture = Capture(limit=0.5)
+    for k in range(3):
+        t = np.arange(1000 * k, 1000 * (k + 1)) / 1000.0
+        capture.add('voltage', Samples(t, t, 'hold'), k)
+        assert capture.n == 1000
+
+
 def test_nothing_and_half_of_it_are_refused(record):
     with pytest.raises(DataError, match='no voltage has been captured; start the excitation'):
         Capture().record()
