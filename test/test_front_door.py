@@ -70,10 +70,12 @@ def test_arguments_of_another_kind_cost_one_line(tmp_path):
     for call in (
         lambda: pi.identify('record.csv'),
         lambda: pi.identify([record, 'record.csv']),
+        lambda: pi.identify(record, record),
         lambda: pi.free_run(record, model),
         lambda: pi.free_run(model, 'record.csv'),
         lambda: pi.diagnose(record, model),
         lambda: pi.diagnose(model, model),
+        lambda: pi.diagnose(model, record, record),
         lambda: pi.write_report(record, tmp_path / 'report'),
         lambda: model.simulate('voltage.csv'),
     ):

@@ -117,9 +117,10 @@ def diagnose(
     >>> result.after.overall < 0.01 * result.before.overall
     True
     """
-    settings = settings or DiagnosisSettings()
+    settings = DiagnosisSettings() if settings is None else settings
     records = records_of(records, 'diagnose, second argument')
     expect(model, StageModel, 'diagnose, first argument', 'read a model with load')
+    expect(settings, DiagnosisSettings, 'diagnose, settings', 'give several records as a list')
     for record in records:
         record.require_displacement()
     part = _beginnings(model, records, settings.most_samples)

@@ -17,7 +17,7 @@ import platform
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
     noise_floor_of,
@@ -106,8 +106,10 @@ def identify(
     True
     """
     records, validation = (records_of(x, 'identify') for x in (records, validation))
+    settings = Settings() if settings is None else settings
+    expect(settings, Settings, 'identify, settings', 'give several records as a list')
     with singular_is_ours():
-        return _identify(records, settings or Settings(), validation, progress, steps)
+        return _identify(records, settings, validation, progress, steps)
 
 
 def _identify(
