@@ -129,7 +129,7 @@ def _record(record: Record) -> tuple[str, Table]:
     channels = sorted({name for piece in record for name in piece.channels})
     rows = [('samples', str(record.n)), ('duration', f'{number(record.duration, 4)} s')]
     rows += [('sampling rate', f'{rates} Hz'), ('voltage', f'{low:.4g} .. {high:.4g} V')]
-    rows += [('stroke', length(record.stroke))]
+    rows += [('stroke', length(record.stroke) if record.is_measured else 'none, voltage alone')]
     rows += [('segments', ', '.join(record.labels))] if record.labels else []
     rows += [('channels', ', '.join(channels))] if channels else []
     rows += [('fault', str(fault)) for fault in record.faults]

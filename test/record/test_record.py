@@ -58,6 +58,12 @@ def test_html_names_what_it_holds_and_escapes_it():
     assert '75' in repr(record)
 
 
+def test_a_voltage_alone_has_no_stroke_to_show():
+    shown = repr(Record((Piece(V, np.full(V.size, np.nan), RATE),)))
+    assert '\u221e' not in shown
+    assert 'none' in shown
+
+
 def test_plot_draws_voltage_and_displacement():
     drawn = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 5.0))).plot()
     assert [len(axes.lines) for axes in drawn.axes] == [2, 2]
