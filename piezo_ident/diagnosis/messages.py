@@ -78,7 +78,7 @@ def _of_time_driven(added: Added, beside_lasting: bool) -> str:
     # with a lasting effect H was fitted to the mean of what wanders
     kept = 'its mean' if beside_lasting and not is_off else 'it switched off'
     if not beside_lasting:
-        kept += ' with the hysteresis as it was given'
+        kept += ', and the hysteresis as it was given'
     return (
         f'{added.name} follows time and not the voltage: what was found holds in its own '
         f'record alone, so the refined model carries {kept}'

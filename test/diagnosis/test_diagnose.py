@@ -210,7 +210,7 @@ def test_a_share_is_of_what_a_refit_leaves(truths):
 def test_hum_stays_in_its_record(truths):
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     result = diagnose(model, record, FEW)
-    assert 'switched off with the hysteresis as it was given' in ' '.join(result.warnings)
+    assert 'switched off, and the hysteresis as it was given' in ' '.join(result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
     frequency = result.effects[0].parameters['frequency'].value
