@@ -121,6 +121,8 @@ def diagnose(
     records = records_of(records, 'diagnose, second argument')
     expect(model, StageModel, 'diagnose, first argument', 'read a model with load')
     expect(settings, DiagnosisSettings, 'diagnose, settings', 'give several records as a list')
+    if not records:
+        raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
     part = _beginnings(model, records, settings.most_samples)

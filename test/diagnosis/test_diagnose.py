@@ -279,6 +279,8 @@ def test_another_rate_and_too_little_are_refused(truths):
     model, record, _ = measured(None, 0.0, 1)
     piece = record.pieces[0]
     slow = Record((Piece(piece.v[::2], piece.y[::2], RATE / 2),), 'slow')
+    with pytest.raises(IdentificationError, match='no record was given'):
+        diagnose(model, [])
     with pytest.raises(IdentificationError, match='sampled'):
         diagnose(model, slow)
     with pytest.raises(IdentificationError, match='longer'):
