@@ -115,6 +115,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(empty):
         ('program', ' ', 'must not be empty'),
         ('sweeps_program', ' ', 'must not be empty'),
         ('model', '/nowhere.yaml', 'no such file'),
+        ('model', __file__, 'YAML'),
     ],
 )
 def test_bad_parameters_are_refused(lab, name, value, reason):

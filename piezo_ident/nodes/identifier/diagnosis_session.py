@@ -52,28 +52,27 @@ class DiagnosisSession:
 
     Attributes
     ----------
-    given : StageModel, str or None
-        The model that is diagnosed, or its file.
+    given : StageModel or None
+        The model that is diagnosed.
     diagnosis : Diagnosis or None
         The last one of this model.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
         self._host, self._capture = host, capture
-        self.given: StageModel | str | None = None
+        self.given: StageModel | None = None
         self.diagnosis: Diagnosis | None = None
         # samples up to here went into the model and cannot test it
         self._used: Mapping[str, int] = {}
         self.drop()
 
-    def take(self, model: StageModel | str, used: Mapping[str, int]) -> None:
+    def take(self, model: StageModel, used: Mapping[str, int]) -> None:
         """
         Take another model to diagnose.
 
         Parameters
         ----------
-        model : StageModel or str
-            A model, or its file.
+        model : StageModel
         used : mapping
             From `Capture.mark`, when the capture up to then went into the model.
         """
@@ -128,7 +127,7 @@ class DiagnosisSession:
             return f'no more than {most} requests are allowed'
         return '' if self._host.can_excite() else 'there is no excitation and no stage'
 
-    def _diagnose(self, given: StageModel | str) -> None:
+    def _diagnose(self, given: StageModel) -> None:
         settings = DiagnosisSettings(seed=self._host.values['seed'])
         snapshot = self._capture.snapshot(self._used)
         job = functools.partial(

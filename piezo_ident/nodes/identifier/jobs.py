@@ -23,7 +23,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import first_steps, identify
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.live.capture import refuse_incomplete, Snapshot
-from piezo_ident.model.files import load, model_to_yaml
+from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
@@ -225,7 +225,7 @@ def records_of_runs(record: Record) -> list[Record]:
 
 def diagnose_capture(
     snapshot: Snapshot,
-    given: StageModel | str,
+    given: StageModel,
     asked: tuple[Kind, ...],
     settings: DiagnosisSettings,
     tick: Tick,
@@ -237,14 +237,12 @@ def diagnose_capture(
     ----------
     snapshot : Snapshot
         Without what the model was identified from.
-    given : StageModel or str
-        A model, or its file.
+    given : StageModel
     asked : tuple of {'sweeps', 'holds'}
         Experiments that the excitation has played already.
     settings : DiagnosisSettings
     tick : callable
     """
-    given = load(given) if isinstance(given, str) else given
     tick('record', 0.0)
     record = snapshot.record('capture')
     records = [r for r in records_of_runs(record) if _is_driven(given, r)]

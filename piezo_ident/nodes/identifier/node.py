@@ -71,9 +71,8 @@ class IdentifierNode(LabNode):
         self._using: dict[str, int] = {}
         self._published = ''
         if path := self.values['model']:
-            # at the start nothing waits, and a bad file ends the node
-            load(path)
-            self._session.take(path, {})
+            # a bad file ends the node
+            self._session.take(load(path), {})
         self._rate = Rate()
         self._passed: Counter[str] = Counter()
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
@@ -197,8 +196,10 @@ class IdentifierNode(LabNode):
         if name == 'model' and value:
             if self._is_busy():
                 return f'busy: {self._task}; set the model when that has ended, or call ~/cancel'
-            if not Path(value).is_file():
-                return f'model: {value}: no such file'
+            try:
+                load(value)
+            except PiezoIdentError as error:
+                return f'model: {error}'
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -206,8 +207,8 @@ class IdentifierNode(LabNode):
         if 'capture_limit' in changed:
             self._capture.limit = changed['capture_limit']
         if path := changed.get('model'):
-            # the job that needs it reads it
-            self._session.take(path, {})
+            # some milliseconds; nothing is compiled before a diagnosis
+            self._session.take(load(path), {})
             self._published = ''
 
     # services
