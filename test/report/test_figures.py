@@ -4,6 +4,7 @@
 """Pictures: they hold the data of the result, and say why they cannot be drawn."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 from diagnosis_examples import example, HOSTILE
 from matplotlib.image import imread
@@ -11,7 +12,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.sines import sines_of
-from piezo_ident.record.record import Piece
+from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report import save_plot
 from piezo_ident.report.figures.diagnosis import draw_diagnosis, errors_figure
 from piezo_ident.report.figures.free_run import loops_figure, overview_figure, sines_figure
@@ -99,6 +100,17 @@ def test_without_a_refinement_nothing_is_drawn_as_refined():
     assert len(residual_figure(given).axes) == 2
     # on the same scale, and enlarged
     assert len(residual_figure(refined).axes) == 4
+
+
+def test_names_of_short_segments_keep_apart():
+    (residual,) = example().residuals
+    edges = np.linspace(2000, 4000, 41).astype(int)
+    steps = tuple(Segment('step', a, b) for a, b in pairwise(edges))
+    piece = replace(residual.piece, segments=(*steps, Segment('triangle', 4000, residual.piece.n)))
+    axes = residual_figure(replace(residual, piece=piece)).axes[0]
+    places = sorted(name.xy[0] for name in axes.texts)
+    assert len(places) > 2
+    assert np.diff(places).min() > 0.03 * piece.duration
 
 
 def test_pictures_that_cannot_be_drawn_say_why(runs):

@@ -34,8 +34,8 @@ STATES = (
     ('before', 'H refitted, nothing added', COLOURS['static']),
     ('after', 'refined', COLOURS['model']),
 )
-#: segments named above a picture, at most
-NAMED = 14
+#: names of segments that have room above a picture
+NAMES = 24
 #: two segments side by side
 TINTS = ('#E9EEF3', '#F4F0E6')
 #: so many times smaller, the rest is drawn once more on a scale of its own
@@ -114,15 +114,18 @@ def _trace(
 
 
 def _shade(axes: Sequence[Axes], piece: Piece) -> None:
-    """Shade the segments that drive the stage, and name the longest above the first axes."""
+    """Shade the segments that drive the stage, and name the longest that have room for it."""
     driven = [s for s in piece.segments if s.kind not in ('idle', 'ramp')]
-    named = sorted(driven, key=lambda s: -s.n)[:NAMED]
     for i, s in enumerate(driven):
         first, last = piece.t[s.start], piece.t[s.stop - 1] + piece.dt
         for each in axes:
             each.axvspan(first, last, color=TINTS[i % 2], linewidth=0.0, zorder=0)
-        if s in named:
-            style.name_above(axes[0], s.label, 0.5 * (first + last))
+    named: list[float] = []
+    for s in sorted(driven, key=lambda s: -s.n):
+        middle = 0.5 * (piece.t[s.start] + piece.t[s.stop - 1] + piece.dt)
+        if all(abs(middle - other) >= piece.duration / NAMES for other in named):
+            style.name_above(axes[0], s.label, middle)
+            named.append(middle)
 
 
 def _both(
