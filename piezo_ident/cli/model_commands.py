@@ -33,8 +33,9 @@ from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.sines import sine_errors
+from piezo_ident.record.io import WRITERS
 from piezo_ident.record.record import Record
-from piezo_ident.record.tables import blocks_of, WRITERS
+from piezo_ident.record.tables import blocks_of
 
 __all__ = [
     'check_order',

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,31 @@ from piezo_ident.common.files import broken_link, check_regular, temporary_outpu
 from piezo_ident.record.assemble import assemble, ReadOptions
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
+from piezo_ident.record.csv_table import read_csv, write_csv
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.tables import blocks_of, labels_of, READERS, WRITERS
+from piezo_ident.record.tables import (
+    Blocks,
+    blocks_of,
+    labels_of,
+    read_mat,
+    read_npz,
+    RecordTable,
+    write_mat,
+    write_npz,
+)
 
-__all__ = ['read', 'write']
+__all__ = ['READERS', 'WRITERS', 'read', 'write']
+
+READERS: Mapping[str, Callable[[Path], RecordTable]] = {
+    '.csv': read_csv,
+    '.npz': read_npz,
+    '.mat': read_mat,
+}
+WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]], None]] = {
+    '.csv': write_csv,
+    '.npz': write_npz,
+    '.mat': write_mat,
+}
 
 _FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 

@@ -2,12 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records in tables: CSV, NumPy's npz and MATLAB's mat, columns by name.
+Records in tables: columns by name, in NumPy's npz and MATLAB's mat.
 
-``t``, ``v`` and ``y`` must be there; ``x_<name>`` are further channels.  In CSV the column
-``segment`` labels each row, and comments, lines with ``#``, may stand above the header; npz and
-mat carry ``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment
-begins.
+``t``, ``v`` and ``y`` must be there; ``x_<name>`` are further channels.  npz and mat carry
+``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment begins.
 """
 
 from __future__ import annotations
@@ -15,10 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-import csv
 from dataclasses import dataclass, field
-import io
-import itertools
 from pathlib import Path
 import re
 from typing import Any, BinaryIO
@@ -28,26 +23,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import UNPACKED_SIZE
-from piezo_ident.record.assemble import label_runs
 from piezo_ident.record.mat_read import read_variables
 from piezo_ident.record.record import Record
 
-__all__ = ['READERS', 'WRITERS', 'Blocks', 'RecordTable', 'blocks_of', 'labels_of']
+__all__ = [
+    'ROWS',
+    'Blocks',
+    'RecordTable',
+    'blocks_of',
+    'check_names',
+    'is_wanted',
+    'labels_of',
+    'read_mat',
+    'read_npz',
+    'write_mat',
+    'write_npz',
+]
 
 Vector = NDArray[np.float64]
 #: yields the columns block by block, each time it is called
 Blocks = Callable[[], Iterator[Mapping[str, Vector]]]
 
 #: rows that are read and written together
-_ROWS = 65536
-_REQUIRED = ('t', 'v', 'y')
+ROWS = 65536
 #: names of columns, and what else npz and mat carry
 _WANTED = 't|v|y|x_.+'
 _USED = f'{_WANTED}|segment_name|segment_start'
-_POINTS = (
-    'these look like decimal commas: save it with decimal points (in a spreadsheet, with the '
-    'number format of English)'
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +75,8 @@ def blocks_of(record: Record, **further: Sequence[Vector]) -> Blocks:
                 columns |= {name: parts[i] for name, parts in further.items()}
             else:
                 columns |= {f'x_{name}': x for name, x in piece.channels.items()}
-            for a in range(0, piece.n, _ROWS):
-                cut = slice(a, min(a + _ROWS, piece.n))
+            for a in range(0, piece.n, ROWS):
+                cut = slice(a, min(a + ROWS, piece.n))
                 yield {'t': piece.time(cut.start, cut.stop)} | {
                     name: x[cut] for name, x in columns.items()
                 }
@@ -104,11 +105,13 @@ def labels_of(record: Record) -> tuple[list[str], list[int]]:
     return (names, starts) if any(names) else ([], [])
 
 
-def _wanted(name: str) -> bool:
+def is_wanted(name: str) -> bool:
+    """Return whether a column of this name is read."""
     return re.fullmatch(_WANTED, name) is not None
 
 
-def _check_names(names: Iterable[str], path: Path) -> None:
+def check_names(names: Iterable[str], path: Path) -> None:
+    """Refuse a column that stands there twice, and a missing one."""
     # a mapping would be taken for counts
     counts = Counter(iter(names))
     twice = sorted(c for c, n in counts.items() if c and n > 1)
@@ -123,176 +126,6 @@ def _check_names(names: Iterable[str], path: Path) -> None:
             f'{path}: {", ".join(missing)} missing (found: {", ".join(counts)[:200] or "nothing"})'
             '; name the columns t [s], v [V] and y'
         )
-
-
-# --- CSV ------------------------------------------------------------------------------------
-
-
-def read_csv(path: Path) -> RecordTable:
-    """Read a CSV file with a header line; comments may stand above it."""
-    try:
-        # utf-8-sig drops a byte order mark
-        with path.open(encoding='utf-8-sig') as file:
-            return _parse_csv(_uncommented(file), path)
-    except UnicodeDecodeError:
-        raise DataError(f'{path}: no text in UTF-8; save it as CSV in UTF-8') from None
-    except csv.Error as error:
-        raise DataError(f'{path}: no CSV file ({error}); save it as comma-separated CSV') from None
-
-
-def _uncommented(lines: Iterable[str]) -> Iterator[str]:
-    """
-    Yield as many lines as there are, with empty ones for the comments above the header.
-
-    Where numbers follow a comment that names the columns, as numpy.savetxt writes it, that is the
-    header.
-    """
-    rest = iter(lines)
-    comment: str | None = None
-    for line in rest:
-        bare = line.strip()
-        if bare.startswith('#'):
-            if comment is not None:
-                yield '\n'
-            comment = bare.lstrip('#').strip()
-        elif bare:
-            if comment is not None:
-                names = {c.strip() for c in comment.split(',')}
-                is_header = names.issuperset(_REQUIRED) and _is_number(bare.partition(',')[0])
-                yield f'{comment}\n' if is_header else '\n'
-            yield line
-            break
-        else:
-            yield '\n'
-    yield from rest
-
-
-def _parse_csv(lines: Iterator[str], path: Path) -> RecordTable:
-    line, header = _header(lines, path)
-    wanted = {name: i for i, name in enumerate(header) if _wanted(name)}
-    # a name may be empty
-    dtype = np.dtype([(f'{i}', float if c in wanted else object) for i, c in enumerate(header)])
-    parts: list[Any] = []
-    names: list[str] = []
-    starts: list[int] = []
-    n = 0
-    while chunk := _whole_rows(lines):
-        if any(map(str.strip, chunk)):
-            try:
-                part = np.loadtxt(
-                    chunk, dtype, delimiter=',', comments=None, quotechar='"', ndmin=1
-                )
-            except ValueError:
-                raise _culprit(chunk, line + 1, header, path) from None
-            if 'segment' in header:
-                new, at = label_runs(map(str.strip, part[f'{header.index("segment")}']))
-                names += new
-                starts += [n + i for i in at]
-            parts.append({name: part[f'{i}'].copy() for name, i in wanted.items()})
-            n += part.size
-        line += len(chunk)
-    if not n:
-        raise DataError(f'{path}: no rows below the header; record some samples')
-    return RecordTable(
-        {name: np.concatenate([part[name] for part in parts]) for name in wanted},
-        names,
-        starts,
-        tuple(c for c in header if c and c not in wanted and c != 'segment'),
-    )
-
-
-def _whole_rows(lines: Iterator[str]) -> list[str]:
-    """Return the next lines, up to the end of a quoted cell; csv.Error where that never comes."""
-    chunk = list(itertools.islice(lines, _ROWS))
-
-    def further() -> Iterator[str]:
-        for line in lines:
-            chunk.append(line)
-            yield line
-
-    # numpy takes all up to the end for a cell whose quote is missing
-    if any('"' in line for line in chunk):
-        n = len(chunk)
-        reader = csv.reader(itertools.chain(chunk[:], further()), strict=True)
-        while reader.line_num < n and next(reader, None) is not None:
-            pass
-    return chunk
-
-
-def _header(lines: Iterator[str], path: Path) -> tuple[int, list[str]]:
-    """Return the number of the header line, and the names in it."""
-    number, text = next(((i, x) for i, x in enumerate(lines, 1) if x.strip()), (0, ''))
-    header = [c.strip() for c in next(csv.reader([text], strict=True), [])]
-    if not header:
-        raise DataError(f'{path}: empty file; write a header line t,v,y and the samples below it')
-    for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
-        if len(header) == 1 and separator in header[0]:
-            raise DataError(f'{path}: separated by {name}; save it with commas and decimal points')
-    if not set(_REQUIRED).intersection(header) and _is_number(header[0]):
-        raise DataError(
-            f"{path}: no header line; put 't,v,y', and a name for each further column, on top of "
-            'the numbers'
-        )
-    _check_names(header, path)
-    return number, header
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    # float takes 1_000 and digits of other scripts too, numpy does not
-    return '_' not in text and text.strip().isascii()
-
-
-def _culprit(chunk: list[str], line: int, header: list[str], path: Path) -> DataError:
-    """Return the error for the first of some lines that cannot be read."""
-    reader = csv.reader(chunk, strict=True)
-    for row in filter(None, reader):
-        at = f'{path}: line {line + reader.line_num - 1}'
-        if len(row) != len(header):
-            return DataError(
-                f'{at} has {len(row)} columns, the header has {len(header)}; '
-                + (_POINTS if _torn_at_commas(row, header) else 'mend or delete the line')
-            )
-        for name, text in zip(header, row, strict=True):
-            if _wanted(name) and not _is_number(text):
-                comma = re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', text)
-                return DataError(
-                    f'{at}, column {name}: {text[:40]!r} is no number; '
-                    + (_POINTS if comma else 'mend or delete the line')
-                )
-    return DataError(f'{path}: unreadable rows from line {line}; save it again')
-
-
-def _torn_at_commas(row: list[str], header: list[str]) -> bool:
-    """Return whether a row looks as if its decimal commas were taken for separators."""
-    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
-    texts = sum(not _wanted(name) for name in header)
-    return len(header) < len(row) <= 2 * len(header) and len(row) - whole <= texts
-
-
-def write_csv(
-    file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
-) -> None:
-    """Write a CSV file whose numbers read back exactly."""
-    labels, n = [_quoted(name) for name in names], 0
-    for block in blocks():
-        if not n:
-            file.write((','.join([*block, *(['segment'] if labels else [])]) + '\n').encode())
-        texts: list[Iterable[str]] = [map(repr, x.tolist()) for x in block.values()]
-        rows = np.arange(n, n + block['t'].size)
-        if labels:
-            texts.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
-        file.write(('\n'.join(map(','.join, zip(*texts, strict=True))) + '\n').encode())
-        n += rows.size
-
-
-def _quoted(text: str) -> str:
-    line = io.StringIO()
-    csv.writer(line, lineterminator='').writerow([text, ''])
-    return line.getvalue()[:-1]
 
 
 # --- npz ------------------------------------------------------------------------------------
@@ -313,9 +146,9 @@ def _used(name: str) -> bool:
 
 
 def _from_arrays(arrays: Mapping[str, Any], everything: Iterable[str], path: Path) -> RecordTable:
-    _check_names(everything, path)
+    check_names(everything, path)
     columns = {}
-    for name in filter(_wanted, arrays):
+    for name in filter(is_wanted, arrays):
         x = np.asarray(arrays[name])
         if x.dtype.kind not in 'fiu':
             raise DataError(f'{path}: {name} holds {x.dtype}, no real numbers; save plain numbers')
@@ -404,15 +237,3 @@ def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
             raise  # the disk's fault, not the file's
         reason = ' '.join(str(error).split()) or type(error).__name__
         raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
-
-
-READERS: Mapping[str, Callable[[Path], RecordTable]] = {
-    '.csv': read_csv,
-    '.npz': read_npz,
-    '.mat': read_mat,
-}
-WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]], None]] = {
-    '.csv': write_csv,
-    '.npz': write_npz,
-    '.mat': write_mat,
-}

@@ -71,7 +71,6 @@ class IdentifierNode(LabNode):
         self._using: dict[str, int] = {}
         self._published = ''
         if path := self.values['model']:
-            # a bad file ends the node
             self._session.take(load(path), {})
         self._rate = Rate()
         self._passed: Counter[str] = Counter()
