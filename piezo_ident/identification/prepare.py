@@ -19,7 +19,7 @@ from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.residual.stretches import runs_of as true_runs
+from piezo_ident.residual.stretches import true_runs
 
 __all__ = [
     'Excerpt',

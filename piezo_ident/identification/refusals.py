@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.spectra import cross_spectra
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.residual.stretches import block_means, runs_of
+from piezo_ident.residual.stretches import block_means, true_runs
 from scipy import signal
 
 __all__ = ['drive_creep', 'refuse_closed_loop', 'refuse_undriven']
@@ -112,7 +112,7 @@ def _refuse_hold(name: str, piece: Piece, span: float, stroke: float) -> None:
     if piece.n < 4 * window:
         return
     v, y = block_means(piece.v, window), block_means(piece.y, window)
-    for start, stop in runs_of(np.abs(np.diff(y)) < 1e-4 * stroke):
+    for start, stop in true_runs(np.abs(np.diff(y)) < 1e-4 * stroke):
         moved = abs(v[stop] - v[start]) / span
         followed = abs(y[stop] - y[start]) / stroke
         if stop - start < 4 or moved <= 0.005 or followed >= 0.05 * moved:

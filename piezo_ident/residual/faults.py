@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.faults import quantum_of
 from piezo_ident.record.record import Fault
-from piezo_ident.residual.stretches import ResidualPart, runs_of, strokes_of
+from piezo_ident.residual.stretches import ResidualPart, strokes_of, true_runs
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
 __all__ = ['FaultSearch', 'find_faults']
@@ -236,7 +236,7 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
     stroke = float(np.ptp(y))
     for end in (float(y.max()), float(y.min())):
         at = np.abs(y - end) <= max(1e-9 * stroke, 0.25 * noise.quantum)
-        for a, b in runs_of(at):
+        for a, b in true_runs(at):
             if b - a < FLAT:
                 continue
             # a delay lets the end of a rest look as if v moved on

@@ -28,9 +28,9 @@ __all__ = [
     'block_means',
     'find_repeats',
     'rests',
-    'runs_of',
     'stretches_of',
     'strokes_of',
+    'true_runs',
 ]
 
 #: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
@@ -107,7 +107,7 @@ class ResidualPart:
 
     def runs(self) -> list[tuple[int, int]]:
         """Return the unbroken stretches of sound samples, as first and behind the last."""
-        return runs_of(self.mask)
+        return true_runs(self.mask)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Stretch:
         return self.stop - self.start
 
 
-def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the runs of true values, as first and behind the last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -208,7 +208,7 @@ def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
         # a window within the rest covers half a window to either side
         inside = binary_dilation(trembling & narrow, iterations=window // 2)
         still = inside & (np.abs(d) < COMES_BACK * span)
-    return runs_of(still)
+    return true_runs(still)
 
 
 def _motion(
@@ -250,7 +250,7 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
         difference = v[period:] - v[:-period]
         matching = [
             (a, b)
-            for a, b in runs_of(np.abs(difference) <= tolerance)
+            for a, b in true_runs(np.abs(difference) <= tolerance)
             if b - a >= (PERIODS - SLACK) * period
             and np.ptp(v[a : a + period]) >= 20.0 * tolerance
         ]
@@ -264,7 +264,7 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     found = []
     for _, period, matching in tried:
         for a, b in matching:
-            free = runs_of(~taken[a : b + period])
+            free = true_runs(~taken[a : b + period])
             for i, j in free:
                 if j - i >= (PERIODS + 1 - SLACK) * period:
                     found.append((a + i, a + j, period))
