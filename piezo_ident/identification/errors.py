@@ -18,7 +18,7 @@ from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.stretches import ResidualPart, stretches_of
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
 __all__ = ['errors_of', 'key_of', 'noise_floor_of', 'predictions_of', 'validation_errors']
 
@@ -106,9 +106,7 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
         ResidualPart(p.run.record, p.run.piece, p.run.piece.y - p.y_hat, p.run.use)
         for p in predictions
     ]
-    return residual_noise_floor(
-        parts, [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
-    )
+    return residual_noise_floor(parts, all_stretches(parts))
 
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
