@@ -1,10 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Commands for tests: run in this process, expected to work, or to end in one line."""
+"""Commands for tests, which work or end in one line, and a table to give them."""
 
 from pathlib import Path
 
+import numpy as np
 from piezo_ident.cli import main
 
 
@@ -37,3 +38,24 @@ def refuse(capsys, folder: Path, argv: list[object], *words: object) -> str:
         assert str(word) in err
     assert contents() == before
     return err
+
+
+def table(n: int = 1000) -> dict[str, np.ndarray]:
+    """Return the columns of a sound record."""
+    v = 5 - 5 * np.cos(np.arange(n) / 50)
+    return {'t': np.arange(n) / 1000, 'v': v, 'y': 7.5e-6 * v}
+
+
+def csv_text(*left_out: str, **columns: object) -> str:
+    """Return it as CSV, with columns left out or replaced."""
+    c = {k: x for k, x in {**table(), **columns}.items() if k not in left_out}
+    rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
+    return '\n'.join([','.join(c), *rows]) + '\n'
+
+
+def with_values(column: str, rows: range, value: object) -> str:
+    """Return it as CSV, with another value in some rows of a column."""
+    x = table()[column].tolist()
+    for i in rows:
+        x[i] = value
+    return csv_text(**{column: x})

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 
-from command_line import run, succeed
+from command_line import csv_text, run, succeed, table, with_values
 import numpy as np
 import piezo_ident as pi
 from piezo_ident import __version__
@@ -200,24 +200,6 @@ def test_convert_round_trip(capsys, tmp_path, made, name):
     again = pi.read(back)
     np.testing.assert_array_equal(again.pieces[0].y, record.pieces[0].y)
     assert again.labels == record.labels
-
-
-def table(n: int = 1000) -> dict[str, np.ndarray]:
-    v = 5 - 5 * np.cos(np.arange(n) / 50)
-    return {'t': np.arange(n) / 1000, 'v': v, 'y': 7.5e-6 * v}
-
-
-def csv_text(**columns: object) -> str:
-    c = {**table(), **columns}
-    rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
-    return '\n'.join([','.join(c), *rows]) + '\n'
-
-
-def with_values(column: str, rows: range, value: object) -> str:
-    x = table()[column].tolist()
-    for i in rows:
-        x[i] = value
-    return csv_text(**{column: x})
 
 
 def test_few_nan_are_met_and_reported(capsys, tmp_path):

@@ -8,30 +8,11 @@ import contextlib
 import shlex
 import sqlite3
 
-from command_line import refuse, succeed
+from command_line import csv_text, refuse, succeed, table, with_values
 import numpy as np
 import piezo_ident as pi
 import pytest
 import yaml
-
-
-def table(n: int = 1000) -> dict[str, np.ndarray]:
-    v = 5 - 5 * np.cos(np.arange(n) / 50)
-    return {'t': np.arange(n) / 1000, 'v': v, 'y': 7.5e-6 * v}
-
-
-def csv_text(*left_out: str, **columns: object) -> str:
-    c = {k: x for k, x in {**table(), **columns}.items() if k not in left_out}
-    rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
-    return '\n'.join([','.join(c), *rows]) + '\n'
-
-
-def with_values(column: str, rows: range, value: object) -> str:
-    x = table()[column].tolist()
-    for i in rows:
-        x[i] = value
-    return csv_text(**{column: x})
-
 
 #: content of a table, and what is said of it
 BAD_FILES: dict[str, tuple[Callable[[], str], str]] = {
