@@ -11,7 +11,7 @@ from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator
-from piezo_ident.operators.kernels import held
+from piezo_ident.operators.kernels import curve, held
 
 __all__ = ['RateDependentHysteresis']
 
@@ -21,6 +21,8 @@ def _widened(
     v: NDArray[np.float64],
     r: NDArray[np.float64],
     q: NDArray[np.float64],
+    low_v: float,
+    c: NDArray[np.float64],
     power: NDArray[np.float64],
     gain: float,
     stretch: float,
@@ -30,7 +32,8 @@ def _widened(
     still: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
-    # memory: plays with growing thresholds; still: the same plays with fixed ones
+    # memory: plays with growing thresholds; still: the same plays with fixed ones;
+    # low_v and c: as in `wide_hysteresis`
     n_r = r.size
     for k in range(v.size):
         x = v[k]
@@ -47,6 +50,11 @@ def _widened(
             f = held(memory[i], low, low if high < low else high)
             memory[i] = f
             w += q[i] * (f - g)
+        if c.shape[0]:
+            for i in range(n_r):
+                f, g = memory[i], still[i]
+                w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f - low_v)
+                w -= curve(c, i, g - low_v)
         out[k] = w
 
 
@@ -153,7 +161,8 @@ class RateDependentHysteresis(Effect):
 
     def process(self, block: Block) -> Block:
         """Return the block with H applied and its plays widened."""
-        h, v = self.hysteresis, np.ascontiguousarray(block.x)
+        v = np.ascontiguousarray(block.x)
+        r, q, *_, low, c = self.hysteresis.for_kernel
         speed = _low_pass(v, self._pole, self.sample_rate, self._speed)
         power = np.abs(speed)
         if self.number('levelling') > 0.0:
@@ -163,8 +172,10 @@ class RateDependentHysteresis(Effect):
         more = np.empty(v.size)
         _widened(
             v,
-            h.thresholds,
-            h.weights,
+            r,
+            q,
+            low,
+            c,
             power,
             self.number('gain'),
             self.number('stretch'),

@@ -8,9 +8,9 @@ With thresholds and dynamics fixed, the output is linear in what is sought,
 
     y = offset + sum_i q_i (G F_ri[v]) + p1 (G v^3) + p2 (G v),        q_i >= 0,
 
-so the filtered plays are columns.  They are reduced once to the triangular factor R, with the
-offsets in front; the rows below the offsets then hold the problem without them, and their Gram
-matrix is all that the swarm needs.
+so the filtered plays are columns, and so are the terms of a wider law (`HysteresisLaw`).  They are
+reduced once to the triangular factor R, with the offsets in front; the rows below the offsets then
+hold the problem without them, and their Gram matrix is all that the swarm needs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from piezo_ident.identification.solvers.least_squares import (
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.play import play_columns, weighted_plays
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.play import weighted_plays
 from scipy.optimize import OptimizeResult
 
 __all__ = [
@@ -108,76 +109,79 @@ def _average(
 
 def factorise(
     excerpts: Sequence[Excerpt],
-    thresholds: NDArray[np.float64],
+    law: HysteresisLaw | NDArray[np.float64],
     dynamics: Dynamics,
     delay: Delay,
 ) -> NDArray[np.float64]:
     """
-    Reduce the data to the factor R of ``[offsets | G F_r | G v^3 | G v | y]``.
+    Reduce the data to the factor R of ``[offsets | G times the columns of the law | y]``.
 
     Parameters
     ----------
     excerpts : sequence of Excerpt
         Each gets an offset of its own.
-    thresholds : ndarray, shape (m,)
+    law : HysteresisLaw, or ndarray of shape (m,)
+        The thresholds alone stand for the law of plays.
     dynamics, delay
         What the plays pass before they are seen.
 
     Returns
     -------
-    ndarray, shape (k + m + 3, k + m + 3)
-        k is the number of excerpts.
+    ndarray, shape (k + size + 1, k + size + 1)
+        k is the number of excerpts, size that of the law.
     """
-    k, m = len(excerpts), thresholds.size
+    law = _law(law)
+    k, r = len(excerpts), law.thresholds
     # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
     part = np.array([1.0 - delay.fraction, delay.fraction])
     G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
 
     def rows() -> Iterator[NDArray[np.float64]]:
         for i, excerpt in enumerate(excerpts):
-            row, memory = excerpt.row, excerpt.start(thresholds)
+            row, memory = excerpt.row, excerpt.start(r)
             stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
             n = excerpt.rows
-            block = np.zeros((k + m + 3, n))
+            block = np.zeros((k + law.size + 1, n))
             block[i] = np.sqrt(row)
             # the plays need all that came before the samples used, G only what it remembers
             begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
             begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
             stretches -= begin
             before, u = excerpt.u[:begin], excerpt.u[begin:end]
-            memory = weighted_plays(before, thresholds, np.zeros(m), 0.0, 0.0, memory)[1]
+            memory = weighted_plays(before, r, np.zeros(r.size), 0.0, 0.0, memory)[1]
             u = Delay(delay.samples).apply(u)
-            for j in range(m):
-                [play] = play_columns(u, thresholds[j : j + 1], memory[j : j + 1])
-                _average(filter_arx(G.a, G.b, play), stretches, row, block[k + j])
-            _average(filter_arx(G.a, G.b, u**3), stretches, row, block[k + m])
-            _average(filter_arx(G.a, G.b, u), stretches, row, block[k + m + 1])
+            for j, column in enumerate(law.columns(u, memory), start=k):
+                _average(filter_arx(G.a, G.b, column), stretches, row, block[j])
             _average(excerpt.x[begin:end], stretches, row, block[-1])
             yield block.T
 
-    return triangular_factor(rows(), k + m + 3)
+    return triangular_factor(rows(), k + law.size + 1)
 
 
-def _independent(A: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _law(law: HysteresisLaw | NDArray[np.float64]) -> HysteresisLaw:
+    return law if isinstance(law, HysteresisLaw) else HysteresisLaw('plays', law)
+
+
+def _independent(A: NDArray[np.float64], m: int) -> NDArray[np.bool_]:
     """
-    Return which columns of ``[F_r | v^3 | v]`` the data tell apart.
+    Return which columns of m densities and the powers of v the data tell apart.
 
     A voltage that only takes two levels makes every play and the cubic a multiple of v: then the
     linear term is kept, and weights of any size cannot cancel each other.
     """
-    m = A.shape[1] - 2
-    keep, basis = np.zeros(m + 2, dtype=bool), np.empty((A.shape[0], 0))
-    for j in (m + 1, m, *range(m)):
-        size = np.linalg.norm(A[:, j])
-        if size == 0.0:
+    size = A.shape[1]
+    keep, basis = np.zeros(size, dtype=bool), np.empty((A.shape[0], 0))
+    for j in (*reversed(range(m, size)), *range(m)):
+        length = np.linalg.norm(A[:, j])
+        if length == 0.0:
             continue
-        rest = A[:, j] / size
+        rest = A[:, j] / length
         for _ in range(2):
             rest = rest - basis @ (basis.T @ rest)
-        size = np.linalg.norm(rest)
-        if size > STILL:
+        length = np.linalg.norm(rest)
+        if length > STILL:
             keep[j] = True
-            basis = np.column_stack([basis, rest / size])
+            basis = np.column_stack([basis, rest / length])
     return keep
 
 
@@ -206,6 +210,8 @@ class HysteresisFit:
         Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound, and
         where the data do not excite the play.
     swarm : scipy.optimize.OptimizeResult or None
+    coefficients : ndarray, shape (size,)
+        Of the law.
     """
 
     hysteresis: Hysteresis
@@ -218,6 +224,7 @@ class HysteresisFit:
     n: int
     std: NDArray[np.float64]
     swarm: OptimizeResult | None
+    coefficients: NDArray[np.float64]
 
     @property
     def rms(self) -> float:
@@ -227,7 +234,7 @@ class HysteresisFit:
 
 def fit_hysteresis(
     R: NDArray[np.float64],
-    thresholds: NDArray[np.float64],
+    law: HysteresisLaw | NDArray[np.float64],
     n: int,
     *,
     solver: Solver = 'least_squares',
@@ -242,7 +249,8 @@ def fit_hysteresis(
     ----------
     R : ndarray
         From `factorise`.
-    thresholds : ndarray, shape (m,)
+    law : HysteresisLaw, or ndarray of shape (m,)
+        As there.
     n : int
         Number of samples behind R.
     solver : {'least_squares', 'swarm'}
@@ -259,17 +267,18 @@ def fit_hysteresis(
     IdentificationError
         When the data hold nothing.
     """
-    m = thresholds.size
-    k = R.shape[0] - m - 3
+    law = _law(law)
+    m = law.densities
+    k = R.shape[0] - law.size - 1
     inner = R[k:, k:].copy()
     # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
     still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
     inner[:, :m][:, still] = 0.0
-    inner[:, :-1][:, ~_independent(inner[:, :-1])] = 0.0
+    inner[:, :-1][:, ~_independent(inner[:, :-1], m)] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
-    lower = np.concatenate([np.zeros(m), [-np.inf, -np.inf]])
-    x, optimum = bounded_least_squares(inner, lower, np.full(m + 2, np.inf))
+    lower = law.lower
+    x, optimum = bounded_least_squares(inner, lower, np.full(law.size, np.inf))
     x[np.linalg.norm(inner[:, :-1], axis=0) == 0.0] = 0.0
     swarm, swarm_loss = None, None
     if solver == 'swarm':
@@ -283,15 +292,13 @@ def fit_hysteresis(
             x = np.where(A.any(axis=0), swarm.x, 0.0)
     offsets = np.linalg.solve(R[:k, :k], R[:k, -1] - R[:k, k:-1] @ x)
     free = (x > lower) & inner[:, :-1].any(axis=0)
-    std = np.zeros(m + 2)
     gram = inner[:, :-1][:, free].T @ inner[:, :-1][:, free]
     loss = optimum if swarm_loss is None or polish else swarm_loss
-    variance = np.diag(np.linalg.pinv(gram, hermitian=True)) * loss
-    variance /= max((n if rows is None else rows) - m - 2, 1)
-    std[free] = np.sqrt(np.maximum(variance, 0.0))
-    h = Hysteresis(thresholds, x[:m], float(x[m]), float(x[m + 1]))
+    covariance = np.zeros((law.size, law.size))
+    covariance[np.ix_(free, free)] = np.linalg.pinv(gram, hermitian=True) * loss
+    covariance /= max((n if rows is None else rows) - law.size, 1)
     return HysteresisFit(
-        hysteresis=h,
+        hysteresis=law.hysteresis(x),
         offsets=np.asarray(offsets),
         solver=solver,
         polished=solver == 'swarm' and polish,
@@ -299,8 +306,9 @@ def fit_hysteresis(
         swarm_loss=swarm_loss,
         optimum_loss=optimum,
         n=n,
-        std=std,
+        std=law.deviations(covariance),
         swarm=swarm,
+        coefficients=x,
     )
 
 

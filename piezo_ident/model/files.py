@@ -42,7 +42,7 @@ _INSIDE: Mapping[str, tuple[str, ...]] = {
     'input': ('v0', 'V', 'range'),
     'output': ('y0', 'Y'),
     'delay': ('samples', 'fraction'),
-    'hysteresis': ('thresholds', 'weights', 'p1', 'p2'),
+    'hysteresis': ('thresholds', 'weights', 'p1', 'p2', 'p0', 'curves', 'bias', 'span'),
     'dynamics': ('a', 'b'),
 }
 _EFFECT = ('name', 'slot', 'parameters')
@@ -201,6 +201,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
                 weights=numbers(h, 'weights', name),
                 p1=number(h, 'p1', name),
                 p2=number(h, 'p2', name),
+                **_wide(h, name),
             ),
             dynamics=Dynamics(a=a, b=b),
             delay=Delay(int(samples), number(delay, 'fraction', name, 0.0)),
@@ -215,6 +216,25 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
         )
     except ModelError as error:
         raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
+
+
+def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return what a hysteresis has beyond plays and a cubic."""
+    wide: dict[str, Any] = {'p0': number(h, 'p0', name, 0.0)}
+    if 'curves' in h:
+        rows = h['curves'] if isinstance(h['curves'], list) else [None]
+        parsed = [numbers({'hysteresis.curves': row}, 'hysteresis.curves', name) for row in rows]
+        if len({row.size for row in parsed}) > 1:
+            raise ModelError(f'{name}: hysteresis.curves must have rows of one length')
+        wide['curves'] = np.array(parsed).reshape(len(parsed), -1)
+    if 'bias' in h:
+        wide['bias'] = numbers(h, 'bias', name)
+    if 'span' in h:
+        span = numbers(h, 'span', name)
+        if span.size != 2:
+            raise ModelError(f'{name}: hysteresis.span must be [lowest, highest] voltage')
+        wide['span'] = (float(span[0]), float(span[1]))
+    return wide
 
 
 def model_to_dict(model: StageModel) -> dict[str, Any]:
@@ -232,6 +252,9 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
             'weights': h.weights,
             'p1': h.p1,
             'p2': h.p2,
+            **({} if h.is_plain else {'p0': h.p0}),
+            **{k: x for k in ('curves', 'bias') if (x := getattr(h, k)) is not None},
+            **({} if h.curves is None and h.bias is None else {'span': list(h.span)}),
         },
         'dynamics': {'a': model.dynamics.a, 'b': model.dynamics.b},
         'effects': [

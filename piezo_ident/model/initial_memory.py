@@ -116,7 +116,7 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
     x = model.scaling.x(part.y)
     memory = h.initial_memory(float(u[0]))
     low, high = float(u[0]) - h.thresholds, np.full(h.thresholds.size, float(u[0]))
-    if not h.weights.any():
+    if not (h.weights.any() or h.rise(high).any()):
         return memory
     top, bottom = np.maximum.accumulate(u), np.minimum.accumulate(u)
     # rows are thinned: a few numbers do not need a hundred thousand samples
@@ -124,7 +124,8 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
     for _ in range(8):
         e = (x - model.scaling.x(model.predict_piece(part, memory)))[keep]
         columns = []
-        for r, q, m in zip(h.thresholds, h.weights, memory, strict=True):
+        rise = h.rise(memory, float(u[0]))
+        for r, q, m in zip(h.thresholds, rise, memory, strict=True):
             # the play follows its start only while neither bound has caught it
             moved = np.clip(m, np.minimum(top - r, bottom), bottom)
             free = ((np.abs(moved - m) < 1e-12) & (top - r < bottom)).astype(np.float64)
@@ -133,7 +134,7 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
             )
             columns.append(q * filtered[keep])
         J = np.array(columns).T
-        pull = np.sqrt(PULL * e.size) * np.maximum(h.weights, 1e-3)
+        pull = np.sqrt(PULL * e.size) * np.maximum(rise, 1e-3)
         A = np.vstack([J, np.diag(pull)])
         target = np.concatenate([e, pull * (h.initial_memory(float(u[0])) - memory)])
         width = np.maximum(high - low, 1e-9)

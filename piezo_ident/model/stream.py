@@ -139,14 +139,14 @@ class _Cascade:
     def __init__(
         self, model: StageModel, H: HysteresisOperator, G: DynamicsOperator, z: DelayOperator
     ) -> None:
-        s, h = model.scaling, model.hysteresis
+        s = model.scaling
         past_w, past_y = G.b.size - 1, max(G.a.size, z.delay.samples + 1)
         # a long delay would else spend its time on moving its past
         room = max(STRETCH, past_y)
         self._H, self._G, self._delay = H, G, z.delay
         self._w, self._y = np.empty(past_w + room), np.empty(past_y + room)
         self._scale = np.array([s.v0, s.V, s.y0, s.Y])
-        self._hysteresis = np.array(h.thresholds), np.array(h.weights), h.p1, h.p2
+        self._hysteresis = model.hysteresis.for_kernel
 
     def reset(self, u0: float) -> float:
         """Come to rest and return the displacement there [m]."""

@@ -2,25 +2,40 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-H, the modified Prandtl-Ishlinskii operator.
+H: a polynomial and functions of play operators, with its memory.
 
-    w(t) = p1 v(t)^3 + p2 v(t) + sum_i q_i F_ri[v](t),      q_i >= 0                    (eqs. 3, 6)
+    w = p1 v^3 + p2 v + sum_i q_i F_ri[v],        q_i >= 0                           (eqs. 3, 6)
 
-of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised units.
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised units.  A wider H adds
+
+    p0 v^2 + sum_i (c_i1 t_i^2 + c_i2 t_i^3 + c_i3 t_i^4) + sum_i kappa_i (v - low) (F_ri[v] - low)
+
+with ``t_i = F_ri[v] - low``, held between 0 and ``high - low - r_i``.  Functions of the play
+outputs make a Preisach operator whose density at threshold and place (r, F) is their derivative:
+Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
+doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are no such operator.
+Either way the memory is that of the plays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import functools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.chain import Block
+from piezo_ident.operators.kernels import wide_hysteresis
 from piezo_ident.operators.play import initial_memory, weighted_plays
 
 __all__ = ['Hysteresis', 'HysteresisOperator']
+
+#: powers t^2 .. t^4 that a curve of a play may have
+POWERS = 3
+#: how far a density may fall below zero, as a share of the largest, by rounding
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +52,37 @@ class Hysteresis:
         Thresholds r_i > 0, ascending, and weights q_i >= 0.
     p1, p2 : float
         Cubic and linear coefficient.
+    p0 : float, optional
+        Square coefficient.
+    curves : array_like, shape (m, 1) to (m, 3), optional
+        Coefficients c_i1 .. of t_i^2 .. of each play; its density ``q_i + 2 c_i1 t + ...`` must
+        not be negative.
+    bias : array_like, shape (m,), optional
+        Growth kappa_i of the weight of a play with the voltage.
+    span : tuple of float, optional
+        Voltages low and high between which curves and bias hold; beyond, a curve is flat.
 
     Raises
     ------
     ModelError
-        When lengths differ, a weight is negative, or thresholds are negative or not ascending.
+        When lengths differ, a weight or density is negative, or thresholds are negative or not
+        ascending.
+
+    Examples
+    --------
+    >>> h = Hysteresis([0.5], [1.0], 0.0, 1.0, curves=[[0.5]])
+    >>> h([0.0, 1.0, 0.5]).tolist()
+    [0.0, 1.625, 1.125]
     """
 
     thresholds: NDArray[np.float64]
     weights: NDArray[np.float64]
     p1: float
     p2: float
+    p0: float = 0.0
+    curves: NDArray[np.float64] | None = None
+    bias: NDArray[np.float64] | None = None
+    span: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
         r, q = frozen_array(self.thresholds), frozen_array(self.weights)
@@ -63,14 +98,140 @@ class Hysteresis:
             raise ModelError('hysteresis: thresholds r_i must ascend and not be negative')
         p2 = float(self.p2)
         if r.size and r[0] == 0.0:
+            if self.curves is not None or self.bias is not None:
+                raise ModelError('hysteresis: with curves or bias, thresholds must be positive')
             p2 += float(q[0])
             r, q = frozen_array(r[1:].copy()), frozen_array(q[1:].copy())
-        if not (np.isfinite(self.p1) and np.isfinite(p2)):
-            raise ModelError('hysteresis: p1 and p2 must be finite numbers')
+        if not (np.isfinite(self.p1) and np.isfinite(p2) and np.isfinite(self.p0)):
+            raise ModelError('hysteresis: p0, p1 and p2 must be finite numbers')
         object.__setattr__(self, 'thresholds', r)
         object.__setattr__(self, 'weights', q)
-        object.__setattr__(self, 'p1', float(self.p1))
+        for name in ('p0', 'p1'):
+            object.__setattr__(self, name, float(getattr(self, name)))
         object.__setattr__(self, 'p2', p2)
+        if self.curves is not None or self.bias is not None:
+            self._check_wide(r, q)
+
+    def _check_wide(self, r: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+        """Check span, curves and bias, and freeze them."""
+        low, high = map(float, self.span)
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise ModelError('hysteresis: span must be [lowest, highest] voltage')
+        object.__setattr__(self, 'span', (low, high))
+        for name, shape in (('curves', (r.size, POWERS)), ('bias', (r.size,))):
+            if getattr(self, name) is None:
+                continue
+            values = frozen_array(getattr(self, name))
+            if (
+                values.ndim != len(shape)
+                or values.shape[0] != r.size
+                or not 0 < values.shape[-1] <= max(shape[-1], 1)
+            ) and r.size:
+                raise ModelError(
+                    f'hysteresis: {name} of shape {values.shape} for {r.size} thresholds; give '
+                    f'{"1 to 3 numbers" if name == "curves" else "one number"} each'
+                )
+            if not np.all(np.isfinite(values)):
+                raise ModelError(f'hysteresis: {name} must be finite numbers')
+            object.__setattr__(self, name, values)
+        places = np.linspace(0.0, 1.0, 33)
+        least = np.min(
+            [self.rise(low + s * self._wide[4], low + s * (high - low)) for s in places]
+        )
+        if least < -ROUNDING * max(1.0, float(q.max(initial=0.0))):
+            raise ModelError(
+                'hysteresis: curves and bias must not make the weight of a play negative'
+            )
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether H is a cubic and a sum of plays, and no more."""
+        return self.p0 == 0.0 and self.curves is None and self.bias is None
+
+    @functools.cached_property
+    def _wide(self) -> NDArray[np.float64]:
+        """The rows c_1 .. c_3, kappa and widths of `wide_hysteresis`; none where H is plain."""
+        m, low, high = self.thresholds.size, *self.span
+        if self.is_plain:
+            return np.empty((0, m))
+        rows = np.zeros((POWERS + 2, m))
+        if self.curves is not None and m:
+            rows[: self.curves.shape[1]] = self.curves.T
+        if self.bias is not None:
+            rows[POWERS] = self.bias
+        rows[-1] = np.maximum(high - low - self.thresholds, 0.0)
+        return rows
+
+    @functools.cached_property
+    def for_kernel(
+        self,
+    ) -> tuple[
+        NDArray[np.float64],
+        NDArray[np.float64],
+        float,
+        float,
+        float,
+        float,
+        NDArray[np.float64],
+    ]:
+        """``r, q, p1, p2, p0, low, c`` as `piezo_ident.operators.kernels` take them."""
+        # a frozen array would be another type to the compiler
+        r, q = np.array(self.thresholds), np.array(self.weights)
+        return r, q, self.p1, self.p2, self.p0, self.span[0], self._wide
+
+    def rise(self, outputs: ArrayLike, v: float = 0.0) -> NDArray[np.float64]:
+        """
+        Return dw/dF_i of each play at its output, under a voltage; shape (m,).
+
+        Parameters
+        ----------
+        outputs : array_like, shape (m,)
+            F_i, normalised.
+        v : float, optional
+            Matters to a bias alone.
+        """
+        if self.is_plain:
+            return self.weights
+        c1, c2, c3, bias, width = self._wide
+        t = np.asarray(outputs, dtype=np.float64) - self.span[0]
+        curved = t * (2.0 * c1 + t * (3.0 * c2 + t * 4.0 * c3))
+        inside = (t >= 0.0) & (t <= width)
+        return np.asarray(self.weights + bias * (v - self.span[0]) + np.where(inside, curved, 0.0))
+
+    def lowest_slope(self) -> float:
+        """Return a lower bound of dw/dv over the span; H has an inverse where it is positive."""
+        low, high = self.span
+        v = np.linspace(low, high, 129)
+        slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
+        if self.bias is not None:
+            # a play stands anywhere in its band
+            down, up = np.minimum(self.bias, 0.0), np.maximum(self.bias, 0.0)
+            least = np.maximum(v[:, None] - low - self.thresholds, 0.0)
+            most = np.minimum(v[:, None] - low, self._wide[4])
+            slope = slope + least @ up + most @ down
+        return float(slope.min())
+
+    def without_idle(self, nothing: float = 0.0) -> Hysteresis:
+        """Return H without the plays that weigh no more than `nothing` anywhere."""
+        low, high = self.span
+        ends = (self.rise(np.full(self.thresholds.size, low), v) for v in (low, high))
+        alive = np.maximum(*ends) > nothing
+        if self.curves is not None:
+            alive |= np.abs(self.curves).max(axis=1, initial=0.0) > nothing
+        return replace(
+            self,
+            thresholds=self.thresholds[alive],
+            weights=self.weights[alive],
+            curves=None if self.curves is None else self.curves[alive],
+            bias=None if self.bias is None else self.bias[alive],
+        )
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """All parameters in a row: r, q, p0, p1, p2, curves, bias."""
+        polynomial = np.array([self.p0, self.p1, self.p2])
+        parts = [self.thresholds, self.weights, polynomial, self._wide.ravel()]
+        return np.concatenate(parts)
 
     def initial_memory(self, v0: float) -> NDArray[np.float64]:
         """Return the play outputs at `v0` of a stage that last came down to zero."""
@@ -93,7 +254,17 @@ class Hysteresis:
         """
         x = np.asarray(v, dtype=np.float64)
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
-        return weighted_plays(x, self.thresholds, self.weights, self.p1, self.p2, start)[0]
+        return self.follow(x, start)[0]
+
+    def follow(
+        self, v: NDArray[np.float64], memory: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return w for the next inputs, shape (n,), and the memory after them, shape (m,)."""
+        if self.is_plain:
+            return weighted_plays(v, self.thresholds, self.weights, self.p1, self.p2, memory)
+        out, end = np.empty(v.size), memory.copy()
+        wide_hysteresis(np.ascontiguousarray(v), *self.for_kernel, end, out)
+        return out, end
 
     def slope(self, v: float, excursion: float = 0.0) -> float:
         """
@@ -110,9 +281,14 @@ class Hysteresis:
             Peak-to-peak size of the small signal, normalised.
         """
         gain = self.p2 + 3.0 * self.p1 * v * v
+        if not self.is_plain:
+            # in the middle of their bands, where a small loop settles
+            place = np.clip(v - self.thresholds / 2.0 - self.span[0], 0.0, self._wide[4])
+            gain += 2.0 * self.p0 * v + float(self._wide[3] @ place)
         if excursion > 0.0:
             moved = np.maximum(0.0, 1.0 - self.thresholds / excursion)
-            gain += float(self.weights @ moved)
+            weights = self.weights if self.is_plain else self.rise(self.span[0] + place, v)
+            gain += float(weights @ moved)
         return gain
 
 
@@ -132,16 +308,10 @@ class HysteresisOperator:
     def reset(self, v0: float, x0: float) -> float:
         """Take the given memory, or the one of a stage that last came down to zero."""
         start = self.hysteresis.initial_memory(x0) if self._given is None else self._given
-        w, self.memory = self._evaluate(np.array([x0]), start)
+        w, self.memory = self.hysteresis.follow(np.array([x0]), start)
         return float(w[0])
 
     def process(self, block: Block) -> Block:
         """Return the block with H applied to its signal."""
-        w, self.memory = self._evaluate(block.x, self.memory)
+        w, self.memory = self.hysteresis.follow(block.x, self.memory)
         return block.with_signal(w)
-
-    def _evaluate(
-        self, x: NDArray[np.float64], memory: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        h = self.hysteresis
-        return weighted_plays(x, h.thresholds, h.weights, h.p1, h.p2, memory)

@@ -6,9 +6,11 @@ The compiled loops of H, of G, and of both with the delay in one.
 
     F_r[v](k) = max(v(k) - r, min(v(k), F_r[v](k-1)))                                  (eqs. 1-2)
     w(k) = p1 v(k)^3 + p2 v(k) + sum_i q_i F_ri[v](k)                                 (eqs. 3, 6)
+           [+ p0 v(k)^2 + sum_i psi_i(F_ri[v](k)) + kappa_i (v(k) - low) (F_ri[v](k) - low)]
     y(k) = sum_{j=1..nb} b_j w(k-j+1) - sum_{i=1..na} a_i y(k-i)                      (eqs. 4-5)
 
-of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868; what stands in brackets is that of
+`piezo_ident.operators.hysteresis`.
 
 Every sum of G runs from the oldest term to the newest wherever a sample stands, so the result does
 not depend on how a stream is cut.  An output of G that has died away is zero
@@ -24,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
-__all__ = ['cascade', 'dynamics', 'held', 'hysteresis', 'plays']
+__all__ = ['cascade', 'curve', 'dynamics', 'held', 'hysteresis', 'plays', 'wide_hysteresis']
 
 #: samples that pass the loops while they are in the cache
 STRETCH = 1024
@@ -72,6 +74,41 @@ def hysteresis(
             memory[i] = f
             w += q[i] * f
         out[k] = w + (p1 * x * x + p2) * x
+
+
+@ordered_kernel
+def curve(c: NDArray[np.float64], i: int, t: float) -> float:
+    """Return c_1 t^2 + c_2 t^3 + c_3 t^4 of a play, flat beyond its width (row 4) and below 0."""
+    t = held(t, 0.0, c[4, i])
+    bent: float = t * t * (c[0, i] + t * (c[1, i] + t * c[2, i]))
+    return bent
+
+
+@kernel
+def wide_hysteresis(
+    v: NDArray[np.float64],
+    r: NDArray[np.float64],
+    q: NDArray[np.float64],
+    p1: float,
+    p2: float,
+    p0: float,
+    low: float,
+    c: NDArray[np.float64],
+    memory: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """
+    Do as `hysteresis`, with what stands in brackets above.
+
+    The rows of c, shape (5, m), are c_1 .. c_3 of `curve`, kappa, and the widths.
+    """
+    for k in range(v.size):
+        x, w = v[k], 0.0
+        for i in range(r.size):
+            f = held(memory[i], x - r[i], x)
+            memory[i] = f
+            w += q[i] * f + c[3, i] * (x - low) * (f - low) + curve(c, i, f - low)
+        out[k] = w + ((p1 * x + p0) * x + p2) * x
 
 
 @ordered_kernel
@@ -155,6 +192,9 @@ def cascade(
     q: NDArray[np.float64],
     p1: float,
     p2: float,
+    p0: float,
+    low: float,
+    c: NDArray[np.float64],
     memory: NDArray[np.float64],
     b: NDArray[np.float64],
     a: NDArray[np.float64],
@@ -173,8 +213,8 @@ def cascade(
         [V] and [m].
     scale : ndarray, shape (4,)
         v0, V, y0 and Y.
-    r, q, p1, p2, memory
-        As in `hysteresis`.
+    r, q, p1, p2, p0, low, c, memory
+        As in `wide_hysteresis`; without rows of c, as in `hysteresis`.
     b, a
         As in `dynamics`.
     w : ndarray, shape (nb - 1 + k,)
@@ -193,7 +233,10 @@ def cascade(
         n = new.size
         for k in range(n):
             new[k] = (v[start + k] - v0) / V
-        hysteresis(new, r, q, p1, p2, memory, w[past_w : past_w + n])
+        if c.shape[0] == 0:
+            hysteresis(new, r, q, p1, p2, memory, w[past_w : past_w + n])
+        else:
+            wide_hysteresis(new, r, q, p1, p2, p0, low, c, memory, w[past_w : past_w + n])
         dynamics(w[: past_w + n], b, a, y[past_y - a.size : past_y + n])
         now, before = y[past_y - d :], y[past_y - d - 1 :]
         for k in range(n):

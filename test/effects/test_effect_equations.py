@@ -110,6 +110,25 @@ def test_rate_dependence_is_its_equation(values):
     assert_allclose(got, plainly(u, FS, *values), atol=1e-13)
 
 
+def test_rate_dependence_of_a_wide_hysteresis_moves_its_curves_too():
+    r = np.array([0.1, 0.4])
+    h = Hysteresis(r, [0.3, 0.2], -0.2, 1.0, 0.1, [[0.2, -0.1], [0.1, 0.3]], [0.1, -0.1])
+    u, pole = signal(1500) / 10, np.exp(-2 * np.pi * 500 / FS)
+    effect = find_effect('rate_dependent_hysteresis')
+    values = effect.check({'gain': 1e-4, 'exponent': 1.0, 'cutoff': 500.0})
+    operator = effect(FS, values, h, HysteresisOperator(h))
+    operator.reset(u[0], u[0])
+    got = operator.process(Block(np.arange(u.size) / FS, u, u)).x
+    f, s, last, w = h.initial_memory(u[0]), 0.0, u[0], []
+    for x in u:
+        s, last = pole * s + (1 - pole) * (x - last) * FS, x
+        f = np.maximum(x - r - 1e-4 * abs(s), np.minimum(x, f))
+        t = np.clip(f, 0, 1 - r)
+        curves = h.curves[:, 0] @ t**2 + h.curves[:, 1] @ t**3
+        w.append((h.p1 * x + h.p0) * x**2 + h.p2 * x + (h.weights + h.bias * x) @ f + curves)
+    assert_allclose(got, w, atol=1e-13)
+
+
 # -- the static curve and the minor loops ------------------------------------------------------
 
 

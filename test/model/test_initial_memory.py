@@ -47,6 +47,16 @@ def test_random_admissible_memory_is_recovered(seed, sign):
     assert np.std(error) < 0.06 * np.std(virgin)
 
 
+def test_memory_of_a_wide_hysteresis_is_recovered():
+    r = PAPER.hysteresis.thresholds
+    h = replace(PAPER.hysteresis, curves=np.full((r.size, 2), 0.2), p0=0.1)
+    model = replace(PAPER, hysteresis=h)
+    truth = admissible(0.5, r, np.random.default_rng(0))
+    found = fit_memory(model, started_from(truth, model, noise=2e-5))
+    error = (model.stream(found).process(V) - model.stream(truth).process(V)) / 75e-6
+    assert np.std(error) < 3e-4
+
+
 def test_memory_is_one_that_can_be():
     piece = started_from(None, noise=0.05)
     found = fit_memory(PAPER, piece)

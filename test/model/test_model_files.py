@@ -63,6 +63,48 @@ def test_save_and_load_is_exact(tmp_path):
     assert model_to_yaml(again) == (tmp_path / 'model.yaml').read_text(encoding='utf-8')
 
 
+@pytest.mark.parametrize(
+    'wide',
+    [
+        {'p0': 0.05},
+        {'p0': 0.05, 'curves': np.full((9, 3), 0.01)},
+        {'bias': np.full(9, 0.02), 'span': (0.0, 1.1)},
+    ],
+)
+def test_a_wide_hysteresis_survives_exactly(wide, tmp_path):
+    model = replace(PAPER, hysteresis=replace(PAPER.hysteresis, **wide))
+    model.save(tmp_path / 'model.yaml')
+    again = load(tmp_path / 'model.yaml')
+    assert_array_equal(again.hysteresis.numbers, model.hysteresis.numbers)
+    assert again.hysteresis.span == model.hysteresis.span
+    v = np.linspace(0, 10, 500)
+    assert_array_equal(again.simulate(v), model.simulate(v))
+
+
+def test_a_plain_hysteresis_has_no_keys_of_a_wide_one():
+    assert set(data()['hysteresis']) == {'thresholds', 'weights', 'p1', 'p2'}
+
+
+@pytest.mark.parametrize(
+    ('key', 'value', 'says'),
+    [
+        ('curves', [0.1] * 9, 'list of numbers'),
+        ('curves', [[0.1]], '9 thresholds'),
+        ('curves', [[0.1], [0.1, 0.2]], 'one length'),
+        ('curves', 'none', 'list of numbers'),
+        ('bias', [0.1], '9 thresholds'),
+        ('bias', {}, 'list of numbers'),
+        ('span', [0.0], 'lowest, highest'),
+        ('p0', [1], 'not a number'),
+    ],
+)
+def test_what_is_no_wide_hysteresis_is_refused(key, value, says):
+    d = data()
+    d['hysteresis'][key] = value
+    with pytest.raises(ModelError, match=says):
+        model_from_dict(d)
+
+
 @settings(deadline=None, max_examples=50)
 @given(
     st.lists(st.floats(0, 1e3, allow_subnormal=True), min_size=2, max_size=2),

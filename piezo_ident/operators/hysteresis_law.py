@@ -1,0 +1,242 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Families of H that are linear in their coefficients, for given thresholds.
+
+    plays      q_i F_i,  v^3,  v                                  the paper's law, eqs. (3) and (6)
+    square     and v^2
+    bias       and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
+    preisach   and hat_j(r_i) times Bernstein polynomials in F_i as densities
+
+hat_j are piecewise linear functions of the threshold on a few even nodes.  All but the powers of v
+have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  The last one is a
+Preisach operator with a density that is smooth along the bias and free along the threshold:
+Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
+doi:10.1007/978-1-4612-4048-8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import functools
+from math import comb
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.errors import ModelError
+from piezo_ident.operators.hysteresis import Hysteresis, POWERS
+from piezo_ident.operators.play import play_columns
+from scipy.optimize import lsq_linear
+
+__all__ = ['LAWS', 'HysteresisLaw', 'LawName']
+
+LawName = Literal['plays', 'square', 'bias', 'preisach']
+#: from the narrowest to the widest
+LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach')
+#: nodes of the hats over the threshold, and degree of the density in the place of a play
+NODES, DEGREE = 5, 3
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisLaw:
+    """
+    A family of H.
+
+    Parameters
+    ----------
+    name : {'plays', 'square', 'bias', 'preisach'}
+    thresholds : array_like, shape (m,)
+        Ascending, above zero, normalised.
+    span : tuple of float, optional
+        Voltages for which it holds, normalised (`Hysteresis.span`).
+
+    Raises
+    ------
+    ModelError
+        When the name is unknown.
+
+    Examples
+    --------
+    >>> law = HysteresisLaw('square', [0.25, 0.5])
+    >>> law.size, law.lower.tolist()
+    (5, [0.0, 0.0, -inf, -inf, -inf])
+    >>> law.hysteresis([0.2, 0.1, -0.05, 0.0, 1.0]).p0
+    -0.05
+    """
+
+    name: LawName
+    thresholds: NDArray[np.float64]
+    span: tuple[float, float] = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if self.name not in LAWS:
+            raise ModelError(f'hysteresis: unknown law {self.name!r}; known are {", ".join(LAWS)}')
+        object.__setattr__(self, 'thresholds', frozen_array(self.thresholds))
+
+    @property
+    def densities(self) -> int:
+        """Number of the coefficients that stand first, and are >= 0; powers of v follow."""
+        return self.size - (2 if self.name == 'plays' else 3)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return int(self._parameters.shape[0])
+
+    @property
+    def lower(self) -> NDArray[np.float64]:
+        """Lower bounds of the coefficients, shape (size,)."""
+        return np.where(np.arange(self.size) < self.densities, 0.0, -np.inf)
+
+    @functools.cached_property
+    def _parameters(self) -> NDArray[np.float64]:
+        """
+        The parameters of H in each coefficient, shape (size, 5 m + 3).
+
+        They are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2.
+        """
+        m = self.thresholds.size
+        plays = np.zeros((m, POWERS + 2, m))
+        plays[:, 0] = np.eye(m)
+        more: list[NDArray[np.float64]] = []
+        low, high = self.span
+        for hat in self._hats() if self.name in ('bias', 'preisach') else ():
+            if self.name == 'bias':
+                for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
+                    part = np.zeros((POWERS + 2, m))
+                    part[0], part[-1] = q * hat, kappa * hat
+                    more.append(part)
+                continue
+            width = np.maximum(high - low - self.thresholds, 0.0)
+            for density in _bernstein():
+                part = np.zeros((POWERS + 2, m))
+                for power, b in enumerate(density):
+                    scale = (power + 1) * np.where(width > 0.0, width, np.inf) ** power
+                    part[power] = b * hat / scale
+                more.append(part)
+        rows = np.concatenate([plays, np.array(more).reshape(-1, POWERS + 2, m)])
+        powers = np.eye(3)[1 if self.name == 'plays' else 0 :]
+        n = rows.shape[0]
+        return np.block(
+            [
+                [rows.reshape(n, -1), np.zeros((n, 3))],
+                [np.zeros((powers.shape[0], rows[0].size)), powers],
+            ]
+        )
+
+    def _hats(self) -> Iterator[NDArray[np.float64]]:
+        """Give piecewise linear functions of the threshold, as shares of a density; shape (m,)."""
+        r = self.thresholds
+        if not r.size:
+            return
+        middles = 0.5 * (r[1:] + r[:-1])
+        width = np.diff(np.concatenate([[0.0], middles, [r[-1]]]))
+        nodes = np.linspace(0.0, r[-1], NODES)
+        for j in range(NODES):
+            yield width * np.interp(r, nodes, np.eye(NODES)[j])
+
+    def hysteresis(self, coefficients: ArrayLike) -> Hysteresis:
+        """
+        Return the H of coefficients; those below their bound by rounding are set on it.
+
+        Parameters
+        ----------
+        coefficients : array_like, shape (size,)
+        """
+        theta = np.maximum(np.asarray(coefficients, dtype=np.float64), self.lower)
+        return self._of(theta @ self._parameters, self.thresholds)
+
+    def _of(self, x: NDArray[np.float64], thresholds: NDArray[np.float64]) -> Hysteresis:
+        plays, (p0, p1, p2) = x[:-3].reshape(POWERS + 2, -1), x[-3:]
+        return Hysteresis(
+            thresholds,
+            plays[0],
+            float(p1),
+            float(p2),
+            float(p0),
+            curves=plays[1:-1].T if self.name == 'preisach' else None,
+            bias=plays[-1] if self.name == 'bias' else None,
+            span=self.span,
+        )
+
+    def deviations(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
+        chosen = [*range(self.thresholds.size), -2, -1]
+        T = self._parameters[:, chosen]
+        variance = np.sum(T * (covariance @ T), axis=0)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def columns(
+        self, v: NDArray[np.float64], memory: ArrayLike | None = None
+    ) -> Iterator[NDArray[np.float64]]:
+        """
+        Give what H adds for each coefficient, one after the other.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n,)
+            Normalised input.
+        memory : array_like, shape (m,), optional
+            Play outputs before the first sample; those of a stage that last came down to zero
+            when absent.
+
+        Yields
+        ------
+        ndarray, shape (n,)
+        """
+        r, m = self.thresholds, self.thresholds.size
+        start = None if memory is None else np.asarray(memory, dtype=np.float64)
+        for i in range(m):
+            one = slice(i, i + 1)
+            yield play_columns(v, r[one], None if start is None else start[one])[0]
+        for row in self._parameters[m : self.densities]:
+            plays = row[:-3].reshape(POWERS + 2, m)
+            moved = plays.any(axis=0)
+            part = self._of(np.concatenate([plays[:, moved].ravel(), row[-3:]]), r[moved])
+            yield part(v, None if start is None else start[moved])
+        if self.name != 'plays':
+            yield v**2
+        yield v**3
+        yield v
+
+    def coefficients(self, hysteresis: Hysteresis) -> NDArray[np.float64]:
+        """
+        Return the coefficients of an H of this family, shape (size,).
+
+        Raises
+        ------
+        ModelError
+            When it has other thresholds, or is none of this family.
+        """
+        h, m = hysteresis, self.thresholds.size
+        if not np.array_equal(h.thresholds, self.thresholds):
+            raise ModelError('hysteresis: the law has other thresholds')
+        theta = np.zeros(self.size)
+        theta[:m], theta[-2:] = h.weights, (h.p1, h.p2)
+        if self.name != 'plays':
+            theta[-3] = h.p0
+        plays = np.zeros((POWERS + 2, m))
+        plays[0] = h.weights
+        if h.curves is not None:
+            plays[1 : 1 + h.curves.shape[1]] = h.curves.T
+        if h.bias is not None:
+            plays[-1] = h.bias
+        wanted = np.concatenate([plays.ravel(), [h.p0, h.p1, h.p2]])
+        if plays[1:].any():
+            theta = lsq_linear(self._parameters.T, wanted, (self.lower, np.inf), method='bvls').x
+        if not np.allclose(theta @ self._parameters, wanted, rtol=1e-6, atol=1e-9):
+            raise ModelError(f'hysteresis: this H is none of the law {self.name!r}')
+        return theta
+
+
+def _bernstein() -> Iterator[NDArray[np.float64]]:
+    """Give the coefficients of 1, s, s^2, ... of each Bernstein polynomial on 0 .. 1."""
+    for j in range(DEGREE + 1):
+        b = np.zeros(DEGREE + 1)
+        for power in range(j, DEGREE + 1):
+            b[power] = comb(DEGREE, j) * comb(DEGREE - j, power - j) * (-1.0) ** (power - j)
+        yield b

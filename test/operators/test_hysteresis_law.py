@@ -1,0 +1,151 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Wide laws of H: Preisach switches as truth, streaming, monotony, and what they refuse."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import paper_stage
+from piezo_ident.common.errors import ModelError
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
+import pytest
+
+R = np.arange(1, 20) / 20
+
+
+def path(seed=0, n=3000):
+    rng = np.random.default_rng(seed)
+    u = np.abs(np.cumsum(0.03 * rng.standard_normal(n))) % 2
+    return np.minimum(u, 2 - u)
+
+
+def law_and_h(name, seed=0, span=(0.0, 1.0)):
+    law = HysteresisLaw(name, R * (span[1] - span[0]), span)
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(0, 1, law.size) * (rng.random(law.size) < 0.7)
+    return law, theta, law.hysteresis(theta)
+
+
+@pytest.mark.parametrize('span', [(0.0, 1.0), (-0.5, 2.5)])
+@pytest.mark.parametrize('name', LAWS)
+def test_h_is_the_sum_of_its_columns_and_streams(name, span):
+    law, theta, h = law_and_h(name, span=span)
+    u = span[0] + (span[1] - span[0]) * path()
+    start = u[0] - R / 3
+    w = h(u, start)
+    assert_allclose(theta @ np.array(list(law.columns(u, start))), w, atol=1e-10)
+    parts, memory = [], start
+    for cut in np.split(u, [1, 2, 700, 2222]):
+        part, memory = h.follow(cut, memory)
+        parts.append(part)
+    assert_array_equal(np.concatenate(parts), w)
+    again = law.coefficients(h)
+    assert_allclose(law.hysteresis(again)(u, start), w, atol=1e-9)
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_every_law_holds_the_plays(name):
+    plain = Hysteresis(R, np.linspace(0, 0.1, 19), -0.2, 0.9)
+    law = HysteresisLaw(name, R)
+    u = path(1)
+    assert_allclose(law.hysteresis(law.coefficients(plain))(u), plain(u), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 10_000), st.sampled_from(['square', 'preisach', 'bias']))
+def test_densities_never_fall_and_the_slope_is_what_is_promised(seed, name):
+    law, theta, _ = law_and_h(name, seed)
+    rng = np.random.default_rng(seed)
+    theta[-3:] = [rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.0), 1.5]
+    h = law.hysteresis(theta)
+    u = path(seed)
+    w = h(u)
+    dw, du = np.diff(w), np.diff(u)
+    # a chord, against the least slope of the branch
+    assert np.all(dw[du > 1e-6] / du[du > 1e-6] >= h.lowest_slope() - 1e-6)
+    assert np.all(dw[du < -1e-6] / du[du < -1e-6] >= h.lowest_slope() - 1e-6)
+
+
+@pytest.mark.parametrize('name', ['square', 'bias', 'preisach'])
+def test_model_streams_in_one_loop_as_it_does_link_by_link(name):
+    _, _, h = law_and_h(name)
+    model = replace(paper_stage.PAPER, hysteresis=h)
+    v = 10 * path(2)
+    y = model.simulate(v)
+    stream, chain = model.stream(), model.stream()
+    chain._cascade = None
+    parts = [stream.process(x) for x in np.split(v, [1, 500, 501])]
+    assert_array_equal(np.concatenate(parts), y)
+    assert_allclose(chain.process(v), y, atol=1e-12 * np.ptp(y))
+
+
+def test_beyond_its_span_a_curve_is_flat():
+    h = Hysteresis([0.5], [0.2], 0.0, 1.0, curves=[[0.4, 0.1]])
+    one, two = h([0.0, 1.0, 1.5])[1:]
+    assert two - one == pytest.approx(0.5 * 1.2)
+    assert_allclose(h.rise([-0.1], 0.0), [0.2])
+    assert_allclose(h.rise([0.25], 0.0), [0.2 + 0.8 * 0.25 + 0.3 * 0.25**2])
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_slope_is_the_chord_of_a_settled_loop(name):
+    law = HysteresisLaw(name, R)
+    theta = np.full(law.size, 0.02)
+    theta[-2:] = [-0.2, 1.0]
+    h = law.hysteresis(theta)
+    bias, size = 0.5, 0.12
+    low, high = bias - size / 2, bias + size / 2
+    # a decaying oscillation settles the wide plays in the middle of their bands
+    k = np.arange(80)
+    turns = np.clip(bias + 0.5 * (-1.0) ** k * 0.95**k, 0, 1)
+    legs = [0, *turns[: np.argmax(0.5 * 0.95**k < size / 2)], low, high, low, high]
+    v = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(legs)])
+    w = h(v)
+    assert h.slope(bias, size) == pytest.approx((w[-1] - w[-200]) / size, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ('more', 'says'),
+    [
+        ({'curves': [[0.1]]}, 'for 2 thresholds'),
+        ({'curves': np.zeros((2, 4))}, '1 to 3 numbers'),
+        ({'curves': [0.1, 0.2]}, '1 to 3 numbers'),
+        ({'bias': [0.1]}, 'one number'),
+        ({'bias': [[0.1], [0.2]]}, 'one number'),
+        ({'bias': [0.1, np.nan]}, 'finite'),
+        ({'curves': [[-0.6], [0.0]]}, 'negative'),
+        ({'bias': [-0.6, 0.0]}, 'negative'),
+        ({'p0': np.inf}, 'finite'),
+        ({'curves': [[0.1], [0.1]], 'span': (1.0, 1.0)}, 'span'),
+    ],
+)
+def test_what_is_no_wide_hysteresis_is_refused(more, says):
+    with pytest.raises(ModelError, match=says):
+        Hysteresis([0.1, 0.2], [0.5, 0.5], 0.0, 1.0, **more)
+
+
+def test_law_refuses_other_names_and_foreign_h():
+    with pytest.raises(ModelError, match='known are plays'):
+        HysteresisLaw('relays', R)
+    _, _, h = law_and_h('preisach')
+    with pytest.raises(ModelError, match='none of the law'):
+        HysteresisLaw('bias', R).coefficients(h)
+    with pytest.raises(ModelError, match='other thresholds'):
+        HysteresisLaw('preisach', R[1:]).coefficients(h)
+
+
+def test_idle_plays_are_left_out_without_a_change():
+    for name in LAWS:
+        law, theta, _ = law_and_h(name)
+        theta[:10] = 0.0
+        theta[19:-3] = 0.0
+        h = law.hysteresis(theta)
+        slim = h.without_idle()
+        assert slim.thresholds.size < h.thresholds.size
+        assert_allclose(slim(path()), h(path()), atol=1e-14)
