@@ -4,6 +4,7 @@
 """What a model leaves: noise floor, lines, dependence and faults of the data."""
 
 from piezo_ident.residual.analysis import analyse, ResidualAnalysis
+from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest
 from piezo_ident.residual.dependence import Curve
 from piezo_ident.residual.faults import FaultSearch, find_faults
 from piezo_ident.residual.lines import find_lines, Line, LineSearch, without_lines
@@ -11,6 +12,7 @@ from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart, Stretch, stretches_of
 
 __all__ = [
+    'ChannelTest',
     'Curve',
     'FaultSearch',
     'Line',
@@ -21,6 +23,7 @@ __all__ = [
     'Stretch',
     'all_stretches',
     'analyse',
+    'channel_tests',
     'find_faults',
     'find_lines',
     'residual_noise_floor',

@@ -1,0 +1,318 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a residual holds that no function of the drive makes, and whether a channel makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.operators.play import play_columns
+from piezo_ident.residual.coherence import coherence
+from piezo_ident.residual.stretches import block_means, ResidualPart
+from scipy import fft, linalg, signal, stats
+
+__all__ = ['ChannelTest', 'channel_tests', 'drive_functions']
+
+Array = NDArray[np.float64]
+
+#: rate of the means that are looked at [Hz]
+RATE = 2500.0
+#: plays of the drive, and of a channel, as shares of the range
+PLAYS, CHANNEL_PLAYS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.9), (0.1, 0.4)
+#: corners of the low-passes behind each function [Hz]
+CORNERS = (0.3, 2.0, 10.0, 50.0, 250.0)
+#: share of a direction below which it is rounding
+RANK, CHANNEL_RANK = 1e-6, 1e-3
+#: half waves over a record that count as drift, and start that is still settling [s]
+SLOW, SETTLING = 24, 0.5
+#: share of a channel that the drive must leave, and of its power that may be coherent with it
+OWN, FOLLOWS = 0.01, 0.9
+#: coefficients of the filter that makes a residual white, and the window of its level [s]
+WHITE, LEVEL = 32, 0.1
+#: chance of an unrelated channel that is taken for a cause
+SIGNIFICANT = 1e-5
+#: share of the gain that must be left where it was not fitted, and parts held out in turn
+KEPT, FOLDS = 0.5, 5
+#: share of a record around no shift that is no surrogate
+AROUND = 0.05
+
+
+@dataclass(frozen=True)
+class ChannelTest:
+    """
+    Whether a further channel explains what the drive leaves of a residual.
+
+    Attributes
+    ----------
+    channel : str
+    significant : bool
+        A channel without a bearing on the residual is so in one of 100,000 cases.
+    chance : float
+        That an unrelated channel of the same kind gains as much, from circular shifts.
+    share : float
+        Share of the residual's mean square that the channel explains beyond the drive, 0..1.
+    rms : float
+        Of what it adds [m].
+    coherence, bound : float
+        Partial coherence given the drive, of residuals made white, all lags together; and what
+        an unrelated channel stays below in 99,999 of 100,000 cases.  For one column and L
+        independent observations that is ``1 - (1 - c)^(1/(L - 1))``.
+    kept : float
+        Share of that gain that is left in fifths of the data to which it was not fitted.
+    why : str
+        Why it was not tested; empty when it was.
+    """
+
+    channel: str
+    significant: bool = False
+    chance: float = 1.0
+    share: float = 0.0
+    rms: float = 0.0
+    coherence: float = 0.0
+    bound: float = 1.0
+    kept: float = 0.0
+    why: str = ''
+
+
+def drive_functions(v: Array, rate: float) -> Array:
+    """
+    Return functions of a drive that a hysteresis, a lag or a creep may be made of, shape (n, k).
+
+    The drive, its square and cube, and plays of it, each with its first and second difference
+    and behind low-passes.  No sum of plays is a real hysteresis: the pairs with the square let
+    its loops lean.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+    rate : float
+        [Hz]
+    """
+    span = float(np.ptp(v))
+    u = (v - v.min()) / span if span > 0.0 else np.zeros(v.size)
+    some = [u, *play_columns(u, PLAYS)]
+    some += [u * u, u**3, *(u * f for f in some[1::2])]
+    columns = []
+    for x in some:
+        columns += [x, np.diff(x, prepend=x[0]), np.diff(x, 2, prepend=(x[0], x[0]))]
+        columns += _lagged(x, rate)
+    return np.stack(columns, axis=1)
+
+
+def _slow(n: int) -> Array:
+    """Return what is slower than a channel can be told from drift and creep, shape (n, k)."""
+    return np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(SLOW)))
+
+
+def _solve(A: Array, e: Array) -> Array:
+    """Return the least squares of scaled columns, directions that are rounding left out."""
+    scale = np.maximum(np.sqrt(np.mean(A**2, axis=0)), 1e-300)
+    N = (A / scale).T @ (A / scale)
+    values, vectors = linalg.eigh(N)
+    kept = values > RANK**1.5 * values[-1]
+    part = vectors[:, kept]
+    return np.asarray(part @ ((part.T @ ((A / scale).T @ e)) / values[kept]) / scale)
+
+
+def _basis(A: Array, rank: float) -> tuple[Array, Array]:
+    """Return an orthonormal basis of columns (n, k), and the combinations that make it."""
+    scale = np.maximum(np.sqrt(np.mean(A**2, axis=0)), 1e-300)
+    values, vectors = linalg.eigh((A / scale).T @ (A / scale))
+    kept = values > rank * max(float(values[-1]), 1e-300)
+    made = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
+    return A @ made, made
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Means of the sound samples of a part."""
+
+    e: Array
+    drive: Array
+    channel: Array
+    own: Array
+    use: NDArray[np.bool_]
+    rate: float
+
+    def beyond(self, x: Array) -> Array:
+        """Return a signal without what the drive explains of it."""
+        return np.asarray(x - self.drive @ _solve(self.drive[self.use], x[self.use]))
+
+
+def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
+    """
+    Return for every further channel of records what it explains that the drive cannot.
+
+    Residual and channel are freed of functions of the drive (`drive_functions`), weighted by the
+    level of the residual around, so that what is still counts, and made white.  Then the channel
+    with its plays and low-passes explains what it explains, and circular shifts of the residual
+    say what an unrelated one would.
+
+    Notes
+    -----
+    Partial coherence: Bendat and Piersol, Random Data, 4th ed. (2010), section 7.3,
+    doi:10.1002/9781118032428.
+    """
+    names = dict.fromkeys(name for part in parts for name in part.piece.channels)
+    return tuple(_tested(name, parts) for name in names)
+
+
+def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
+    having = [part for part in parts if name in part.piece.channels]
+    found = [_part_of(part, part.piece.channels[name]) for part in having]
+    rate = max((p.rate for p in found), default=0.0)
+    found = [p for p in found if p.rate == rate and p.use.sum() > 4 * WHITE]
+    if not found:
+        return ChannelTest(name, why='too little was recorded with it')
+    if all(np.ptp(p.own[p.use]) == 0.0 for p in found):
+        return ChannelTest(name, why='it does not move')
+    if _follows(having, name, found):
+        return ChannelTest(name, why='it follows the drive, or moves as slowly as drift')
+    levels = [_level(p) for p in found]
+    at_level = [(p.beyond(p.e) / s)[p.use] for p, s in zip(found, levels, strict=True)]
+    white = _whitening(np.concatenate(at_level))
+    weighed = list(zip(found, levels, strict=True))
+    E = np.concatenate([_white(p.e[:, None], p, s, white)[:, 0] for p, s in weighed])
+    B = linalg.block_diag(*(_white(p.drive, p, s, white) for p, s in weighed))
+    C = np.vstack([_white(p.channel, p, s, white) for p, s in weighed])
+    Q, _ = _basis(B, RANK)
+    E, C = E - Q @ (Q.T @ E), C - Q @ (Q.T @ C)
+    P, made = _basis(C, CHANNEL_RANK)
+    chance, gain, bound = _chance(E, P)
+    kept = _held_out(E, P) / max(float(np.sum((P.T @ E) ** 2)), 1e-300)
+    coefficients = made @ (P.T @ E)
+    added = np.concatenate([_centred((p.channel @ coefficients)[p.use]) for p in found])
+    whole = np.concatenate([_centred(p.e[p.use]) for p in found])
+    power = float(np.mean(added**2))
+    return ChannelTest(
+        channel=name,
+        significant=chance < SIGNIFICANT and gain > bound and kept > KEPT,
+        kept=kept,
+        chance=chance,
+        share=min(power / max(float(np.mean(whole**2)), 1e-300), 1.0),
+        rms=float(np.sqrt(power)),
+        coherence=gain,
+        bound=bound,
+    )
+
+
+def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) -> bool:
+    """Return whether the drive, or drift, explains a channel."""
+    left = sum(float(np.sum(p.beyond(p.own)[p.use] ** 2)) for p in found)
+    whole = sum(float(np.sum(_centred(p.own[p.use]) ** 2)) for p in found)
+    signals = [(part, np.asarray(part.piece.channels[name], np.float64)) for part in having]
+    of_drive = coherence([part.with_residual(c) for part, c in signals if np.isfinite(c).all()])
+    return left < OWN * whole or (of_drive is not None and of_drive.share > FOLLOWS)
+
+
+def _centred(x: Array) -> Array:
+    return np.asarray(x - x.mean())
+
+
+def _part_of(part: ResidualPart, channel: Array) -> _Part:
+    m = max(1, int(part.piece.sample_rate / RATE))
+    rate = part.piece.sample_rate / m
+    e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, np.asarray(channel, np.float64)))
+    use = part.mask[: e.size * m].reshape(-1, m).all(axis=1) & np.isfinite(c)
+    use[: min(round(SETTLING * rate), e.size // 8)] = False
+    c = np.where(np.isfinite(c), c, c[use].mean() if use.any() else 0.0)
+    drive = np.hstack([drive_functions(v, rate), _slow(e.size)])
+    functions = _channel_functions(c, rate)
+    return _Part(np.where(use, e, 0.0), drive, functions, c, use, rate)
+
+
+def _channel_functions(c: Array, rate: float) -> Array:
+    """Return what a channel may move: itself, late, fast, and with a hysteresis of its own."""
+    span = float(np.ptp(c))
+    u = (c - c[0]) / span if span > 0.0 else np.zeros(c.size)
+    columns = [u, np.diff(u, prepend=u[0]), *play_columns(u - u.min(), CHANNEL_PLAYS)]
+    return np.stack([*columns, *_lagged(u, rate, CORNERS[1:])], axis=1)
+
+
+def _lagged(x: Array, rate: float, corners: Sequence[float] = CORNERS) -> list[Array]:
+    """Return a signal behind low-passes, from rest at its first value."""
+    found = []
+    for corner in corners:
+        if corner < 0.2 * rate:
+            a = float(np.exp(-2.0 * np.pi * corner / rate))
+            found.append(signal.lfilter([1.0 - a], [1.0, -a], x, zi=[a * x[0]])[0])
+    return found
+
+
+def _level(p: _Part) -> Array:
+    """Return the rms of a residual around each sample, never below a hundredth of the whole."""
+    window = np.ones(max(8, round(LEVEL * p.rate)))
+    e = np.where(p.use, p.beyond(p.e), 0.0)
+    power = np.convolve(e * e, window, 'same')
+    level = power / np.maximum(np.convolve(p.use.astype(np.float64), window, 'same'), 1.0)
+    return np.asarray(np.sqrt(np.maximum(level, 1e-4 * float(level[p.use].mean()) + 1e-300)))
+
+
+def _white(x: Array, p: _Part, level: Array, white: Array) -> Array:
+    """Return signals (n, k) at one level and white, at samples that count."""
+    # where the filter starts, and behind samples that do not count, all looks like a jump
+    settled = np.convolve(p.use.astype(np.float64), np.ones(white.size))[: p.use.size]
+    whitened = signal.lfilter(white, [1.0], x / level[:, None], axis=0)
+    return np.asarray(whitened[settled > white.size - 0.5])
+
+
+def _whitening(e: Array) -> Array:
+    """Return the prediction error filter of a residual (Levinson)."""
+    n = e.size
+    spectrum = np.abs(fft.rfft(e - e.mean(), 2 * n)) ** 2
+    r = fft.irfft(spectrum)[: WHITE + 1] / n
+    r[0] *= 1.0 + 1e-9
+    if r[0] <= 0.0:
+        return np.ones(1)
+    return np.concatenate([[1.0], -linalg.solve_toeplitz(r[:-1], r[1:])])
+
+
+def _held_out(e: Array, P: Array) -> float:
+    """Return the gain in squares of stretches that were not fitted, equal motion in each."""
+    moved = np.cumsum(np.sum(P**2, axis=1))
+    edges = np.searchsorted(moved, np.linspace(0.0, moved[-1], FOLDS + 1)[1:-1])
+    total = 0.0
+    for p, x in zip(np.split(P, edges), np.split(e, edges), strict=True):
+        G = p.T @ p
+        theta = linalg.solve(np.eye(P.shape[1]) * (1.0 + 1e-9) - G, P.T @ e - p.T @ x)
+        total += float(2.0 * theta @ (p.T @ x) - theta @ G @ theta)
+    return total
+
+
+def _chance(e: Array, P: Array) -> tuple[float, float, float]:
+    """
+    Return the chance of a gain, the gain as a share of e, and its bound.
+
+    The surrogates are all circular shifts of e, without what the columns of P explain of it,
+    against those columns.  Their gains are coherences, so a beta distribution of their mean and
+    variance goes on where their number ends.
+    """
+    n, k = P.shape
+    power = float(e @ e)
+    if power == 0.0 or k == 0:
+        return 1.0, 0.0, 1.0
+    size = fft.next_fast_len(n, real=True)
+    # the shifts of a series that is filled up with zeros are as good
+    rest = e - P @ (P.T @ e)
+    E = np.conj(fft.rfft(rest, size))
+    gains = np.zeros(size)
+    for column in P.T:
+        gains += fft.irfft(fft.rfft(column, size) * E, size) ** 2
+    gains /= max(float(rest @ rest), 1e-300)
+    away = max(2 * WHITE, round(AROUND * n))
+    others = gains[away : size - away]
+    gain = float(np.sum((P.T @ e) ** 2)) / power
+    mean, spread = float(others.mean()), float(others.var())
+    if spread == 0.0:
+        return 1.0, gain, 1.0
+    # a and b of the mean and the variance; one column and L observations have 1 and L - 1
+    total = mean * (1.0 - mean) / spread - 1.0
+    law = stats.beta(mean * total, (1.0 - mean) * total)
+    chance = max(float(law.sf(gain)), 1e-300)
+    if gain <= float(others.max()):
+        chance = max(chance, 1.0 / others.size)
+    return chance, gain, float(law.isf(SIGNIFICANT))

@@ -1,0 +1,69 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Further channels beside a misfit of the hysteresis: coupled ones are found, others are not."""
+
+import numpy as np
+from piezo_ident.record.record import Piece
+from piezo_ident.residual import channel_tests, ResidualPart
+import pytest
+from residual_stages import drives, foreign, RATE
+from scipy.signal import lfilter
+
+STROKE = 75e-6
+DRIVES = drives()
+
+
+def stages(drive: str, *, added=0.0, **channels: np.ndarray):
+    v = DRIVES[drive]
+    y, y_hat = foreign(v, np.random.default_rng(2))
+    e = y + added - y_hat
+    piece = Piece(v, STROKE * (y + added), RATE, channels=channels)
+    part = ResidualPart('r', piece, STROKE * e)
+    return {test.channel: test for test in channel_tests([part])}
+
+
+def others(n: int) -> dict[str, np.ndarray]:
+    """Signals that no drive made."""
+    rng = np.random.default_rng(3)
+    t = np.arange(n) / RATE
+    levels = np.repeat(rng.uniform(0, 10, n // 400 + 1), 400)[:n]
+    return {
+        'raster': np.abs((7.3 * t) % 1 * 2 - 1),
+        'sine': np.sin(2 * np.pi * 3.1 * t),
+        'levels': lfilter([0.1], [1, -0.9], levels),
+        'noise': rng.standard_normal(n),
+        'temperature': 22 + np.cumsum(rng.standard_normal(n)) / n,
+    }
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_unrelated_channels_and_copies_of_the_drive_mean_nothing(drive):
+    v = DRIVES[drive]
+    rng = np.random.default_rng(4)
+    copies = {
+        'monitor': 0.1 * v + 1e-3 * rng.standard_normal(v.size),
+        'filtered': lfilter([0.02], [1, -0.98], v),
+        'sensor': foreign(v, rng)[0],
+        'rest': np.ones(v.size),
+    }
+    found = stages(drive, **copies, **others(v.size))
+    assert [test.channel for test in found.values() if test.significant] == []
+    assert all(found[name].why for name in copies)
+
+
+@pytest.mark.parametrize('size', [7e-4, 5e-3])
+@pytest.mark.parametrize('drive', DRIVES)
+def test_another_axis_is_found_under_a_misfit(drive, size):
+    other = others(DRIVES[drive].size)['raster']
+    moved = lfilter([0.3], [1, -0.7], other)
+    moved = size * (moved - moved.mean()) / moved.std()
+    test = stages(drive, added=moved, other=other)['other']
+    assert test.significant
+    assert test.rms == pytest.approx(size * STROKE, rel=0.35)
+
+
+def test_too_little_data():
+    piece = Piece(np.arange(100.0), np.arange(100.0), RATE, channels={'x': np.arange(100.0)})
+    (test,) = channel_tests([ResidualPart('r', piece, np.ones(100))])
+    assert test.why == 'too little was recorded with it'
