@@ -44,12 +44,12 @@ def _charged(u: Array, tau: float, growth: float, step: float, out: Array) -> No
         out[k] = x
 
 
-def charged(u: Array, tau: float, variant: int) -> Array:
+def charged(u: Array, tau: float, variant: int, rate: float = RATE) -> Array:
     """Return the voltage on a capacitance that grows with it, or behind two equal lags."""
     if variant == 1:
-        return lag(u, 1.0 / (np.pi * tau), order=2)
+        return lag(u, 1.0 / (np.pi * tau), order=2, rate=rate)
     out = np.empty(u.size)
-    _charged(np.ascontiguousarray(u), tau, 0.3, 1.0 / RATE, out)
+    _charged(np.ascontiguousarray(u), tau, 0.3, 1.0 / rate, out)
     return out
 
 
@@ -70,7 +70,7 @@ def _current_limited(u: Array, slew: float, tau: float, step: float, out: Array)
         out[k] = x
 
 
-def current_limited(u: Array, slew: float, variant: int) -> Array:
+def current_limited(u: Array, slew: float, variant: int, rate: float = RATE) -> Array:
     """
     Return the voltage behind an amplifier whose current saturates softly.
 
@@ -80,8 +80,8 @@ def current_limited(u: Array, slew: float, variant: int) -> Array:
     out = np.empty(u.size)
     tau = (20e-6, 40e-6)[variant]
     if not math.isfinite(slew):
-        return lag(u, 1.0 / (2 * np.pi * tau))
-    _current_limited(np.ascontiguousarray(u), slew, tau, 1.0 / RATE, out)
+        return lag(u, 1.0 / (2 * np.pi * tau), rate=rate)
+    _current_limited(np.ascontiguousarray(u), slew, tau, 1.0 / rate, out)
     return out
 
 
@@ -117,10 +117,10 @@ def hinge(u: Array, amount: float, variant: int) -> Array:
     return np.asarray(-amount * np.maximum(at - u, 0.0) ** 1.5)
 
 
-def speed_of(u: Array, corner: float = 400.0) -> Array:
+def speed_of(u: Array, corner: float = 400.0, rate: float = RATE) -> Array:
     """Return the smoothed speed of u in spans a second."""
-    du = np.diff(u, prepend=u[0]) * RATE
-    return np.abs(lag(du, corner))
+    du = np.diff(u, prepend=u[0]) * rate
+    return np.abs(lag(du, corner, rate=rate))
 
 
 def drift(t: Array, amount: float, variant: int, rng: Rng) -> Array:
@@ -147,23 +147,24 @@ def hum(t: Array, amount: float, variant: int, rng: Rng) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _friction(y: Array, reach: float, stribeck: float, out: Array) -> None:
+def _friction(y: Array, reach: float, stribeck: float, rate: float, out: Array) -> None:
     # Dahl: dz = (1 - z sgn(dy)) dy / reach; LuGre's level falls with the speed
     z, last = 0.0, y[0]
     for k in range(y.size):
         dy = y[k] - last
         last = y[k]
-        level = 1.0 + stribeck * math.exp(-abs(dy) * 20000.0 / 2.0)
+        level = 1.0 + stribeck * math.exp(-abs(dy) * rate / 2.0)
         if dy != 0.0:
             end = math.copysign(level, dy)
             z = end + (z - end) * math.exp(-abs(dy) / (reach * level))
         out[k] = z
 
 
-def friction(y: Array, amount: float, variant: int) -> Array:
+def friction(y: Array, amount: float, variant: int, rate: float = RATE) -> Array:
     """Return what a guide with friction takes from the motion: Dahl's law, or LuGre's."""
     out = np.empty(y.size)
-    _friction(np.ascontiguousarray(y), (0.004, 0.008)[variant], (0.0, 0.15)[variant], out)
+    reach, stribeck = (0.004, 0.008)[variant], (0.0, 0.15)[variant]
+    _friction(np.ascontiguousarray(y), reach, stribeck, rate, out)
     return np.asarray(-amount * out)
 
 
@@ -175,10 +176,10 @@ def bridge(y: Array, amount: float, variant: int) -> Array:
     return np.asarray(y + np.arctan(amount * x) / amount - x)
 
 
-def fed_through(u: Array, amount: float, variant: int) -> Array:
+def fed_through(u: Array, amount: float, variant: int, rate: float = RATE) -> Array:
     """Return the drive's own voltage in the reading: through a capacitance, and a resistance."""
     corner = (3000.0, 1500.0)[variant]
-    coupled = u - lag(u, corner)
+    coupled = u - lag(u, corner, rate=rate)
     return np.asarray(amount * (8.0 * coupled + (0.1, 0.02)[variant] * u))
 
 

@@ -179,13 +179,13 @@ def ridden(h: Array, change: float, frequency: float) -> Array:
     return np.asarray(share * (mode(h) - lag(h, stiff)))
 
 
-def delayed(x: Array, seconds: float) -> Array:
+def delayed(x: Array, seconds: float, rate: float = RATE) -> Array:
     """
     Return a signal that starts from rest, delayed by any time, band-limited.
 
     Whole samples are shifted, the fraction is a windowed sinc of 64 taps.
     """
-    samples = seconds * RATE
+    samples = seconds * rate
     whole = math.floor(samples + 1e-9)
     fraction = samples - whole
     out = np.empty_like(x)
@@ -202,9 +202,9 @@ def delayed(x: Array, seconds: float) -> Array:
     return np.asarray(np.convolve(padded, kernel, mode='valid'))
 
 
-def lag(x: Array, corner: float, order: int = 1) -> Array:
+def lag(x: Array, corner: float, order: int = 1, rate: float = RATE) -> Array:
     """Return x behind equal first-order lags, held between samples, from rest at x[0]."""
-    pole = math.exp(-2 * math.pi * corner / RATE)
+    pole = math.exp(-2 * math.pi * corner / rate)
     y = x
     for _ in range(order):
         y, _ = lfilter([1.0 - pole], [1.0, -pole], y, zi=[pole * y[0]])
@@ -223,7 +223,9 @@ def _relax(h: Array, pole: Array, weight: Array, up: float, down: float, out: Ar
         out[k] = (1.0 + whole) * h[k] + (up if behind < 0 else down) * behind
 
 
-def relaxation(h: Array, law: str, amount: float, up: float = 1.0, down: float = 1.0) -> Array:
+def relaxation(
+    h: Array, law: str, amount: float, up: float = 1.0, down: float = 1.0, rate: float = RATE
+) -> Array:
     """
     Return h with creep, every change of h relaxing on its own (Boltzmann's superposition).
 
@@ -240,6 +242,8 @@ def relaxation(h: Array, law: str, amount: float, up: float = 1.0, down: float =
         Per factor e of time, early on.
     up, down : float
         Multiply what is still missing after rises and after falls; 0 makes that way immediate.
+    rate : float
+        [Hz]
     """
     t0, nu = 0.02, 0.12
     tau = np.geomspace(0.004, 4000.0, 60)
@@ -247,7 +251,7 @@ def relaxation(h: Array, law: str, amount: float, up: float = 1.0, down: float =
     if law == 'power':
         spectrum *= (tau / t0) ** nu / math.gamma(1.0 - nu)
     out = np.empty(h.size)
-    _relax(np.ascontiguousarray(h), np.exp(-1.0 / (RATE * tau)), amount * spectrum, up, down, out)
+    _relax(np.ascontiguousarray(h), np.exp(-1.0 / (rate * tau)), amount * spectrum, up, down, out)
     return out
 
 

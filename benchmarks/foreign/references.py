@@ -1,0 +1,135 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What models that are linear in their weights reach, each with the stage's own linear part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from numba import njit
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
+from scipy.optimize import lsq_linear
+
+from .stage import Stage
+
+__all__ = ['FORMS', 'Reference', 'basis', 'references', 'remainder']
+
+Array = NDArray[np.float64]
+
+#: rows that are fitted at most
+ROWS = 30_000
+#: ten plays, forty plays, and on each a form of the hysteresis
+FORMS = ('ten plays', 'forty plays', 'and a square', 'weighted by the bias', 'relay plane')
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Error of a form on another record, % of stroke: identification's weights, mean removed."""
+
+    form: str
+    diagnosis: float
+    unseen: float
+
+
+@njit(cache=True, nogil=True)
+def _play(u: Array, r: float, out: Array) -> None:
+    state = u[0]
+    for k in range(u.size):
+        state = min(max(state, u[k] - r), u[k])
+        out[k] = state
+
+
+def _columns(u: Array, form: str) -> tuple[list[Array], int]:
+    """Return the columns of a form before the linear part; the first so many are >= 0."""
+    count = 40 if form in ('forty plays', 'and a square') else 10
+    plays = []
+    for r in np.arange(count) / count:
+        play = np.empty(u.size)
+        _play(u, float(r), play)
+        plays.append(play)
+    if form == 'weighted by the bias':
+        # without the first: v times itself is a square
+        return [*plays, u**3, *(u * play for play in plays)], count
+    if form == 'relay plane':
+        # a relay density cubic in the bias: each play through a curve of its own
+        return [*(play**k for play in plays for k in (1, 2, 3, 4))], 0
+    return [*plays, u**3, *([u**2] if form == 'and a square' else [])], count
+
+
+def basis(stage: Stage, v: Array, name: str, form: str) -> tuple[Array, int]:
+    """
+    Return the columns of a form behind the stage's linear part, with an offset, thinned.
+
+    Parameters
+    ----------
+    stage : Stage
+    v : ndarray, shape (n,)
+        [V]
+    name : str
+        Of the record: the past of the plays is the stage's own.
+    form : str
+        One of `FORMS`.
+    """
+    low, high = stage.limits
+    u = (v - low) / (high - low)
+    before = stage.before(float(u[0]), name)
+    columns, positive = _columns(np.concatenate([before, u]), form)
+    stride = max(1, v.size // ROWS)
+    parts = [stage.linear(c, stage.rate)[before.size :: stride] for c in columns]
+    return np.stack([*parts, np.ones(parts[0].size)], axis=1), positive
+
+
+def _fitted(X: Array, y: Array, positive: int) -> Array:
+    scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-9)
+    # a touch of ridge, since neighbouring plays are nearly the same
+    rows = np.vstack([X / scale, 1e-4 * np.sqrt(y.size) * np.eye(X.shape[1])])
+    Q, R = qr(rows, mode='economic')
+    target = Q.T @ np.concatenate([y, np.zeros(X.shape[1])])
+    if not positive:
+        return np.asarray(solve_triangular(R, target) / scale)
+    least = np.full(X.shape[1], -np.inf)
+    least[:positive] = 0.0
+    return np.asarray(lsq_linear(R, target, (least, np.inf), method='bvls').x / scale)
+
+
+def _error(X: Array, y: Array, weights: Array) -> float:
+    e = y - X @ weights
+    return float(100.0 * e.std() / np.ptp(y))
+
+
+def references(
+    stage: Stage, records: Mapping[str, tuple[Array, Array]], forms: tuple[str, ...] = FORMS
+) -> dict[str, Reference]:
+    """
+    Return what each form reaches, fitted on the identification.
+
+    Parameters
+    ----------
+    stage : Stage
+    records : mapping of str to (v, y)
+        Of every record: command [V], and displacement in parts of the stroke.
+    forms : tuple of str, optional
+    """
+    found = {}
+    for form in forms:
+        weights: Array | None = None
+        errors = {}
+        for name in ('identification', 'diagnosis', 'unseen'):
+            v, y = records[name]
+            X, positive = basis(stage, v, name, form)
+            y = y[:: max(1, v.size // ROWS)]
+            if weights is None:
+                weights = _fitted(X, y, positive)
+            errors[name] = _error(X, y, weights)
+        found[form] = Reference(form, errors['diagnosis'], errors['unseen'])
+    return found
+
+
+def remainder(X: Array, change: Array) -> float:
+    """Return the rms of what a refit of columns leaves of a change."""
+    Q, _ = np.linalg.qr(X)
+    return float(np.sqrt(np.mean((change - Q @ (Q.T @ change)) ** 2)))
