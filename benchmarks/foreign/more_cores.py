@@ -78,7 +78,8 @@ def _kernels(u: Array, up: Array, down: Array, ramp: float, weight: Array, out: 
 
 def krasnoselskii_pokrovskii(rng: Rng) -> Law:
     """Draw kernels on a coarse grid of thresholds, more of them narrow and to one side."""
-    ramp = 3.0 / KERNELS
+    # as long as three steps of the grid, or the branches would be jagged
+    ramp = 3.0 / (KERNELS - 1)
     grid = np.linspace(-0.5 * ramp, 1.0 - 0.5 * ramp, KERNELS)
     a, b = np.meshgrid(grid, grid, indexing='ij')
     up, down = a[a >= b], b[a >= b]
@@ -205,7 +206,7 @@ def _turning(u: Array, bow: float, power: float, lean: float, out: Array) -> Non
 
 def turning_curves(rng: Rng) -> Law:
     """Draw curves from each turning point to the one before, the longer the more bent."""
-    bow, power, lean = rng.uniform(0.5, 0.85), rng.uniform(0.6, 1.1), rng.uniform(-0.3, 0.3)
+    bow, power, lean = rng.uniform(0.5, 0.85), rng.uniform(0.6, 1.1), rng.uniform(-0.5, 0.5)
 
     def law(u: Array) -> Array:
         out = np.empty(u.size)
