@@ -557,7 +557,7 @@ def main() -> None:
     """Run what is not done yet, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('out', type=Path)
-    parser.add_argument('--set', choices=tuple(SETS), default=tuple(SETS)[-1], dest='group')
+    parser.add_argument('--set', choices=tuple(SETS), default='final', dest='group')
     parser.add_argument('--only', default='', help='regular expression for the keys of cases')
     parser.add_argument('--first', type=int, help='only so many cases')
     parser.add_argument('--kept', type=Path, help='build/study_foreign_SET.jsonl when absent')
