@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +44,10 @@ def key_of(run: Run) -> tuple[str, float]:
 
 
 def predictions_of(
-    model: StageModel, runs: Sequence[Run], memories: Memories | None = None
+    model: StageModel,
+    runs: Sequence[Run],
+    memories: Memories | None = None,
+    offsets: Mapping[tuple[str, float], float] | None = None,
 ) -> list[Prediction]:
     """Return the free run over each run; a memory at the start that is not given is estimated."""
     static, found = model.without_dynamics(), []
@@ -52,7 +55,9 @@ def predictions_of(
         memory, judged = (memories or {}).get(key_of(run)), run.use
         if memory is None:
             memory, judged = start_memory(model, run.piece), run.known
-        y_hat, y_static = (m.predict_piece(run.piece, memory) for m in (model, static))
+        # a sensor may be set to zero between two records
+        zero = (offsets or {}).get(key_of(run), 0.0)
+        y_hat, y_static = (m.predict_piece(run.piece, memory) + zero for m in (model, static))
         found.append(Prediction(run, y_hat, y_static, judged))
     return found
 

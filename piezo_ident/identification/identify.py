@@ -76,7 +76,7 @@ def identify(
     ----------
     records : sequence of Record, or Record
         With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
-        of other kinds are then left for validation.  Without them the longest run is fitted as a
+        of other kinds are then left for validation.  Without them every run is fitted as a
         whole, but for its end.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
@@ -128,7 +128,7 @@ def _identify(
     else:
         fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
     model, stroke = fit.model, abs(scaling.Y)
-    predictions = predictions_of(model, runs, fit.memories)
+    predictions = predictions_of(model, runs, fit.memories, fit.offsets)
     floor = noise_floor_of(predictions)
     result = Identification(
         model=model,

@@ -137,6 +137,8 @@ class DelayResult:
         One-step ARX loss for d = 0, 1, ...
     scan : int or None
         Delay that the scan points to.
+    fraction : float
+        Further part of a sample, where the data show it.
     """
 
     samples: int
@@ -145,6 +147,7 @@ class DelayResult:
     step: StepDelay | None = None
     loss: NDArray[np.float64] | None = None
     scan: int | None = None
+    fraction: float = 0.0
 
     @property
     def agree(self) -> bool | None:
@@ -279,6 +282,8 @@ class FitOutcome:
     warnings : sequence of str
     not_identified, memories
         As in `Identification`.
+    offsets : mapping
+        How far the zero of displacement of a run lies from that of the model [m], as `memories`.
     """
 
     model: StageModel
@@ -289,6 +294,7 @@ class FitOutcome:
     warnings: Sequence[str]
     not_identified: Sequence[tuple[str, str]] = ()
     memories: Memories = field(default_factory=dict)
+    offsets: Mapping[tuple[str, float], float] = field(default_factory=dict)
 
 
 def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:

@@ -14,12 +14,13 @@ Every smaller order, and every delay, is a choice of columns of R:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
 from piezo_ident.identification.solvers.output_error import lag_products
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
@@ -32,6 +33,8 @@ __all__ = [
     'delayed',
     'free_run_error',
     'instrumental_variables',
+    'instruments_of',
+    'order_table',
     'scan_orders',
     'stabilised',
 ]
@@ -239,6 +242,28 @@ def scan_orders(
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
     """
+    return order_table(
+        factor, d, nb_max, lambda model: free_run_error(model, d, u_held, y_held), tick
+    )
+
+
+def order_table(
+    factor: ArxFactor,
+    d: int,
+    nb_max: int,
+    judged: Callable[[Dynamics], float],
+    tick: Callable[[float], None] | None = None,
+) -> OrderTable:
+    """
+    Fit all orders up to (na_max, nb_max), and judge each as asked.
+
+    Parameters
+    ----------
+    factor, d, nb_max, tick
+        As in `scan_orders`.
+    judged : callable
+        Returns the held-out error of dynamics without the delay, infinite when unstable.
+    """
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
     size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
@@ -249,7 +274,7 @@ def scan_orders(
             loss[na - 1, nb - 1] = one_step
             model = Dynamics(a=theta[:na], b=theta[na:])
             row.append(model)
-            held[na - 1, nb - 1] = free_run_error(model, d, u_held, y_held)
+            held[na - 1, nb - 1] = judged(model)
         models.append(tuple(row))
         if tick is not None:
             tick(na / shape[0])
@@ -319,24 +344,41 @@ def instrumental_variables(
     Dynamics
         Possibly unstable: the caller judges.
     """
+    part = Excerpt(delayed(u, d), y, np.ones(u.size, dtype=bool))
+    return instruments_of([part], start, iterations)
+
+
+def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics, iterations: int = 3) -> Dynamics:
+    """Refine an ARX model by instrumental variables, from the samples that count of excerpts."""
     na, nb = start.a.size, start.b.size
     model = stabilised(start)
-    w = delayed(u, d)
     first = max(na, nb)
-    n = u.size - first
+    spans = [(e, max(a, first), b - max(a, first)) for e in excerpts for a, b in e.stretches]
     for _ in range(iterations):
-        one = np.ones(1)
-        y_sim = filter_arx(model.a, model.b, w, at_rest=False)
-        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, w, y_sim))
-        u_lags = (uf, first, 1.0, nb)
-        z, phi = ((sf, first - 1, -1.0, na), u_lags), ((yf, first - 1, -1.0, na), u_lags)
-        A = np.block([[_inner(x, other, n) for other in phi] for x in z])
-        right = np.concatenate([_inner(x, (yf, first, 1.0, 1), n) for x in z])[:, 0]
-        scale = np.sqrt(np.concatenate([np.diag(_inner(x, x, n)) for x in z]))
-        scale[scale == 0.0] = 1.0
-        theta = np.linalg.lstsq(A / scale[:, None], right / scale, rcond=None)[0]
+        A, right = np.zeros((na + nb, na + nb)), np.zeros(na + nb)
+        scale = np.zeros(na + nb)
+        filtered = [_filtered(e, model) for e in excerpts]
+        of = {id(e): signals for e, signals in zip(excerpts, filtered, strict=True)}
+        for e, at, n in spans:
+            if n <= 0:
+                continue
+            yf, uf, sf = of[id(e)]
+            u_lags = (uf, at, 1.0, nb)
+            z, phi = ((sf, at - 1, -1.0, na), u_lags), ((yf, at - 1, -1.0, na), u_lags)
+            A += np.block([[_inner(x, other, n) for other in phi] for x in z])
+            right += np.concatenate([_inner(x, (yf, at, 1.0, 1), n) for x in z])[:, 0]
+            scale += np.concatenate([np.diag(_inner(x, x, n)) for x in z])
+        size = np.sqrt(scale)
+        size[size == 0.0] = 1.0
+        theta = np.linalg.lstsq(A / size[:, None], right / size, rcond=None)[0].astype(float)
         candidate = Dynamics(a=theta[:na], b=theta[na:])
         if not candidate.is_stable:
             return candidate
         model = candidate
     return model
+
+
+def _filtered(e: Excerpt, model: Dynamics) -> list[NDArray[np.float64]]:
+    """Return displacement, input and simulated output, filtered by 1/A."""
+    y_sim = filter_arx(model.a, model.b, e.u, at_rest=False)
+    return [filter_arx(model.a, np.ones(1), x, at_rest=False) for x in (e.x, e.u, y_sim)]

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from piezo_ident.identification.prepare import Run
@@ -14,12 +14,14 @@ from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['warn_of_range', 'warnings_of']
+__all__ = ['warn_of_range', 'warn_of_zeros', 'warnings_of']
 
 #: change of G within the excited band below which the band is too narrow to know G by
 HARDLY = 0.1
 #: measured and modelled small-signal gain may differ by this share before it is said
 SLOPE_TOLERANCE = 0.05
+#: zeros of displacement may differ by this share of the stroke before it is said
+ZERO_MOVED = 2e-3
 
 
 def warnings_of(
@@ -117,13 +119,25 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     return warnings
 
 
-def warn_of_range(run: Run, n_fit: int, scaling: Scaling) -> list[str]:
-    """Return a warning when the held-out part leaves the voltages of the fitted one."""
-    fitted, held = run.u[:n_fit], run.u[n_fit:]
-    if held.min() > fitted.min() - 0.01 and held.max() < fitted.max() + 0.01:
+def warn_of_range(runs: Sequence[Run], ends: Sequence[int], scaling: Scaling) -> list[str]:
+    """Return a warning when the held-out ends leave the voltages of the fitted parts."""
+    pairs = list(zip(runs, ends, strict=True))
+    parts = [run.u[:n] for run, n in pairs], [run.u[n:] for run, n in pairs]
+    spans = [(min(map(np.min, part)), max(map(np.max, part))) for part in parts]
+    if spans[1][0] > spans[0][0] - 0.01 and spans[1][1] < spans[0][1] + 0.01:
         return []
-    spans = [f'{scaling.v(u.min()):.3g} .. {scaling.v(u.max()):.3g} V' for u in (fitted, held)]
+    one, other = (f'{scaling.v(low):.3g} .. {scaling.v(high):.3g} V' for low, high in spans)
     return [
-        f'the fitted part covers {spans[0]}, the held-out part {spans[1]}: its error is partly '
+        f'the fitted part covers {one}, the held-out part {other}: its error is partly '
         'one of extrapolation'
+    ]
+
+
+def warn_of_zeros(offsets: Mapping[tuple[str, float], float], scaling: Scaling) -> list[str]:
+    """Return a warning where the displacement of a run has another zero than the model."""
+    return [
+        f'{record}: its zero of displacement lies {1e6 * offset:.3g} um from that of the model; '
+        'its errors are told without it'
+        for (record, _), offset in offsets.items()
+        if abs(offset) > ZERO_MOVED * abs(scaling.Y)
     ]

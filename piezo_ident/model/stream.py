@@ -39,9 +39,7 @@ class Stream:
         self._started = False
         self._cascade: _Cascade | None = None
         match self._chain.operators:
-            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z) if (
-                model.hysteresis.relaxations is None
-            ):
+            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z):
                 self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:

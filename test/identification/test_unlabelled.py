@@ -49,8 +49,8 @@ def sine(seconds, f=2.0, phase=0.0):
 
 def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
     steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 1500)
-    run, scaling = run_of(np.concatenate([steps, sine(2.0)]))
-    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
+    run, _ = run_of(np.concatenate([steps, sine(2.0)]))
+    fit = joint_fit([run], [run.piece.n], Settings(), silent)
     assert fit.delay.samples == 2
     assert fit.delay.source == 'steps'
     assert fit.not_identified == ()
@@ -60,8 +60,8 @@ def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
 
 
 def test_slow_record_leaves_delay_and_dynamics_neutral_and_says_so():
-    run, scaling = run_of(sine(2.0))
-    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
+    run, _ = run_of(sine(2.0))
+    fit = joint_fit([run], [run.piece.n], Settings(), silent)
     assert [what for what, _ in fit.not_identified] == ['delay', 'dynamics']
     assert (fit.delay.samples, fit.delay.source, fit.delay.std) == (0, 'none', float('inf'))
     assert fit.G.a.size == 0
@@ -72,10 +72,9 @@ def test_memory_of_a_start_in_the_middle_is_found():
     rng = np.random.default_rng(4)
     r = STAGE.hysteresis.thresholds
     truth = 0.5 - np.cumsum(np.diff(np.concatenate([[0.0], r])) * rng.uniform(0, 1, r.size))
-    run, scaling = run_of(sine(2.0, phase=np.pi / 2), memory=truth)
-    fit = joint_fit(run, run.piece.n, scaling, Settings(), silent)
-    assert fit.memory is not None
-    found = fit.memory(fit.hysteresis.thresholds)
+    run, _ = run_of(sine(2.0, phase=np.pi / 2), memory=truth)
+    fit = joint_fit([run], [run.piece.n], Settings(), silent)
+    found = fit.excerpts[0].start(fit.hysteresis.thresholds)
     u = run.u
     with_it, without = fit.hysteresis(u, found), fit.hysteresis(u)
 
@@ -88,15 +87,15 @@ def test_memory_of_a_start_in_the_middle_is_found():
     assert np.all(found >= u[0] - fit.hysteresis.thresholds - 1e-12)
     # thresholds of another grid get a memory that can be, too
     other = np.array([0.01, 0.33, 0.97])
-    assert np.all(fit.memory(other) >= u[0] - other - 1e-12)
+    assert np.all(fit.excerpts[0].start(other) >= u[0] - other - 1e-12)
 
 
 def test_given_delay_is_taken_and_too_little_is_refused():
-    run, scaling = run_of(sine(1.0))
-    assert joint_fit(run, run.piece.n, scaling, Settings(delay=4), silent).delay.samples == 4
-    flat, scaling = run_of(np.concatenate([np.zeros(1000), sine(1.0)]))
+    run, _ = run_of(sine(1.0))
+    assert joint_fit([run], [run.piece.n], Settings(delay=4), silent).delay.samples == 4
+    flat, _ = run_of(np.concatenate([np.zeros(1000), sine(1.0)]))
     with pytest.raises(IdentificationError, match='moves by 0'):
-        joint_fit(flat, 900, scaling, Settings(), silent)
+        joint_fit([flat], [900], Settings(), silent)
     assert_allclose(flat.u[:900], 0.0)
 
 

@@ -1,0 +1,193 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What is fast in a record: jumps, chirps, multisines, noise, turning points.
+
+Both sides of G pass the same high-pass, so that slow errors of H and creep stay outside; G is
+still what leads from one to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.step1_delay import find_jumps
+from scipy import ndimage, signal
+
+__all__ = ['FastMotion', 'Samples', 'moving']
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: below this the signals are taken away before G is fitted [Hz]
+HIGH_PASS = 30.0
+#: time after a jump in which the dynamics are looked for [s]
+WINDOW = 0.1
+#: rms above `HIGH_PASS` from which the voltage excites the dynamics, normalised
+FAST = 2e-3
+#: further edges of the bands whose busiest samples are searched [Hz], and the rms they need
+EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
+#: samples of fast motion that the search uses
+MOST = 40_000
+#: after this time a voltage that moves by less than this share of its range rests [s]
+SETTLED, STILL = 0.2, 1e-3
+#: time ahead of the samples that count, in which the start of G dies away [s]
+WARM_UP = 0.15
+#: time of a block [s], and how many blocks share one that is held out: what a chirp passes, and
+#: a ring that dies away, has to be seen on both sides
+BLOCK, EVERY = 0.005, 4
+
+
+def moving(u: Vector, rate: float, swing: float) -> Mask:
+    """
+    Return the samples at which the voltage moves, or did a moment ago.
+
+    Of a rest only its beginning counts: what a stage does there later is creep, and a long rest
+    would outweigh the motion.  All samples count where hardly any would be left.
+    """
+    width = max(2, int(SETTLED * rate))
+    behind = {'size': width, 'origin': (width - 1) // 2, 'mode': 'nearest'}
+    span = ndimage.maximum_filter1d(u, **behind) - ndimage.minimum_filter1d(u, **behind)
+    found = span > STILL * swing
+    return np.asarray(found if found.sum() > u.size // 10 else np.ones(u.size, dtype=bool))
+
+
+def _rms_above(u: Vector, rate: float, edge: float) -> Vector:
+    """Return the rms above a frequency around each sample."""
+    if 4.0 * edge > rate:
+        return np.zeros(u.size)
+    width = max(1, int(WINDOW * rate))
+    sos = signal.butter(1, edge, btype='highpass', fs=rate, output='sos')
+    # both ways, with the ends turned over: a record that starts on the move does not jump there
+    pad = min(u.size - 1, int(3.0 * rate / edge))
+    power = ndimage.uniform_filter1d(signal.sosfiltfilt(sos, u, padlen=pad) ** 2, width)
+    return np.asarray(np.sqrt(np.maximum(power, 0.0)))
+
+
+def _windows(u: Vector, rate: float) -> Mask:
+    """Return the samples behind each jump of the voltage."""
+    use = np.zeros(u.size, dtype=bool)
+    before = min(50, u.size // 10)
+    for k in find_jumps(u, before, min(20, u.size // 10)):
+        use[max(0, k - before) : k + int(WINDOW * rate)] = True
+    return use
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Of each run, the samples whose motion is fast, and those that are slow enough for H."""
+
+    fast: list[Mask]
+    calm: list[Mask]
+
+    @classmethod
+    def of(cls, excerpts: Sequence[Excerpt], rate: float, swing: float) -> Samples:
+        """Return them for the fitted parts of runs; `swing` is the range of the voltage."""
+        jumps = [_windows(e.u, rate) & e.use for e in excerpts]
+        rms = [_rms_above(e.u, rate, HIGH_PASS) for e in excerpts]
+        quiet = np.concatenate(
+            [r[e.use & ~j] for e, r, j in zip(excerpts, rms, jumps, strict=True)]
+        )
+        fast = jumps
+        broad = quiet.size > 0 and bool(
+            np.sqrt(np.mean(quiet**2)) > FAST or quiet.max() > 2 * FAST
+        )
+        if broad:
+            score = [r / max(float(r.max()), FAST) for r in rms]
+            score = [np.where(r > 0.5 * FAST, s, 0.0) for r, s in zip(rms, score, strict=True)]
+            for edge in EDGES:
+                band = [_rms_above(e.u, rate, edge) for e in excerpts]
+                most = max(float(b.max()) for b in band)
+                if most > FAINT:
+                    score = [np.maximum(s, b / most) for s, b in zip(score, band, strict=True)]
+            fast = _busiest(score, jumps, int(0.2 * WINDOW * rate))
+            fast = [f & e.use for f, e in zip(fast, excerpts, strict=True)]
+        calm = [e.use & (r < FAST) for e, r in zip(excerpts, rms, strict=True)]
+        # where the stage lags behind a fast drive, H alone would take the lag for hysteresis
+        slow = [float(np.ptp(e.u[c])) for e, c in zip(excerpts, calm, strict=True) if c.any()]
+        enough = sum(int(c.sum()) for c in calm) > sum(e.u.size for e in excerpts) // 20
+        if not broad or not enough or max(slow, default=0.0) < 0.8 * swing:
+            calm = [e.use for e in excerpts]
+        return cls(fast, calm)
+
+
+def _busiest(score: Sequence[Vector], jumps: Sequence[Mask], size: int) -> list[Mask]:
+    """Return the jumps, and with them the whole blocks of the highest score."""
+    size = max(1, size)
+    of = [np.maximum.reduceat(s, np.arange(0, s.size, size)) for s in score]
+    ranked = np.sort(np.concatenate(of))[::-1]
+    least = max(float(ranked[min(MOST // size, ranked.size - 1)]), 1e-3)
+    return [
+        jump | np.repeat(blocks > least, size)[: jump.size]
+        for jump, blocks in zip(jumps, of, strict=True)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class FastMotion:
+    """
+    What G is found from: pieces of w = H[v] and of the displacement.
+
+    Attributes
+    ----------
+    whole, fitted, held : list of Excerpt
+        Pieces with all samples that count, with those fitted, and with those that judge.
+    rate : float
+        [Hz]
+    """
+
+    whole: list[Excerpt]
+    fitted: list[Excerpt]
+    held: list[Excerpt]
+    rate: float
+
+    @classmethod
+    def of(cls, signals: Sequence[Excerpt], rate: float) -> FastMotion:
+        """Return the motion in the samples that count, high-passed, blocks of it held out."""
+        whole, fitted, held = [], [], []
+        warm_up = int(WARM_UP * rate)
+        for e in signals:
+            w, x = (_high_passed(z, rate) for z in (e.u, e.x))
+            out = _held_blocks(e, max(1, int(BLOCK * rate)))
+            whole += _cut(w, x, e.use, warm_up)
+            fitted += _cut(w, x, e.use & ~out, warm_up)
+            held += _cut(w, x, e.use & out, warm_up)
+        return cls(whole, fitted, held, rate)
+
+
+def _high_passed(x: Vector, rate: float) -> Vector:
+    if 4.0 * HIGH_PASS > rate:
+        return np.asarray(x - x[0])
+    sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, x - x[0]))
+
+
+def _held_blocks(e: Excerpt, size: int) -> NDArray[np.bool_]:
+    """Return blocks all over the samples that count; a short stretch is one block."""
+    held = np.zeros(e.use.size, dtype=bool)
+    i = 0
+    for start, stop in e.stretches:
+        count = max(1, round((stop - start) / size))
+        edges = np.linspace(start, stop, count + 1).astype(int)
+        for a, b in itertools.pairwise(edges):
+            i += 1
+            held[a:b] = i % EVERY == 0
+    return held
+
+
+def _cut(w: Vector, x: Vector, use: NDArray[np.bool_], warm_up: int) -> list[Excerpt]:
+    """Return the samples that count with what comes before them, without the rest."""
+    pieces: list[list[int]] = []
+    for start, stop in Excerpt(w, x, use).stretches:
+        begin = max(0, start - warm_up)
+        if pieces and begin <= pieces[-1][1]:
+            pieces[-1][1] = stop
+        else:
+            pieces.append([begin, stop])
+    return [Excerpt(w[a:b], x[a:b], use[a:b]) for a, b in pieces]

@@ -1,0 +1,208 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The unknown memory of runs that do not start at the lowest voltage, together with their plays.
+
+Until the voltage has moved by the width of a play, the play may stand still at an unknown place,
+so nothing of a run has to be thrown away: the places are fitted with the weights.  The outputs of
+all plays are one curve over the threshold, which starts at the voltage and nowhere rises or falls
+faster than the threshold grows,
+
+    F_r(0) = u(0) - int_0^r s(r') dr',      0 <= s <= 1,
+
+so the shares s are what is sought.  Gauss-Newton on the weights and the shares, both bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.solvers.least_squares import (
+    bounded_least_squares,
+    triangular_factor,
+)
+from piezo_ident.operators.play import play_columns
+
+__all__ = ['fit_starts']
+
+Vector = NDArray[np.float64]
+Rule = Callable[[Vector], Vector]
+
+#: blocks into which a run is thinned; of each, the extremes and the last sample stay
+BLOCKS = 4000
+#: thresholds over the range of the voltage, fewer where there are several unknown starts
+COUNT, COUNT_OF_MANY = 40, 20
+#: weight of the first guess of the shares, per row and threshold
+PULL = 1e-3
+#: most turns
+TURNS = 12
+#: smallest fall of the loss that is worth another turn, as a share of it
+WORTH = 1e-3
+
+
+class _Thinned:
+    """A run by its extremes: plays depend on nothing else."""
+
+    def __init__(self, excerpt: Excerpt, lag: float) -> None:
+        u, n = excerpt.u, excerpt.u.size
+        size = max(1, n // BLOCKS)
+        edges = np.arange(0, n - n % size, size)
+        blocks = u[: edges.size * size].reshape(-1, size)
+        last = edges + size - 1
+        keep = np.unique([edges + blocks.argmin(axis=1), edges + blocks.argmax(axis=1), last])
+        self.u = u[keep]
+        at = last + lag
+        inside = at <= n - 1
+        near = np.minimum(np.rint(at).astype(int), n - 1)
+        used = inside & excerpt.use[near]
+        self.rows = np.searchsorted(keep, last[used])
+        self.x = np.interp(at[used], np.arange(n), excerpt.x)
+        self.top, self.bottom = np.maximum.accumulate(self.u), np.minimum.accumulate(self.u)
+
+    def columns(
+        self, r: Vector, memory: Vector
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the plays at the rows, and 1 where a play still stands at its start."""
+        plays = play_columns(self.u, r, memory)[:, self.rows]
+        top, bottom = self.top[self.rows], self.bottom[self.rows]
+        at, width = memory[:, None], r[:, None]
+        free = (top <= at + width + 1e-12) & (bottom >= at - 1e-12)
+        return plays.T, free.T.astype(np.float64)
+
+
+def _guesses(u0: float, r: Vector) -> list[Vector]:
+    """Return shares of a stage that came up from the lowest voltage, down, or from between."""
+    steps = np.diff(np.concatenate([[0.0], r]))
+
+    def shares(memory: Vector) -> Vector:
+        fall = -np.diff(np.concatenate([[u0], memory]))
+        return np.asarray(np.clip(fall / steps, 0.0, 1.0))
+
+    up = np.maximum(u0 - r, np.minimum(u0, 0.0))
+    down = np.minimum(u0, np.maximum(1.0, u0) - r)
+    return [shares(up), shares(down), shares(u0 - 0.5 * r)]
+
+
+def fit_starts(
+    excerpts: Sequence[Excerpt], unknown: Sequence[bool], lag: float = 0.0
+) -> list[Rule | None]:
+    """
+    Return the memory at the start of each run as a function of the thresholds.
+
+    Parameters
+    ----------
+    excerpts : sequence of Excerpt
+        Runs with the samples to use, at best slow ones; each gets an offset.
+    unknown : sequence of bool
+        Whose memory is sought; the others keep theirs.
+    lag : float, optional
+        Samples by which the displacement follows slow motion: the delay and that of G.
+
+    Returns
+    -------
+    list of callable or None
+        `Excerpt.memory` of each.
+    """
+    rules = [e.memory for e in excerpts]
+    if not any(unknown):
+        return rules
+    swing = max(float(np.ptp(e.u)) for e in excerpts)
+    count = COUNT if sum(unknown) < 3 else COUNT_OF_MANY
+    r = swing * np.arange(1, count) / count
+    steps = np.diff(np.concatenate([[0.0], r]))
+    thinned = [_Thinned(e, lag) for e in excerpts]
+    sought = [i for i, is_sought in enumerate(unknown) if is_sought and thinned[i].x.size]
+    if not sought:
+        return rules
+    k, m = len(excerpts), r.size
+    n = sum(t.x.size for t in thinned)
+    pull = PULL * np.sqrt(n) * steps
+    starts = {i: float(excerpts[i].u[0]) for i in sought}
+
+    def memory(i: int, shares: dict[int, Vector]) -> Vector:
+        if i in shares:
+            return np.asarray(starts[i] - np.cumsum(shares[i] * steps))
+        return excerpts[i].start(r)
+
+    def solve(
+        shares: dict[int, Vector], weights: Vector | None, prior: dict[int, Vector]
+    ) -> tuple[Vector, dict[int, Vector], float]:
+        """Return weights and changes of the shares, and the loss of the weights before."""
+        free_columns = [] if weights is None else sought
+        width = k + m + 2 + m * len(free_columns) + 1
+        blocks = []
+        for i, part in enumerate(thinned):
+            plays, free = part.columns(r, memory(i, shares))
+            block = np.zeros((part.x.size, width))
+            block[:, i] = 1.0
+            u = part.u[part.rows]
+            block[:, k : k + m + 2] = np.column_stack([plays, u**3, u])
+            block[:, -1] = part.x
+            if weights is not None and i in free_columns:
+                at = k + m + 2 + m * free_columns.index(i)
+                still = free * weights[k : k + m]
+                block[:, at : at + m] = -steps * np.cumsum(still[:, ::-1], axis=1)[:, ::-1]
+            blocks.append(block)
+        loss = 0.0
+        if weights is not None:
+            loss = sum(
+                float(np.sum((b[:, : k + m + 2] @ weights - b[:, -1]) ** 2)) for b in blocks
+            )
+        for j, i in enumerate(free_columns):
+            ridge = np.zeros((m, width))
+            at = k + m + 2 + m * j
+            ridge[:, at : at + m] = np.diag(pull)
+            ridge[:, -1] = pull * (prior[i] - shares[i])
+            loss += float(np.sum(ridge[:, -1] ** 2))
+            blocks.append(ridge)
+        R = triangular_factor(blocks, width)
+        lower, upper = np.full(width - 1, -np.inf), np.full(width - 1, np.inf)
+        lower[k : k + m] = 0.0
+        for j, i in enumerate(free_columns):
+            at = k + m + 2 + m * j
+            lower[at : at + m] = -shares[i] - 1e-9
+            upper[at : at + m] = 1.0 - shares[i] + 1e-9
+        theta, after = bounded_least_squares(R, lower, upper)
+        change = {
+            i: theta[k + m + 2 + m * j : k + m + 2 + m * (j + 1)]
+            for j, i in enumerate(free_columns)
+        }
+        return theta[: k + m + 2], change, after if weights is None else loss
+
+    guesses = [{i: _guesses(starts[i], r)[g] for i in sought} for g in range(3)]
+    tried = [solve(guess, None, guess) for guess in guesses]
+    first = int(np.argmin([loss for *_, loss in tried]))
+    prior = shares = guesses[first]
+    weights = tried[first][0]
+    best, change, best_loss = shares, {}, np.inf
+    for _ in range(TURNS):
+        new_weights, new_change, loss = solve(shares, weights, prior)
+        if loss < best_loss:
+            small = loss > (1.0 - WORTH) * best_loss
+            best, best_loss, change, weights_next = shares, loss, new_change, new_weights
+            if small:
+                break
+            scale = 1.0
+        else:
+            scale *= 0.4
+            if scale < 0.05:
+                break
+        shares = {i: np.clip(best[i] + scale * change[i], 0.0, 1.0) for i in sought}
+        weights = weights_next
+    for i in sought:
+        rules[i] = _rule(starts[i], r, memory(i, best))
+    return rules
+
+
+def _rule(u0: float, r: Vector, memory: Vector) -> Rule:
+    places, curve = np.concatenate([[0.0], r]), np.concatenate([[u0], memory])
+
+    def rule(thresholds: Vector) -> Vector:
+        found = np.interp(thresholds, places, curve)
+        return np.asarray(np.clip(found, u0 - thresholds, u0))
+
+    return rule
