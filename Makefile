@@ -57,9 +57,11 @@ bench-live: .venv/.demo
 study-identification: .venv/.demo
 	.venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
-# how often a diagnosis is right: hours on two cores; goes on where it was stopped
+# how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
+# cores; goes on where it was stopped
 study: .venv/.demo
 	.venv/bin/python benchmarks/study_diagnosis.py docs/diagnosis_study.md
+	.venv/bin/python benchmarks/study_foreign.py docs/diagnosis_study_foreign.md
 
 # what docs/reliability.md says, run again; then the page is made of what came out
 RUN_STUDY = .venv/bin/python benchmarks/reliability

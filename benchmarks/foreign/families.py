@@ -6,12 +6,39 @@
 from __future__ import annotations
 
 from .cores import bouc_wen, coleman_hodgdon, uneven
+from .more_cores import (
+    dahl,
+    hills,
+    jiles_atherton,
+    krasnoselskii_pokrovskii,
+    skewed_bouc_wen,
+    turning_curves,
+)
 
 __all__ = ['LAWS', 'SETS']
 
-LAWS = {'preisach': uneven, 'bouc-wen': bouc_wen, 'duhem': coleman_hodgdon}
+LAWS = {
+    'preisach': uneven,
+    'bouc-wen': bouc_wen,
+    'duhem': coleman_hodgdon,
+    'hills': hills,
+    'kp-kernels': krasnoselskii_pokrovskii,
+    'jiles-atherton': jiles_atherton,
+    'skewed-bouc-wen': skewed_bouc_wen,
+    'dahl': dahl,
+    'turning-curves': turning_curves,
+}
 
 #: how often each is dealt
 SETS = {
     'tuning': ('preisach', 'preisach', 'bouc-wen', 'duhem'),
+    'final': (
+        'hills',
+        'hills',
+        'kp-kernels',
+        'jiles-atherton',
+        'skewed-bouc-wen',
+        'dahl',
+        'turning-curves',
+    ),
 }

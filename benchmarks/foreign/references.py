@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import lsq_linear
 
+from .cores import play
 from .stage import Stage
 
 __all__ = ['FORMS', 'Reference', 'basis', 'references', 'remainder']
@@ -35,28 +35,16 @@ class Reference:
     unseen: float
 
 
-@njit(cache=True, nogil=True)
-def _play(u: Array, r: float, out: Array) -> None:
-    state = u[0]
-    for k in range(u.size):
-        state = min(max(state, u[k] - r), u[k])
-        out[k] = state
-
-
 def _columns(u: Array, form: str) -> tuple[list[Array], int]:
     """Return the columns of a form before the linear part; the first so many are >= 0."""
     count = 40 if form in ('forty plays', 'and a square') else 10
-    plays = []
-    for r in np.arange(count) / count:
-        play = np.empty(u.size)
-        _play(u, float(r), play)
-        plays.append(play)
+    plays = [play(u, float(r)) for r in np.arange(count) / count]
     if form == 'weighted by the bias':
         # without the first: v times itself is a square
-        return [*plays, u**3, *(u * play for play in plays)], count
+        return [*plays, u**3, *(u * F for F in plays)], count
     if form == 'relay plane':
         # a relay density cubic in the bias: each play through a curve of its own
-        return [*(play**k for play in plays for k in (1, 2, 3, 4))], 0
+        return [*(F**k for F in plays for k in (1, 2, 3, 4))], 0
     return [*plays, u**3, *([u**2] if form == 'and a square' else [])], count
 
 

@@ -182,8 +182,8 @@ def _diagnosed(
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     faults = find_faults(_parts(Simulator(model, rows), given))
-    few = [bad if bad.mean() < criteria.FAULTY else None for bad in faults.bad]
-    if any(bad is not None and bad.any() for bad in few):
+    few = faults.left_out(criteria.FAULTY)
+    if any(bad is not None for bad in few):
         rows = make_rows(model, records, few)
     simulator = Simulator(model, rows)
     progress('residual', 0.5)

@@ -110,8 +110,9 @@ class NoncongruentMinorLoops(Effect):
         memory, core = initial_memory(x0, self._r), self.core
         if isinstance(core, HysteresisOperator):
             h = core.hysteresis
-            if not np.array_equal(core.memory, h.initial_memory(x0)):
-                r, f = np.append(0.0, h.thresholds), np.append(x0, core.memory)
+            plays = core.memory[: h.thresholds.size]
+            if not np.array_equal(plays, h.initial_memory(x0)):
+                r, f = np.append(0.0, h.thresholds), np.append(x0, plays)
                 memory = np.clip(np.interp(self._r, r, f), x0 - self._r, x0)
         self._memory = memory
         return w + float(self._more(np.array([x0]))[0])

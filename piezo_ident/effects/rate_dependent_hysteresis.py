@@ -152,7 +152,7 @@ class RateDependentHysteresis(Effect):
         w = self.inner.reset(v0, x0)
         plays = self.core
         if isinstance(plays, HysteresisOperator):
-            self._memory = plays.memory.copy()
+            self._memory = plays.memory[: self.hysteresis.thresholds.size].copy()
         else:
             self._memory = self.hysteresis.initial_memory(x0)
         self._still = self._memory.copy()

@@ -146,6 +146,8 @@ def factorise(
             # the plays need all that came before the samples used, G only what it remembers
             begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
             begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
+            # lags along the path start with the excerpt
+            begin = 0 if law.lags else begin
             stretches -= begin
             before, u = excerpt.u[:begin], excerpt.u[begin:end]
             memory = weighted_plays(before, r, np.zeros(r.size), 0.0, 0.0, memory)[1]

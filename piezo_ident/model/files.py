@@ -42,9 +42,13 @@ _INSIDE: Mapping[str, tuple[str, ...]] = {
     'input': ('v0', 'V', 'range'),
     'output': ('y0', 'Y'),
     'delay': ('samples', 'fraction'),
-    'hysteresis': ('thresholds', 'weights', 'p1', 'p2', 'p0', 'curves', 'bias', 'span'),
+    'hysteresis': (
+        *('thresholds', 'weights', 'p1', 'p2'),
+        *('p0', 'curves', 'bias', 'span', 'relaxations'),
+    ),
     'dynamics': ('a', 'b'),
 }
+_WIDE = ('curves', 'bias', 'relaxations')
 _EFFECT = ('name', 'slot', 'parameters')
 
 
@@ -221,12 +225,14 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
 def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return what a hysteresis has beyond plays and a cubic."""
     wide: dict[str, Any] = {'p0': number(h, 'p0', name, 0.0)}
-    if 'curves' in h:
-        rows = h['curves'] if isinstance(h['curves'], list) else [None]
-        parsed = [numbers({'hysteresis.curves': row}, 'hysteresis.curves', name) for row in rows]
+    for key in ('curves', 'relaxations'):
+        if key not in h:
+            continue
+        rows, where = h[key] if isinstance(h[key], list) else [None], f'hysteresis.{key}'
+        parsed = [numbers({where: row}, where, name) for row in rows]
         if len({row.size for row in parsed}) > 1:
-            raise ModelError(f'{name}: hysteresis.curves must have rows of one length')
-        wide['curves'] = np.array(parsed).reshape(len(parsed), -1)
+            raise ModelError(f'{name}: {where} must have rows of one length')
+        wide[key] = np.array(parsed).reshape(len(parsed), -1)
     if 'bias' in h:
         wide['bias'] = numbers(h, 'bias', name)
     if 'span' in h:
@@ -253,8 +259,8 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
             'p1': h.p1,
             'p2': h.p2,
             **({} if h.is_plain else {'p0': h.p0}),
-            **{k: x for k in ('curves', 'bias') if (x := getattr(h, k)) is not None},
-            **({} if h.curves is None and h.bias is None else {'span': list(h.span)}),
+            **{k: x for k in _WIDE if (x := getattr(h, k)) is not None},
+            **({'span': list(h.span)} if any(getattr(h, k) is not None for k in _WIDE) else {}),
         },
         'dynamics': {'a': model.dynamics.a, 'b': model.dynamics.b},
         'effects': [

@@ -39,7 +39,9 @@ class Stream:
         self._started = False
         self._cascade: _Cascade | None = None
         match self._chain.operators:
-            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z):
+            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z) if (
+                model.hysteresis.relaxations is None
+            ):
                 self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:

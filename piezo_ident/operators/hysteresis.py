@@ -15,19 +15,26 @@ outputs make a Preisach operator whose density at threshold and place (r, F) is 
 Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
 doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are no such operator.
 Either way the memory is that of the plays.
+
+What forgets along the path that the voltage travels, however fast, and has no return points, is
+a semilinear Duhem model: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and
+cubic phi_j.  J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
+rate-dependent hysteresis", IEEE Trans. Automatic Control 50(5), 2005,
+doi:10.1109/TAC.2005.847035; Bouc-Wen and Coleman-Hodgdon loops are of this kind.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import functools
+import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.kernels import wide_hysteresis
+from piezo_ident.operators.kernels import relaxing, wide_hysteresis
 from piezo_ident.operators.play import initial_memory, weighted_plays
 
 __all__ = ['Hysteresis', 'HysteresisOperator']
@@ -61,6 +68,8 @@ class Hysteresis:
         Growth kappa_i of the weight of a play with the voltage.
     span : tuple of float, optional
         Voltages low and high between which curves and bias hold; beyond, a curve is flat.
+    relaxations : array_like, shape (k, 4), optional
+        Rate a_j, and the coefficients of v, v^2 and v^3 of phi_j, of each lag along the path.
 
     Raises
     ------
@@ -83,6 +92,7 @@ class Hysteresis:
     curves: NDArray[np.float64] | None = None
     bias: NDArray[np.float64] | None = None
     span: tuple[float, float] = (0.0, 1.0)
+    relaxations: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         r, q = frozen_array(self.thresholds), frozen_array(self.weights)
@@ -109,6 +119,18 @@ class Hysteresis:
         for name in ('p0', 'p1'):
             object.__setattr__(self, name, float(getattr(self, name)))
         object.__setattr__(self, 'p2', p2)
+        if self.relaxations is not None:
+            x = frozen_array(self.relaxations)
+            if (
+                x.ndim != 2
+                or x.shape[1] != 4
+                or not np.all(np.isfinite(x))
+                or np.any(x[:, 0] <= 0)
+            ):
+                raise ModelError(
+                    'hysteresis: relaxations must be rows of a rate > 0 and three coefficients'
+                )
+            object.__setattr__(self, 'relaxations', x)
         if self.curves is not None or self.bias is not None:
             self._check_wide(r, q)
 
@@ -146,13 +168,17 @@ class Hysteresis:
     @property
     def is_plain(self) -> bool:
         """Whether H is a cubic and a sum of plays, and no more."""
-        return self.p0 == 0.0 and self.curves is None and self.bias is None
+        return not self._is_curved and self.relaxations is None
+
+    @property
+    def _is_curved(self) -> bool:
+        return self.p0 != 0.0 or self.curves is not None or self.bias is not None
 
     @functools.cached_property
     def _wide(self) -> NDArray[np.float64]:
         """The rows c_1 .. c_3, kappa and widths of `wide_hysteresis`; none where H is plain."""
         m, low, high = self.thresholds.size, *self.span
-        if self.is_plain:
+        if not self._is_curved:
             return np.empty((0, m))
         rows = np.zeros((POWERS + 2, m))
         if self.curves is not None and m:
@@ -190,7 +216,7 @@ class Hysteresis:
         v : float, optional
             Matters to a bias alone.
         """
-        if self.is_plain:
+        if not self._is_curved:
             return self.weights
         c1, c2, c3, bias, width = self._wide
         t = np.asarray(outputs, dtype=np.float64) - self.span[0]
@@ -199,8 +225,19 @@ class Hysteresis:
         return np.asarray(self.weights + bias * (v - self.span[0]) + np.where(inside, curved, 0.0))
 
     def lowest_slope(self) -> float:
-        """Return a lower bound of dw/dv over the span; H has an inverse where it is positive."""
+        """
+        Return a lower bound of dw/dv over the span; H has an inverse where it is positive.
+
+        With lags along the path, the lowest slope of sweeps between any two of nine voltages.
+        """
         low, high = self.span
+        if self.relaxations is not None:
+            levels = np.linspace(low, high, 9)
+            ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
+            places = np.concatenate(
+                [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise([low, *ends]) if a != b]
+            )
+            return float(np.min(np.diff(self(places)) / np.diff(places)))
         v = np.linspace(low, high, 129)
         slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
         if self.bias is not None:
@@ -231,6 +268,8 @@ class Hysteresis:
         """All parameters in a row: r, q, p0, p1, p2, curves, bias."""
         polynomial = np.array([self.p0, self.p1, self.p2])
         parts = [self.thresholds, self.weights, polynomial, self._wide.ravel()]
+        if self.relaxations is not None:
+            parts.append(self.relaxations.ravel())
         return np.concatenate(parts)
 
     def initial_memory(self, v0: float) -> NDArray[np.float64]:
@@ -256,15 +295,36 @@ class Hysteresis:
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
         return self.follow(x, start)[0]
 
+    def settled(self, v0: float) -> NDArray[np.float64]:
+        """Return the lags along the path of a stage that rests in the middle of its loop at v0."""
+        if self.relaxations is None:
+            return np.empty(0)
+        phi = self.relaxations[:, 1:] @ np.array([v0, v0 * v0, v0**3])
+        return np.append(phi, v0)
+
     def follow(
         self, v: NDArray[np.float64], memory: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return w for the next inputs, shape (n,), and the memory after them, shape (m,)."""
-        if self.is_plain:
-            return weighted_plays(v, self.thresholds, self.weights, self.p1, self.p2, memory)
-        out, end = np.empty(v.size), memory.copy()
-        wide_hysteresis(np.ascontiguousarray(v), *self.for_kernel, end, out)
-        return out, end
+        """
+        Return w for the next inputs, shape (n,), and the memory after them.
+
+        That are the play outputs, shape (m,), and behind them the lags along the path; without
+        lags these begin as `settled` at the first input.
+        """
+        x, m = np.ascontiguousarray(v), self.thresholds.size
+        plays = memory[:m]
+        if self._is_curved:
+            out, end = np.empty(x.size), plays.copy()
+            wide_hysteresis(x, *self.for_kernel, end, out)
+        else:
+            out, end = weighted_plays(x, self.thresholds, self.weights, self.p1, self.p2, plays)
+        if self.relaxations is None:
+            return out, end
+        if not x.size:
+            return out, memory
+        lags = memory[m:].copy() if memory.size > m else self.settled(float(x[0]))
+        relaxing(x, np.array(self.relaxations), lags, out)
+        return out, np.concatenate([end, lags])
 
     def slope(self, v: float, excursion: float = 0.0) -> float:
         """
@@ -281,14 +341,19 @@ class Hysteresis:
             Peak-to-peak size of the small signal, normalised.
         """
         gain = self.p2 + 3.0 * self.p1 * v * v
-        if not self.is_plain:
+        if self._is_curved:
             # in the middle of their bands, where a small loop settles
             place = np.clip(v - self.thresholds / 2.0 - self.span[0], 0.0, self._wide[4])
             gain += 2.0 * self.p0 * v + float(self._wide[3] @ place)
         if excursion > 0.0:
             moved = np.maximum(0.0, 1.0 - self.thresholds / excursion)
-            weights = self.weights if self.is_plain else self.rise(self.span[0] + place, v)
+            weights = self.weights if not self._is_curved else self.rise(self.span[0] + place, v)
             gain += float(weights @ moved)
+        if self.relaxations is not None:
+            # the chord of a lag behind a triangle wave that has gone on for long
+            x = 0.5 * self.relaxations[:, 0] * max(excursion, 1e-9)
+            steepness = self.relaxations[:, 1:] @ np.array([1.0, 2.0 * v, 3.0 * v * v])
+            gain -= float(steepness @ (np.tanh(x) / x))
         return gain
 
 

@@ -8,6 +8,7 @@ Families of H that are linear in their coefficients, for given thresholds.
     square     and v^2
     bias       and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
     preisach   and hat_j(r_i) times Bernstein polynomials in F_i as densities
+    duhem      and lags of v, v^2 and v^3 along the path of v, at a few rates
 
 hat_j are piecewise linear functions of the threshold on a few even nodes.  All but the powers of v
 have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  The last one is a
@@ -34,11 +35,13 @@ from scipy.optimize import lsq_linear
 
 __all__ = ['LAWS', 'HysteresisLaw', 'LawName']
 
-LawName = Literal['plays', 'square', 'bias', 'preisach']
+LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem']
 #: from the narrowest to the widest
-LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach')
+LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach', 'duhem')
 #: nodes of the hats over the threshold, and degree of the density in the place of a play
 NODES, DEGREE = 5, 3
+#: of lags along the path, per span of the voltage
+RATES = (1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class HysteresisLaw:
 
     Parameters
     ----------
-    name : {'plays', 'square', 'bias', 'preisach'}
+    name : {'plays', 'square', 'bias', 'preisach', 'duhem'}
     thresholds : array_like, shape (m,)
         Ascending, above zero, normalised.
     span : tuple of float, optional
@@ -79,8 +82,13 @@ class HysteresisLaw:
 
     @property
     def densities(self) -> int:
-        """Number of the coefficients that stand first, and are >= 0; powers of v follow."""
-        return self.size - (2 if self.name == 'plays' else 3)
+        """Number of the coefficients that stand first, and are >= 0; lags and powers follow."""
+        return self.size - (2 if self.name == 'plays' else 3) - self.lags
+
+    @property
+    def lags(self) -> int:
+        """Number of the coefficients of lags along the path."""
+        return 3 * len(RATES) if self.name == 'duhem' else 0
 
     @property
     def size(self) -> int:
@@ -95,16 +103,17 @@ class HysteresisLaw:
     @functools.cached_property
     def _parameters(self) -> NDArray[np.float64]:
         """
-        The parameters of H in each coefficient, shape (size, 5 m + 3).
+        The parameters of H in each coefficient, shape (size, 5 m + 3 + lags).
 
-        They are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2.
+        They are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2, then d_1 .. d_3 of
+        every rate.
         """
         m = self.thresholds.size
         plays = np.zeros((m, POWERS + 2, m))
         plays[:, 0] = np.eye(m)
         more: list[NDArray[np.float64]] = []
         low, high = self.span
-        for hat in self._hats() if self.name in ('bias', 'preisach') else ():
+        for hat in self._hats() if self.name not in ('plays', 'square') else ():
             if self.name == 'bias':
                 for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
                     part = np.zeros((POWERS + 2, m))
@@ -120,13 +129,12 @@ class HysteresisLaw:
                 more.append(part)
         rows = np.concatenate([plays, np.array(more).reshape(-1, POWERS + 2, m)])
         powers = np.eye(3)[1 if self.name == 'plays' else 0 :]
-        n = rows.shape[0]
-        return np.block(
-            [
-                [rows.reshape(n, -1), np.zeros((n, 3))],
-                [np.zeros((powers.shape[0], rows[0].size)), powers],
-            ]
-        )
+        n, k = rows.shape[0], self.lags
+        whole = np.zeros((n + k + powers.shape[0], rows[0].size + 3 + k))
+        whole[:n, : rows[0].size] = rows.reshape(n, -1)
+        whole[n : n + k, rows[0].size + 3 :] = np.eye(k)
+        whole[n + k :, rows[0].size : rows[0].size + 3] = powers
+        return whole
 
     def _hats(self) -> Iterator[NDArray[np.float64]]:
         """Give piecewise linear functions of the threshold, as shares of a density; shape (m,)."""
@@ -151,21 +159,29 @@ class HysteresisLaw:
         return self._of(theta @ self._parameters, self.thresholds)
 
     def _of(self, x: NDArray[np.float64], thresholds: NDArray[np.float64]) -> Hysteresis:
-        plays, (p0, p1, p2) = x[:-3].reshape(POWERS + 2, -1), x[-3:]
+        n = (POWERS + 2) * thresholds.size
+        plays, (p0, p1, p2) = x[:n].reshape(POWERS + 2, -1), x[n : n + 3]
+        lags = None
+        if self.name == 'duhem':
+            rates = np.array(RATES) / (self.span[1] - self.span[0])
+            lags = np.column_stack([rates, x[n + 3 :].reshape(-1, 3)])
         return Hysteresis(
             thresholds,
             plays[0],
             float(p1),
             float(p2),
             float(p0),
-            curves=plays[1:-1].T if self.name == 'preisach' else None,
+            curves=plays[1:-1].T if self.name in ('preisach', 'duhem') else None,
             bias=plays[-1] if self.name == 'bias' else None,
             span=self.span,
+            relaxations=lags,
         )
 
     def deviations(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
-        chosen = [*range(self.thresholds.size), -2, -1]
+        m = self.thresholds.size
+        n = (POWERS + 2) * m
+        chosen = [*range(m), n + 1, n + 2]
         T = self._parameters[:, chosen]
         variance = np.sum(T * (covariance @ T), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -189,15 +205,28 @@ class HysteresisLaw:
         ndarray, shape (n,)
         """
         r, m = self.thresholds, self.thresholds.size
+        n = (POWERS + 2) * m
         start = None if memory is None else np.asarray(memory, dtype=np.float64)
         for i in range(m):
             one = slice(i, i + 1)
             yield play_columns(v, r[one], None if start is None else start[one])[0]
         for row in self._parameters[m : self.densities]:
-            plays = row[:-3].reshape(POWERS + 2, m)
+            plays = row[:n].reshape(POWERS + 2, m)
             moved = plays.any(axis=0)
-            part = self._of(np.concatenate([plays[:, moved].ravel(), row[-3:]]), r[moved])
+            part = Hysteresis(
+                r[moved],
+                plays[0, moved],
+                0.0,
+                0.0,
+                curves=None if self.name == 'bias' else plays[1:-1, moved].T,
+                bias=plays[-1, moved] if self.name == 'bias' else None,
+                span=self.span,
+            )
             yield part(v, None if start is None else start[moved])
+        for k in range(self.lags):
+            rate = RATES[k // 3] / (self.span[1] - self.span[0])
+            lag = np.append(rate, np.eye(3)[k % 3])[None]
+            yield Hysteresis(np.empty(0), np.empty(0), 0.0, 0.0, relaxations=lag)(v)
         if self.name != 'plays':
             yield v**2
         yield v**3
@@ -215,17 +244,24 @@ class HysteresisLaw:
         h, m = hysteresis, self.thresholds.size
         if not np.array_equal(h.thresholds, self.thresholds):
             raise ModelError('hysteresis: the law has other thresholds')
-        theta = np.zeros(self.size)
-        theta[:m], theta[-2:] = h.weights, (h.p1, h.p2)
-        if self.name != 'plays':
-            theta[-3] = h.p0
         plays = np.zeros((POWERS + 2, m))
         plays[0] = h.weights
         if h.curves is not None:
             plays[1 : 1 + h.curves.shape[1]] = h.curves.T
         if h.bias is not None:
             plays[-1] = h.bias
-        wanted = np.concatenate([plays.ravel(), [h.p0, h.p1, h.p2]])
+        lags = np.zeros(self.lags)
+        if h.relaxations is not None:
+            rates = np.array(RATES) / (self.span[1] - self.span[0])
+            if not self.lags or not np.array_equal(h.relaxations[:, 0], rates):
+                raise ModelError(f'hysteresis: this H is none of the law {self.name!r}')
+            lags = h.relaxations[:, 1:].ravel()
+        wanted = np.concatenate([plays.ravel(), [h.p0, h.p1, h.p2], lags])
+        theta = np.zeros(self.size)
+        theta[:m], theta[-2:] = h.weights, (h.p1, h.p2)
+        theta[self.densities : self.densities + self.lags] = lags
+        if self.name != 'plays':
+            theta[-3] = h.p0
         if plays[1:].any():
             theta = lsq_linear(self._parameters.T, wanted, (self.lower, np.inf), method='bvls').x
         if not np.allclose(theta @ self._parameters, wanted, rtol=1e-6, atol=1e-9):

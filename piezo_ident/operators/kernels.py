@@ -26,7 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
-__all__ = ['cascade', 'curve', 'dynamics', 'held', 'hysteresis', 'plays', 'wide_hysteresis']
+__all__ = [
+    'cascade',
+    'curve',
+    'dynamics',
+    'held',
+    'hysteresis',
+    'plays',
+    'relaxing',
+    'wide_hysteresis',
+]
 
 #: samples that pass the loops while they are in the cache
 STRETCH = 1024
@@ -109,6 +118,46 @@ def wide_hysteresis(
             memory[i] = f
             w += q[i] * f + c[3, i] * (x - low) * (f - low) + curve(c, i, f - low)
         out[k] = w + ((p1 * x + p0) * x + p2) * x
+
+
+@kernel
+def relaxing(
+    v: NDArray[np.float64],
+    x: NDArray[np.float64],
+    state: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """
+    Add the lags along the path of v to `out`, and carry `state` on.
+
+    Rows of x, shape (j, 4), are a rate a and d_1 .. d_3 of ``phi(v) = d_1 v + d_2 v^2 + d_3 v^3``;
+    each adds ``z - phi(v)`` with ``dz = a |dv| (phi(v) - z)``, exact for straight lines between
+    the samples.  `state` holds each z, and then the last v.
+    """
+    n = x.shape[0]
+    last = float(state[n])
+    for k in range(v.size):
+        u = float(v[k])
+        length = abs(u - last)
+        total = 0.0
+        for j in range(n):
+            a, d1, d2, d3 = x[j, 0], x[j, 1], x[j, 2], x[j, 3]
+            if length > 0.0:
+                # a line's own answer, in the place of phi: phi - phi' s/a + phi'' (s/a)^2 - ...
+                b = 1.0 / a if u > last else -1.0 / a
+                new = _line(u, b, d1, d2, d3)
+                state[j] = new + (state[j] - _line(last, b, d1, d2, d3)) * np.exp(-a * length)
+            total += state[j] - u * (d1 + u * (d2 + u * d3))
+        last = u
+        out[k] += total
+    state[n] = last
+
+
+@ordered_kernel
+def _line(u: float, b: float, d1: float, d2: float, d3: float) -> float:
+    one = u - b
+    two = u * u - 2.0 * b * one
+    return d1 * one + d2 * two + d3 * (u * u * u - 3.0 * b * two)
 
 
 @ordered_kernel

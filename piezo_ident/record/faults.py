@@ -259,10 +259,13 @@ def quantum_of(y: Vector) -> float:
     # the ends of a clipped range need not be codes
     inner = (some > y.min()) & (some < y.max())
     jumps = jumps[(jumps > 1e-9 * span) & inner[1:] & inner[:-1]]
-    total = jumps.size
+    usual = float(np.median(jumps)) if jumps.size > 20 else 0.0
+    if usual > 0.0 and np.mean(np.abs(jumps - usual) < 1e-6 * usual) > 0.98:
+        # one step at a time, and where a sensor hung or samples are missing a whole number of them
+        ratio = jumps / usual
+        if np.all(np.abs(ratio - np.rint(ratio)) < 1e-3):
+            return usual
     jumps = np.unique(np.round(jumps, 18))
-    if jumps.size and total > 20 and np.ptp(jumps) < 1e-6 * jumps[0]:
-        return float(jumps.mean())
     if jumps.size < 2 or jumps.size > y.size // 4 + 50:
         return 0.0
     small = jumps[: max(20, jumps.size // 10)]

@@ -27,6 +27,9 @@ CHANCE, MOVED = 0.01, 3e-5
 REPEATS, REPEATED = 4, 2e-4
 #: share of the repeats behind which the signal makes up for them; share of a sensor that is slow
 MADE_UP, HELD = 0.7, 0.2
+#: a sensor hangs: equal readings, least motion of the model meanwhile, and share of the stroke by
+#: which no backlash lets it move; the reading then jumps by so many of the steps around it
+STUCK, HANGS, ALONE, AROUND = 20, 3.0, 0.05, 8
 #: a quantum is named above so many times the rest of the noise, and this share of the stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
 #: deviations of an outlier, and the largest share of it that its surroundings may show
@@ -35,6 +38,8 @@ FAR, QUIET = 8.0, 0.35
 FLAT, LEFT = 5, 6.0
 #: jitter: deviations of the slope, least growth of the variance, blocks of samples
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
+#: third differences of white noise are anticorrelated by 3/4 from one sample to the next
+WHITE = (0.5, 1.0)
 #: jitter is read where the fast part of the motion has at most this share of the scatter's power
 SMOOTH = 1.0
 
@@ -45,7 +50,8 @@ class FaultSearch:
     Faults found.
 
     `bad` are for each part the samples that are missed, outliers or clipped, `out` the clipped
-    ones among them, which no bridge can replace; `jitter` is the rms of the sampling instants [s]
+    and those of a sensor that hangs among them, which no bridge can replace, `stuck` the latter;
+    `jitter` is the rms of the sampling instants [s]
     and `quantum` the step of the readings [m], each 0 when there is none.
     """
 
@@ -54,6 +60,15 @@ class FaultSearch:
     out: tuple[Mask, ...]
     jitter: float = 0.0
     quantum: float = 0.0
+    stuck: tuple[Mask, ...] = ()
+
+    def left_out(self, share: float) -> list[Mask | None]:
+        """Return for each part the samples to leave out: all bad ones up to a share of it."""
+        found = []
+        for bad, stuck in zip(self.bad, self.stuck, strict=True):
+            mask = bad if (bad & ~stuck).mean() < share else stuck
+            found.append(mask if mask.any() else None)
+        return found
 
 
 def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
@@ -61,16 +76,18 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     faults: list[Fault] = []
     bad: list[Mask] = []
     out: list[Mask] = []
+    hung: list[Mask] = []
     largest_jitter = largest_quantum = 0.0
     strokes = strokes_of(parts)
     for part in parts:
         stroke = strokes[part.record]
-        missed = clipped = outliers = np.zeros(part.piece.n, dtype=bool)
+        missed = clipped = outliers = stuck = np.zeros(part.piece.n, dtype=bool)
         if part.piece.n >= 100 and stroke > 0.0:
             noise = _noise_of(part)
             largest_quantum = max(largest_quantum, noise.quantum)
             clipped = _clipped(part, noise)
-            missed = _missed(part, noise)
+            stuck = _stuck(part, noise, stroke) & ~clipped
+            missed = _missed(part, noise, stuck) | stuck
             wide = binary_dilation(missed, iterations=3)
             outliers = _outliers(part, noise, wide | clipped)
             if missed.any():
@@ -81,14 +98,22 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
                 # most of them may be readings at the wrong moment
                 outliers = _outliers(part, noise, wide | clipped, jitter)
             largest_jitter = max(largest_jitter, jitter)
-            faults += _masked(part, missed, outliers, clipped)
+            faults += _masked(part, missed, outliers, clipped, stuck)
             faults += _of_all(part, stroke, noise, jitter, growth)
         bad.append(missed | outliers | clipped)
-        out.append(clipped)
-    return FaultSearch(tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum)
+        out.append(clipped | stuck)
+        hung.append(stuck)
+    return FaultSearch(
+        tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum, tuple(hung)
+    )
 
 
-def _masked(part: ResidualPart, missed: Mask, outliers: Mask, clipped: Mask) -> list[Fault]:
+def _masked(
+    part: ResidualPart, missed: Mask, outliers: Mask, clipped: Mask, stuck: Mask
+) -> list[Fault]:
+    repeats = 'readings that repeat the one before in motion'
+    if stuck.any():
+        repeats += f', {len(true_runs(stuck))} of them stretches in which the sensor hangs'
     return [
         Fault(
             name,
@@ -97,7 +122,7 @@ def _masked(part: ResidualPart, missed: Mask, outliers: Mask, clipped: Mask) -> 
             f'{what}; to be left out',
         )
         for name, mask, what in (
-            ('missed_samples', missed, 'readings that repeat the one before in motion'),
+            ('missed_samples', missed, repeats),
             ('outliers', outliers, 'isolated jumps'),
             ('clipping', clipped, 'readings at the end of their range while the model moves'),
         )
@@ -150,7 +175,29 @@ def _noise_of(part: ResidualPart) -> _Noise:
     return _Noise(rms, quantum, rest)
 
 
-def _missed(part: ResidualPart, noise: _Noise) -> Mask:
+def _stuck(part: ResidualPart, noise: _Noise, stroke: float) -> Mask:
+    """Return long stretches of one reading that jumps in the end, while the model moves on."""
+    y, y_hat = part.piece.y, part.y_hat
+    found = np.zeros(y.size, dtype=bool)
+    steps = np.abs(np.diff(y))
+    ends = float(y.min()), float(y.max())
+    for a, b in true_runs(steps == 0.0):
+        # readings a to b are equal
+        if b - a < STUCK or float(y[a]) in ends:
+            continue
+        way = np.abs(y_hat[a : b + 1] - y_hat[a])
+        moved, least = float(way.max()), LEFT * noise.rms + HANGS * noise.quantum + 1e-4 * stroke
+        if moved < least:
+            continue
+        around = np.concatenate([steps[max(0, a - AROUND) : a], steps[b + 1 : b + 1 + AROUND]])
+        jump = float(steps[b]) if b < steps.size else 0.0
+        if moved > ALONE * stroke or jump > AROUND * float(around.max(initial=0.0)):
+            # it may have been at rest before
+            found[a + 1 + int(np.argmax(way > 0.5 * least)) : b + 1] = True
+    return found & part.mask
+
+
+def _missed(part: ResidualPart, noise: _Noise, known: Mask) -> Mask:
     """
     Return readings equal to the one before where those around say that the position moved.
 
@@ -161,7 +208,7 @@ def _missed(part: ResidualPart, noise: _Noise) -> Mask:
     found = np.zeros(n, dtype=bool)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(y) != 0.0) + 1, [n]])
     start, stop = edges[:-1], edges[1:]
-    inner = (start >= 1) & (stop < n)
+    inner = (start >= 1) & (stop < n) & ~known[np.minimum(start + 1, n - 1)]
     start, stop = start[inner], stop[inner]
     slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
     sigma, q = max(noise.rms, 1e-12 * stroke), noise.quantum
@@ -268,7 +315,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     unusable = known | ~part.mask
     unusable[:4] = unusable[-4:] = True
     unusable = binary_dilation(unusable, iterations=3)
-    n = e.size // CHUNK * CHUNK
+    n = (e.size - 1) // CHUNK * CHUNK
     if n < 40 * CHUNK or noise.rms == 0.0:
         return 0.0, 1.0
     motion2 = np.mean(motion[:n].reshape(-1, CHUNK) ** 2, axis=1)
@@ -276,14 +323,20 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     rows = smooth & ~unusable[:n].reshape(-1, CHUNK).any(axis=1)
     s2 = np.mean(slope[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
     h2 = np.mean(third[:n].reshape(-1, CHUNK)[rows] ** 2, axis=1)
+    neighbours = np.mean((third[:n] * third[1 : n + 1]).reshape(-1, CHUNK)[rows], axis=1)
     motion2 = motion2[rows]
     # readings that rest on one code have no scatter of their own to compare with
     moving = np.sqrt(s2) > noise.quantum * rate
-    s2, h2, motion2 = s2[moving], h2[moving], motion2[moving]
+    s2, h2, motion2, neighbours = (x[moving] for x in (s2, h2, motion2, neighbours))
     if s2.size < 40 or float(np.ptp(s2)) == 0.0:
         return 0.0, 1.0
     slope2, error = _slope(s2, motion2, h2)
     if slope2 <= SURE * error:
+        return 0.0, 1.0
+    # what a model misses is smooth; jitter is another from sample to sample
+    anticorrelated = float(np.mean(neighbours)) < 0.0
+    apart = _slope(s2, motion2, -neighbours)[0] / slope2 if anticorrelated else 0.0
+    if not WHITE[0] < apart < WHITE[1]:
         return 0.0, 1.0
     base = max(float(np.mean(h2)) - slope2 * float(np.mean(s2)), 1e-3 * float(np.mean(h2)))
     base = max(base, (1e-6 * float(np.ptp(part.piece.y))) ** 2)

@@ -149,3 +149,39 @@ def test_idle_plays_are_left_out_without_a_change():
         slim = h.without_idle()
         assert slim.thresholds.size < h.thresholds.size
         assert_allclose(slim(path()), h(path()), atol=1e-14)
+
+
+def test_lags_along_the_path_know_no_time_and_no_sampling():
+    h = Hysteresis([], [], 0.0, 1.0, relaxations=[[3.0, 0.5, 0.3, -0.2], [9.0, 0.1, 0.0, 0.4]])
+    turns = [0.0, 0.7, 0.2, 0.2, 1.0, 0.0]
+    fine = np.concatenate([np.linspace(a, b, 801)[1:] for a, b in pairwise(turns)])
+    assert_allclose(h(turns)[1:], h(np.append(0.0, fine))[800::800], atol=1e-12)
+
+
+def bouc_wen(u, steps=2e-4):
+    z, last, out = 0.0, u[0], np.empty(u.size)
+    for k, x in enumerate(u):
+        count = max(1, int(abs(x - last) / steps))
+        for _ in range(count):
+            d = (x - last) / count
+            z += d * (0.45 - abs(z) ** 1.3 * (0.6 + 3.5 * np.sign(d * z)))
+        last, out[k] = x, z
+    return 0.7 * u + out
+
+
+def test_lags_along_the_path_follow_a_bouc_wen_loop_that_plays_cannot():
+    fitted, unseen = (
+        np.concatenate([np.linspace(a, b, 60)[1:] for a, b in pairwise([0.0, *turns])])
+        for turns in (
+            np.clip(np.random.default_rng(5).uniform(-0.2, 1.2, 90), 0, 1),
+            [1, 0, 0.7, 0.3, 0.7, 0.3, 0.9, 0.1, 0.9, 0.5, 0.6, 0.5, 0.6, 0],
+        )
+    )
+    errors = {}
+    for name in ('preisach', 'duhem'):
+        law = HysteresisLaw(name, R)
+        A, B = (np.array([*law.columns(u), np.ones(u.size)]).T for u in (fitted, unseen))
+        theta = np.linalg.lstsq(A, bouc_wen(fitted), rcond=1e-7)[0]
+        w = bouc_wen(unseen)
+        errors[name] = 100 * np.std(B @ theta - w) / np.ptp(w)
+    assert errors['duhem'] < 0.3 < 1.0 < errors['preisach']

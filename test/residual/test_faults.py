@@ -91,6 +91,39 @@ def test_missed_samples(truth, share):
     assert np.mean(missed[bad]) > 0.95
 
 
+def test_a_sensor_that_hangs_while_the_drive_moves(truth):
+    v, y, read = truth
+    z, hung = read.copy(), np.zeros(y.size, dtype=bool)
+    rng = np.random.default_rng(3)
+    for start in (15_000, 31_000, 47_000, 52_000, 55_000, 66_000):
+        stop = start + int(rng.integers(1200, 3000))
+        z[start:stop], hung[start + 1 : stop] = z[start], True
+    # a model of a wrong size is no excuse
+    named, found = faults(v, z, 0.98 * y)
+    assert 'stretches in which the sensor hangs' in named['missed_samples'].action
+    assert not np.any(found.stuck[0] & ~hung)
+    # in a rest nobody can tell
+    assert np.mean(found.stuck[0][hung & (np.abs(np.gradient(v)) > 1e-5)]) > 0.9
+    # however many there are: nothing can be learnt from them
+    (left_out,) = found.left_out(0.001)
+    assert np.all(left_out[found.stuck[0]])
+
+
+def test_steps_in_coarse_readings_with_a_sensor_that_hangs_are_still_known():
+    code = np.repeat(np.arange(200), 50)
+    code[3000:7000] = code[3000]
+    assert quantum_of(7e-8 * code) == pytest.approx(7e-8)
+
+
+def test_a_wrong_mode_is_no_jitter(truth):
+    v, y, _ = truth
+    rng = np.random.default_rng(4)
+    # what rings is as strong as the motion is fast: its variance grows as that of jitter does
+    t, speed = np.arange(y.size) / RATE, np.abs(np.gradient(y))
+    ringing = 1e-6 * speed / speed.max() * np.sin(2 * np.pi * 2300 * t)
+    assert faults(v, y + ringing + 1.5e-9 * rng.standard_normal(y.size), y)[0] == {}
+
+
 @pytest.mark.parametrize('jitter', [1e-6, 5e-6])
 def test_timing_jitter(truth, jitter):
     v, y, read = truth
