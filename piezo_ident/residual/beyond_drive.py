@@ -15,7 +15,7 @@ from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
-__all__ = ['ChannelTest', 'channel_tests', 'drive_functions']
+__all__ = ['ChannelTest', 'channel_tests', 'drive_functions', 'without_drive']
 
 Array = NDArray[np.float64]
 
@@ -101,6 +101,12 @@ def drive_functions(v: Array, rate: float) -> Array:
         columns += [x, np.diff(x, prepend=x[0]), np.diff(x, 2, prepend=(x[0], x[0]))]
         columns += _lagged(x, rate)
     return np.stack(columns, axis=1)
+
+
+def without_drive(e: Array, v: Array, rate: float, use: NDArray[np.bool_]) -> Array:
+    """Return a residual without the best sum of functions of the drive, shape (n,)."""
+    A = np.hstack([drive_functions(v, rate), _slow(e.size)])
+    return np.asarray(e - A @ _solve(A[use], e[use]))
 
 
 def _slow(n: int) -> Array:

@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
+from piezo_ident.residual.beyond_drive import without_drive
+from piezo_ident.residual.reversals import TURN, turns_of
+from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, true_runs
 from scipy import fft, signal
 from scipy.ndimage import maximum_filter1d, median_filter
 
-__all__ = ['FEWEST', 'Series', 'Spectrum', 'series_of']
+__all__ = ['FAINT', 'FEWEST', 'Series', 'Spectrum', 'series_of']
 
 Array = NDArray[np.float64]
 
@@ -24,13 +26,21 @@ TOP, RATE = 0.8, 2500.0
 SHORTEST = 0.3
 #: neighbours on either side that a line is held against, and fewest of them [bins]
 NEIGHBOURS, FEWEST = 31, 7
+#: a bin belongs to the drive where it stands so far out of the bins around, rounding apart
+LOCKED, ROUNDING = 16.0, 1e-12
+#: gain of differences, or of means, below which nothing is read
+FAINT = 0.15
 #: a median of exponential variables is worth this share of a mean as an estimate of their scale
 MEDIAN_WORTH = 0.48
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A stretch of the residual at the lower rate, as differences where the drive repeats."""
+    """
+    A stretch of the residual at the lower rate, as differences where the drive repeats.
+
+    `driven` is power that the drive may have put there, `locked` are the bins of its periods.
+    """
 
     record: str
     t: float
@@ -41,6 +51,7 @@ class Series:
     block: int
     rate: float
     driven: Array | None = None
+    locked: NDArray[np.bool_] | None = None
 
     def gain(self, f: Array) -> NDArray[np.complex128]:
         """Return what the block means, and the differences, make of a wave at f."""
@@ -80,9 +91,11 @@ def series_of(
     found: list[Series] = []
     rate = max((p.piece.sample_rate for p in parts), default=0.0)
     m = max(1, int(rate / RATE))
+    shortest = SHORTEST * rate / m
+    used: dict[int, list[tuple[int, int]]] = {}
     for s in stretches:
         piece = parts[s.part].piece
-        if abs(piece.sample_rate / rate - 1.0) > 1e-6:
+        if s.kind == 'motion' or abs(piece.sample_rate / rate - 1.0) > 1e-6:
             continue
         start = s.start
         if s.kind == 'rest' and s.step:
@@ -95,29 +108,73 @@ def series_of(
         if s.period:
             e = e[s.period :] - e[: -s.period]
         x = block_means(e, m)
-        if x.size < SHORTEST * rate / m:
+        if x.size < shortest:
             continue
-        x = signal.detrend(x)
-        window = signal.windows.hann(x.size)
-        driven = None
-        if s.kind == 'motion':
-            driven = _driven(block_means(piece.v[start : s.stop], m), x, window)
-        # at the middle of its first block
-        t = piece.start_time + (start + 0.5 * (m - 1)) / rate
-        found.append(
-            Series(
-                parts[s.part].record,
-                t,
-                x,
-                window,
-                s.period / rate,
-                (first + -first % m) // m,
-                m,
-                rate / m,
-                driven,
-            )
-        )
+        used.setdefault(s.part, []).append((s.start, s.stop))
+        found.append(_series(parts[s.part], start, x, m, s.period))
+    for k, part in enumerate(parts):
+        if abs(part.piece.sample_rate / rate - 1.0) < 1e-6:
+            found += _motions(part, used.get(k, []), m, shortest)
     return found, rate / m, TOP * 0.5 * rate / m
+
+
+def _series(part: ResidualPart, start: int, x: Array, m: int, period: int = 0) -> Series:
+    rate, begin = part.piece.sample_rate, part.piece.start_time
+    return Series(
+        part.record,
+        # at the middle of its first block
+        begin + (start + 0.5 * (m - 1)) / rate,
+        signal.detrend(x),
+        signal.windows.hann(x.size),
+        period / rate,
+        (round(begin * rate) + start) // m,
+        m,
+        rate / m,
+    )
+
+
+def _motions(
+    part: ResidualPart, used: Sequence[tuple[int, int]], m: int, shortest: float
+) -> list[Series]:
+    """Return what lies between the stretches used, freed of what the drive explains."""
+    piece, free = part.piece, part.mask.copy()
+    for start, stop in used:
+        free[start:stop] = False
+    runs = [(a, b) for a, b in true_runs(free) if b - a >= (shortest + 1) * m]
+    if not runs:
+        return []
+    tick = -round(piece.start_time * piece.sample_rate) % m
+    e, v = (block_means(x[tick:], m) for x in (part.e, piece.v))
+    use: NDArray[np.bool_] = np.all(part.mask[tick : tick + e.size * m].reshape(-1, m), axis=1)
+    e = without_drive(e, v, piece.sample_rate / m, use)
+    found = []
+    for start, stop in runs:
+        a, b = -(-(start - tick) // m), (stop - tick) // m
+        series = _series(part, tick + a * m, e[a:b], m)
+        driven = _driven(v[a:b], series.x, series.window)
+        found.append(replace(series, driven=driven, locked=_locked(v[a:b])))
+    return found
+
+
+def _locked(v: Array) -> NDArray[np.bool_]:
+    """
+    Return the bins at which a drive that goes on in periods may leave a line, shape (n // 2 + 1,).
+
+    Its turns, as impulses, have every harmonic, also those at which a mode rings.
+    """
+    turns = turns_of(v, TURN * float(np.ptp(v)))
+    signed, plain = np.zeros(v.size), np.zeros(v.size)
+    if turns.size > 1:
+        signed[turns], plain[turns] = np.sign(np.diff(v[turns], prepend=v[turns[0] - 1])), 1.0
+    locked = np.zeros(v.size // 2 + 1, dtype=bool)
+    window = signal.windows.hann(v.size)
+    for wave in (v, v * v, np.diff(v, prepend=v[0]), signed, plain):
+        power = np.abs(fft.rfft(window * signal.detrend(wave))) ** 2
+        top = float(power.max(initial=0.0))
+        usual = median_filter(power, size=2 * NEIGHBOURS + 1, mode='nearest')
+        peak = power == maximum_filter1d(power, 5)
+        locked |= peak & (power > LOCKED * usual) & (power > ROUNDING * top)
+    return np.asarray(maximum_filter1d(locked, 7))
 
 
 def _driven(v: Array, x: Array, window: Array) -> Array:
@@ -202,6 +259,10 @@ def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
     at = np.clip(np.rint(f * s.x.size / rate).astype(np.int64), 0, power.size - 1)
     if s.driven is not None:
         level = np.maximum(level, s.driven)
+    if s.locked is not None:
+        level = np.where(s.locked, np.inf, level)
     # a record without any noise must not make a line of its rounding
     least = max(np.finfo(float).eps ** 2 * float(power.max(initial=0.0)), 1e-40)
-    return np.maximum(level[at], least) * s.comb(f), worth[at]
+    level = np.maximum(level[at], least) * s.comb(f)
+    # periods of no whole number of samples leave something of themselves in the differences
+    return np.where(np.abs(s.gain(f)) < FAINT, np.inf, level), worth[at]

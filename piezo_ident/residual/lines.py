@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.residual.line_spectrum import FEWEST, Series, series_of, Spectrum
-from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
+from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
+from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of, true_runs
 from scipy import fft
 from scipy.special import gammaincc, gammaln
 
@@ -29,8 +29,9 @@ Array = NDArray[np.float64]
 LINES = 6
 #: chance of one false line in a search
 SIGNIFICANT = 1e-3
-#: lines below this share of the stroke are nothing's cause; converters make them
-SMALLEST = 1e-5
+#: lines below this share of the stroke are nothing's cause, converters make them; and below this
+#: share of the residual, which is never quite locked to the drive
+SMALLEST, SIDELINE = 1e-5, 0.01
 #: points of the common grid in one bin of the whole search
 FINE = 2.5
 #: between two bins the largest score is found more often than at them; seen in white noise
@@ -38,7 +39,7 @@ TRIALS = 4.0
 #: a line is the same everywhere: in each half of the data this share of its amplitude, at least
 STEADY = 0.5
 #: harmonics that are grouped under their base
-HARMONICS = (2, 3)
+HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,27 @@ class Line:
 
 @dataclass(frozen=True)
 class LineSearch:
-    """The lines found, by falling amplitude; `searched`: whether a stretch was long enough."""
+    """
+    The lines found.
+
+    Attributes
+    ----------
+    lines : tuple of Line
+        By falling amplitude.
+    searched : bool
+        Whether a stretch was long enough.
+    tested : tuple of (float, float)
+        Bands [Hz] in which a line as large as the residual would have been seen; between them the
+        drive, a harmonic of it, or what it leaves hides it.
+    """
 
     lines: tuple[Line, ...] = ()
     searched: bool = False
+    tested: tuple[tuple[float, float], ...] = ()
+
+    def is_tested(self, frequency: float) -> bool:
+        """Return whether a line of a frequency [Hz] would have been seen."""
+        return any(low <= frequency <= high for low, high in self.tested)
 
 
 def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> LineSearch:
@@ -89,8 +107,10 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     keep = (f >= (FEWEST + 2) / longest) & (f <= high)
     searched = bool(keep.any())
     bins = max(1.0, TRIALS * float(keep.sum()) / FINE)
-    negligible = SMALLEST * max(strokes_of(parts).values())
+    negligible = max(SMALLEST * max(strokes_of(parts).values()), SIDELINE * _rms(parts))
     search = _Search(series, f, size)
+    seen = keep & (search.information() * _rms(parts) ** 2 > np.log(bins / SIGNIFICANT))
+    tested = tuple((float(f[a]), float(f[b - 1])) for a, b in true_runs(seen))
     found: list[Line] = []
     for _ in range(2 * LINES):
         score, gain = search.score()
@@ -98,14 +118,23 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
         significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
             break
-        frequency = search.refined(int(np.argmax(np.where(significant, gain, -1.0))))
-        sines = [(name, *search.sine(frequency, name)) for name in search.records]
+        best = int(np.argmax(np.where(significant, gain, -1.0)))
+        frequency = search.refined(search.top_near(best), best)
+        sines = [(name, *search.sine(frequency, name, best)) for name in search.records]
         amplitude = max(a for _, a, _ in sines)
-        if amplitude >= negligible and search.is_steady(frequency):
+        if amplitude >= negligible and search.is_steady(frequency, best):
             found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
         keep &= np.abs(f - frequency) > 2.0 / longest
-    return LineSearch(_grouped(found, 2.0 / longest), searched)
+    return LineSearch(_grouped(found, 2.0 / longest), searched, tested)
+
+
+def _rms(parts: Sequence[ResidualPart]) -> float:
+    """Return the smallest rms of a residual among the records, each about its mean."""
+    records: dict[str, list[Array]] = {}
+    for part in parts:
+        records.setdefault(part.record, []).append(part.e[part.mask])
+    return min(float(np.std(np.concatenate(e))) for e in records.values())
 
 
 class _Search:
@@ -160,15 +189,45 @@ class _Search:
             total += k * np.log1p(ratio / k)
         return _log_chance(total, len(self.records)), gain
 
-    def refined(self, best: int) -> float:
-        """Return the frequency of the least squared error."""
+    def information(self) -> Array:
+        """Return what is known of an amplitude at every f in the best record [1/m^2]."""
+        known = np.zeros((len(self.records), self._f.size))
+        for s in self._spectra:
+            response = np.abs(s.series.gain(self._f)) * (0.5 * s.series.window.sum())
+            known[self.records.index(s.series.record)] += response**2 / s.noise
+        return np.asarray(known.max(axis=0))
+
+    def top_near(self, best: int) -> int:
+        """
+        Return where the gain is largest around a frequency, all with the noise at that one.
+
+        A strong line counts as noise of the bins beside it, and the least of that is not its
+        frequency.
+        """
+        power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
+        series = self._spectra[int(np.argmax(power))].series
+        reach = round(3.0 * series.rate / series.x.size / float(self._f[1]))
+        near = np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
+        gain = np.zeros(near.size)
+        for name in self.records:
+            top, information = np.zeros(near.size, np.complex128), np.zeros(near.size)
+            for s in self._spectra:
+                if s.series.record == name:
+                    response = s.series.gain(self._f[near]) * (0.5 * s.series.window.sum())
+                    top += np.conj(response) * s.values[near] / s.noise[best]
+                    information += np.abs(response) ** 2 / s.noise[best]
+            gain += np.abs(top) ** 2 / np.maximum(information, np.finfo(float).tiny)
+        return int(near[np.argmax(gain)])
+
+    def refined(self, top: int, best: int) -> float:
+        """Return the frequency of the least squared error near one, with the noise at another."""
 
         def gain(frequency: float) -> float:
-            fits = [self._fit(frequency, name) for name in self.records]
+            fits = [self._fit(frequency, name, best) for name in self.records]
             return sum(abs(a) ** 2 * information for a, information in fits)
 
         step = float(self._f[1])
-        centre = float(self._f[best])
+        centre = float(self._f[top])
         for width in (0.5 * step, 0.1 * step):
             left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
             bend = left - 2.0 * middle + right
@@ -176,29 +235,37 @@ class _Search:
                 centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
         return centre
 
-    def sine(self, frequency: float, record: str) -> tuple[float, float]:
+    def sine(self, frequency: float, record: str, best: int) -> tuple[float, float]:
         """Return amplitude and phase of A sin(2 pi f t + phase)."""
-        a, _ = self._fit(frequency, record)
+        a, _ = self._fit(frequency, record, best, least=FAINT)
         return float(abs(a)), float(np.angle(1j * a))
 
-    def is_steady(self, frequency: float) -> bool:
+    def is_steady(self, frequency: float, best: int) -> bool:
         """Return whether both halves of the stretches see the same sine; a transient does not."""
         for name in self.records:
-            whole, information = self._fit(frequency, name)
+            whole, information = self._fit(frequency, name, best, least=FAINT)
             if abs(whole) ** 2 * information < 12.0:
                 continue
             for half in (0, 1):
-                a, own = self._fit(frequency, name, half)
+                a, own = self._fit(frequency, name, best, half, least=FAINT)
                 spread = 3.0 / np.sqrt(max(own, 1e-300))
                 if abs(a - whole) > (1.0 - STEADY) * abs(whole) + spread:
                     return False
         return True
 
     def _fit(
-        self, frequency: float, record: str, half: int | None = None
+        self,
+        frequency: float,
+        record: str,
+        k: int,
+        half: int | None = None,
+        least: float = 0.0,
     ) -> tuple[complex, float]:
-        """Return the best common amplitude of a record's stretches, and the information on it."""
-        k = int(np.clip(np.rint(frequency / self._f[1]), 0, self._f.size - 1))
+        """
+        Return the best common amplitude of a record's stretches, and the information on it.
+
+        The noise is that at index k; stretches with less than the `least` gain do not count.
+        """
         top, bottom = 0j, 0.0
         for spectrum in self._spectra:
             s = spectrum.series
@@ -209,7 +276,10 @@ class _Search:
             x = (s.window * s.x)[part]
             t = s.t + ((part.start or 0) + np.arange(x.size)) / s.rate
             z = complex(np.sum(x * np.exp(-2j * np.pi * frequency * t)))
-            response = complex(s.gain(np.array(frequency))) * 0.5 * float(s.window[part].sum())
+            gain = complex(s.gain(np.array(frequency)))
+            if abs(gain) < least:
+                continue
+            response = gain * 0.5 * float(s.window[part].sum())
             top += np.conj(response) * z / spectrum.noise[k]
             bottom += abs(response) ** 2 / spectrum.noise[k]
         return (top / bottom if bottom > 0.0 else 0j), bottom

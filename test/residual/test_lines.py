@@ -3,11 +3,16 @@
 
 """The line search: hum is found to a fraction of a bin, drive and noise are not taken for it."""
 
+from functools import cache
+
 import numpy as np
 from piezo_ident.record.record import Piece
 from piezo_ident.residual import all_stretches, find_lines, ResidualPart, without_lines
 import pytest
 from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
+from residual_stages import drives, foreign
+
+DRIVES = drives()
 
 
 def search(*parts: ResidualPart):
@@ -59,7 +64,10 @@ def test_a_record_driven_at_50_hz_cannot_tell_hum():
     v = 5 + 5 * np.sin(2 * np.pi * 50 * t)
     e = 2e-9 * rng.standard_normal(t.size) + 1e-7 * np.sin(2 * np.pi * 50 * t + 1) + misfit(v)
     part = ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)
-    assert search(part).lines == ()
+    found = search(part)
+    assert found.lines == ()
+    assert not any(found.is_tested(k * 50) for k in range(1, 10))
+    assert found.is_tested(60.0)
 
 
 @pytest.mark.parametrize('colour', ['white', 'pink', 'misfit'])
@@ -73,6 +81,36 @@ def test_no_false_lines(colour):
         false += bool(search(part_of(e, labelled=i % 2 == 0)).lines)
     # 0 to 1 in 800 were seen in longer runs
     assert false <= 1
+
+
+@cache
+def stage_of(drive: str) -> tuple[np.ndarray, np.ndarray]:
+    return foreign(DRIVES[drive], np.random.default_rng(6))
+
+
+def of_stage(drive: str, hum: float) -> ResidualPart:
+    v = DRIVES[drive]
+    y, y_hat = stage_of(drive)
+    t = np.arange(v.size) / RATE
+    y = y + hum * np.tanh(2.5 * np.sin(2 * np.pi * 50.03 * t + 1))
+    return ResidualPart('r', Piece(v, STROKE * y, RATE), STROKE * (y - y_hat))
+
+
+@pytest.mark.parametrize('drive', DRIVES)
+def test_a_misfit_of_the_hysteresis_makes_no_line(drive):
+    assert search(of_stage(drive, 0.0)).lines == ()
+
+
+@pytest.mark.parametrize(
+    ('drive', 'size'),
+    # the steps, never at rest for long, excite 50 Hz themselves
+    [*((name, 5e-4) for name in ('sines', 'triangle', 'multisine')), ('steps', 2.5e-3)],
+)
+def test_clipped_hum_beside_a_misfit_of_a_per_cent(drive, size):
+    line, *_ = search(of_stage(drive, size)).lines
+    assert line.frequency == pytest.approx(50.03, abs=0.05)
+    # the first harmonic of that wave
+    assert line.amplitude == pytest.approx(1.18 * size * STROKE, rel=0.1)
 
 
 def test_a_sweep_of_one_frequency_is_drive_not_hum():
