@@ -37,7 +37,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from foreign import Case, CASES, draw, make_stage, Motion, record_motion, references, Stage
 from foreign.families import SETS
 from foreign.faults import NAMES, spoilt
-from foreign.references import basis, remainder, ROWS
+from foreign.references import basis, FORMS, remainder, ROWS
 from foreign.sizes import scaled
 import numpy as np
 from numpy.typing import NDArray
@@ -200,7 +200,7 @@ def case_records(case: Case, forms: bool = True) -> Records:
     forms : bool
         Also compare forms of the hysteresis, which takes some seconds.
     """
-    stage = make_stage(case.core, case.seed, case.effects)
+    stage = make_stage(case.core, case.seed, case.effects, further=case.group == 'final')
     low, high = stage.limits
     moved = motions(case, stage)
     volts = {name: low + (high - low) * m.u for name, m in moved.items()}
@@ -208,8 +208,8 @@ def case_records(case: Case, forms: bool = True) -> Records:
         name: (v, stage.read(stage.respond(v, name, {}, clean=True), name))
         for name, v in volts.items()
     }
-    every = ('ten plays', 'forty plays', 'and a square', 'weighted by the bias', 'relay plane')
-    best = references(stage, plain, every if forms else ('forty plays',))
+    sweeps = [x[1:] for x in moved['identification'].labels if x[0].startswith('triangle')]
+    best = references(stage, plain, FORMS if forms else ('forty plays',), sweeps)
     misfit = best['forty plays'].unseen
     coupled = 'cross_coupling' in case.effects
     others = {

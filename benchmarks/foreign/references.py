@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import lsq_linear
 
 from .cores import play
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 #: rows that are fitted at most
 ROWS = 30_000
+#: over which the voltage must sweep far for a sample to tell of the hysteresis [s]
+WINDOW = 0.6
 #: ten plays, forty plays, and on each a form of the hysteresis
 FORMS = ('ten plays', 'forty plays', 'and a square', 'weighted by the bias', 'relay plane')
 
@@ -90,10 +93,16 @@ def _error(X: Array, y: Array, weights: Array) -> float:
 
 
 def references(
-    stage: Stage, records: Mapping[str, tuple[Array, Array]], forms: tuple[str, ...] = FORMS
+    stage: Stage,
+    records: Mapping[str, tuple[Array, Array]],
+    forms: tuple[str, ...] = FORMS,
+    sweeps: Sequence[tuple[int, int]] = (),
 ) -> dict[str, Reference]:
     """
     Return what each form reaches, fitted on the identification.
+
+    Fitted on all of it, where the stage moves far, and on its sweeps, since a stage that is no sum
+    of plays creeps away in the steps and the noise; the one that predicts better is kept.
 
     Parameters
     ----------
@@ -101,20 +110,34 @@ def references(
     records : mapping of str to (v, y)
         Of every record: command [V], and displacement in parts of the stroke.
     forms : tuple of str, optional
+    sweeps : sequence of (start, stop), optional
+        Samples of the identification that follow its triangles.
     """
     found = {}
     for form in forms:
-        weights: Array | None = None
-        errors = {}
-        for name in ('identification', 'diagnosis', 'unseen'):
-            v, y = records[name]
+        thinned = {}
+        for name, (v, y) in records.items():
             X, positive = basis(stage, v, name, form)
-            y = y[:: max(1, v.size // ROWS)]
-            if weights is None:
-                weights = _fitted(X, y, positive)
-            errors[name] = _error(X, y, weights)
-        found[form] = Reference(form, errors['diagnosis'], errors['unseen'])
+            thinned[name] = X, y[:: max(1, v.size // ROWS)]
+        X, y = thinned['identification']
+        tries = []
+        v = records['identification'][0]
+        at = np.arange(0, v.size, max(1, v.size // ROWS))
+        swept = [(a <= at) & (at < b) for a, b in sweeps]
+        for rows in (np.ones(y.size, dtype=bool), _moved(stage, v), *swept):
+            weights = _fitted(X[rows], y[rows], positive)
+            errors = [_error(*thinned[name], weights) for name in ('diagnosis', 'unseen')]
+            tries.append(Reference(form, *errors))
+        found[form] = min(tries, key=lambda one: one.unseen)
     return found
+
+
+def _moved(stage: Stage, v: Array) -> NDArray[np.bool_]:
+    """Return the thinned samples about which the voltage sweeps a third of its range."""
+    stride = max(1, v.size // ROWS)
+    v, around = v[::stride], round(WINDOW * stage.rate / stride)
+    swept = maximum_filter1d(v, around) - minimum_filter1d(v, around)
+    return np.asarray(swept > np.ptp(stage.limits) / 3.0)
 
 
 def remainder(X: Array, change: Array) -> float:

@@ -18,6 +18,7 @@ from truths import laws
 from truths.linear import delayed, relaxation
 from truths.table import LATER
 
+from . import forms
 from .cores import Core, core_of, WIDTHS
 from .families import LAWS
 from .speed import spent_on_speed
@@ -195,9 +196,9 @@ class Stage:
             slew = gains.get('slew_limit', math.inf)
             drive = laws.current_limited(drive, slew, kind['slew_limit'], rate)
         if 'saturation' in gains:
-            drive = laws.limited(drive, gains['saturation'], kind['saturation'])
+            drive = forms.limited(drive, gains['saturation'], kind['saturation'])
         if 'amplifier_lag' in gains:
-            drive = laws.charged(drive, gains['amplifier_lag'], kind['amplifier_lag'], rate)
+            drive = forms.lagging(drive, gains['amplifier_lag'], kind['amplifier_lag'], rate)
         field_ = drive
         if 'rate_dependent_hysteresis' in gains:
             amount, form = gains['rate_dependent_hysteresis'], kind['rate_dependent_hysteresis']
@@ -205,7 +206,9 @@ class Stage:
         h = self.core(field_)
         if 'noncongruent_minor_loops' in gains:
             amount = gains['noncongruent_minor_loops']
-            h = h + amount * (2.0 * drive - 1.0) * (h - drive)
+            # loops are wider the higher the voltage, or the further the stage is out
+            place = drive if kind['noncongruent_minor_loops'] == 0 else h
+            h = h + amount * (2.0 * place - 1.0) * (h - drive)
         if 'even_nonlinearity' in gains:
             amount, form = gains['even_nonlinearity'], kind['even_nonlinearity']
             h = h + laws.bent(drive, amount, form)
@@ -213,26 +216,26 @@ class Stage:
             law = ('log', 'power')[kind['creep']]
             h = relaxation(h, law, gains['creep'], rate=rate)
         if 'preload_loss' in gains:
-            h = h + laws.hinge(drive, gains['preload_loss'], kind['preload_loss'])
+            h = h + forms.hinge(drive, gains['preload_loss'], kind['preload_loss'])
         y = self._motion(h, gains)
         if 'backlash' in gains:
-            y = y + laws.friction(y, gains['backlash'], kind['backlash'], rate)
+            y = y + forms.friction(y, gains['backlash'], kind['backlash'], rate)
         y, u = y[start:], u[start:]
         t = np.arange(y.size) / rate
         if 'gain_drift' in gains:
             rng = self._draw('gain_drift', name)
-            y = y * (1.0 + laws.wander(t, gains['gain_drift'], kind['gain_drift'], rng))
+            y = y * (1.0 + forms.wander(t, gains['gain_drift'], kind['gain_drift'], rng))
         if 'cross_coupling' in gains and other is not None:
             y = y + gains['cross_coupling'] * self._other(other)
-        for effect, law_of in (('thermal_drift', laws.drift), ('periodic_disturbance', laws.hum)):
+        for effect, law_of in (('thermal_drift', laws.drift), ('periodic_disturbance', forms.hum)):
             if effect in gains:
                 rng = self._draw(effect, name)
                 y = y + law_of(t, gains[effect], kind[effect], rng)
         if 'sensor_nonlinearity' in gains:
-            y = laws.bridge(y, gains['sensor_nonlinearity'], kind['sensor_nonlinearity'])
+            y = forms.bent(y, gains['sensor_nonlinearity'], kind['sensor_nonlinearity'])
         if 'input_feedthrough' in gains:
             amount, form = gains['input_feedthrough'], kind['input_feedthrough']
-            y = y + laws.fed_through(u, amount, form, rate)
+            y = y + forms.fed(u, amount, form, rate)
         return np.asarray(y)
 
     def _motion(self, h: Array, gains: Mapping[str, float]) -> Array:
@@ -244,6 +247,9 @@ class Stage:
                 # the same dashpot on more mass
                 ratio = 1.0 / (1.0 + amount)
                 modes = ((frequency * ratio, zeta * ratio, share), *others)
+            elif self.variants['changed_dynamics'] == 2:
+                # a stiffer or lighter platform: every mode moves up
+                modes = tuple((f * (1.0 + 0.5 * amount), z, k) for f, z, k in linear.modes)
             else:
                 # a part of the platform rides on a mode of its own
                 modes = ((frequency, zeta, share - amount), (0.7 * frequency, 0.02, amount))
@@ -259,10 +265,10 @@ class Stage:
         return Linear(((rng.uniform(150.0, 400.0), 0.03, 1.0),), 2500.0, 0.0)(moved, self.rate)
 
 
-def make_linear(rng: Rng, rate: float) -> Linear:
+def make_linear(rng: Rng, rate: float, highest: float = 1500.0) -> Linear:
     """Draw two or three light modes, a sensor's pole and a delay of 0 to 6 samples."""
     top = 0.38 * rate
-    first = math.exp(rng.uniform(math.log(200.0), math.log(min(1500.0, top / 1.7))))
+    first = math.exp(rng.uniform(math.log(200.0), math.log(min(highest, top / 1.7))))
     places, frequency = [first], first
     for _ in range(int(rng.integers(1, 3))):
         frequency *= rng.uniform(1.6, 2.8)
@@ -288,7 +294,16 @@ def make_core(name: str, rng: Rng) -> Core:
     raise ValueError(f'no core of {name} has the slopes of a piezo')
 
 
-def make_stage(core: str, seed: int, effects: tuple[str, ...] = ()) -> Stage:
+def _form(effect: str, rng: Rng, further: bool) -> int:
+    known = VARIANTS.get(effect, 2)
+    if not further or effect not in forms.FURTHER:
+        return int(rng.integers(known))
+    return min(int(rng.integers(known + 2)), forms.FURTHER[effect])
+
+
+def make_stage(
+    core: str, seed: int, effects: tuple[str, ...] = (), further: bool = False
+) -> Stage:
     """
     Draw a stage; the gains of its effects are still to be found.
 
@@ -299,6 +314,8 @@ def make_stage(core: str, seed: int, effects: tuple[str, ...] = ()) -> Stage:
     seed : int
     effects : tuple of str
         Of which the forms are drawn.
+    further : bool
+        Also draw from `forms.FURTHER`, which counts twice.
     """
     rng = np.random.default_rng([8812, seed])
     rate = float(rng.choice([10_000.0, 20_000.0, 20_000.0, 50_000.0]))
@@ -308,13 +325,14 @@ def make_stage(core: str, seed: int, effects: tuple[str, ...] = ()) -> Stage:
     noise = str(rng.choice(['white', 'white', '1/f', '1/f', '10-bit', '12-bit']))
     return Stage(
         core=make_core(core, rng),
-        linear=make_linear(rng, rate),
+        # a change of a high mode shows in nothing that a stage is driven with
+        linear=make_linear(rng, rate, 600.0 if 'changed_dynamics' in effects else 1500.0),
         rate=rate,
         limits=limits,
         stroke=sign * stroke,
         offset=stroke * rng.uniform(-0.3, 0.3),
         noise=noise,
         noise_rms=math.exp(rng.uniform(math.log(2e-5), math.log(2e-4))),
-        variants={n: int(rng.integers(VARIANTS.get(n, 2))) for n in effects},
+        variants={n: _form(n, rng, further) for n in effects},
         seed=seed,
     )
