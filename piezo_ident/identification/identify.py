@@ -20,6 +20,7 @@ import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
+    key_of,
     noise_floor_of,
     predictions_of,
     validation_errors,
@@ -36,6 +37,7 @@ from piezo_ident.identification.results import (
     Steps,
 )
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
+from piezo_ident.identification.starts import lag_of, with_starts
 from piezo_ident.identification.three_steps import (
     first_step,
     model_of,
@@ -162,19 +164,16 @@ def _labelled(
     progress: Progress,
     steps: Steps,
 ) -> FitOutcome:
-    fit = triangle_excerpts(runs)
-    if not fit:
-        raise IdentificationError(
-            'no triangle starts from a known memory or sweeps its range twice; start it from the '
-            'lowest voltage'
-        )
+    unstarted, runs = runs, with_starts(runs)
     delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
     dynamics, G = steps.dynamics or second_step(runs, delay, settings, progress)
     if delay_result.agree is False and steps.delay is None and steps.dynamics is None:
         delay_result, dynamics, G = _either(runs, delay_result, dynamics, G, settings, progress)
         delay = Delay(delay_result.samples)
-    held = triangle_excerpts(runs, held=True)
+    # the same with what is known of the lag by now
+    runs = with_starts(unstarted, lag_of(G, delay))
+    fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
     hysteresis = third_step(fit, held, G, delay, settings, progress)
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
@@ -199,7 +198,14 @@ def _labelled(
     for run in runs:
         kept = run.held_out()
         masks.append((run.mask('triangle', 'noise', 'settle', 'step') & ~kept, kept))
-    return FitOutcome(model, delay_result, dynamics, hysteresis, masks, warnings)
+    memories = {
+        key_of(run): run.start(model.hysteresis.thresholds)
+        for run in runs
+        if run.memory is not None and sum(key_of(other) == key_of(run) for other in runs) == 1
+    }
+    return FitOutcome(
+        model, delay_result, dynamics, hysteresis, masks, warnings, memories=memories
+    )
 
 
 def _either(
@@ -257,7 +263,7 @@ def first_steps(
         if not data.labelled:
             raise IdentificationError(_UNLABELLED.format('dynamics', 'noise and triangle'))
         delay = steps.delay or first_step(data.runs, settings, progress)
-        found = second_step(data.runs, Delay(delay.samples), settings, progress)
+        found = second_step(with_starts(data.runs), Delay(delay.samples), settings, progress)
     return replace(steps, delay=delay, dynamics=found)
 
 

@@ -15,6 +15,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.stage_model import Scaling
+from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults
 from piezo_ident.record.gaps import bridged
@@ -110,6 +111,14 @@ class Run(Excerpt):
     record: str
     piece: Piece
     known: NDArray[np.bool_]
+
+    def through(self, hysteresis: Hysteresis) -> NDArray[np.float64]:
+        """Return what H makes of the input, from the start of this run."""
+        return hysteresis(self.u, self.start(hysteresis.thresholds))
+
+    def excerpt(self, use: NDArray[np.bool_]) -> Excerpt:
+        """Return this run with other samples that count."""
+        return Excerpt(self.u, self.x, use, self.memory)
 
     def mask(self, *kinds: str) -> NDArray[np.bool_]:
         """Return which samples belong to segments of these kinds."""

@@ -17,17 +17,19 @@ so the shares s are what is sought.  Gauss-Newton on the weights and the shares,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
 )
+from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 
-__all__ = ['fit_starts']
+__all__ = ['fit_starts', 'lag_of', 'with_starts']
 
 Vector = NDArray[np.float64]
 Rule = Callable[[Vector], Vector]
@@ -196,6 +198,39 @@ def fit_starts(
     for i in sought:
         rules[i] = _rule(starts[i], r, memory(i, best))
     return rules
+
+
+def lag_of(G: Dynamics, delay: Delay) -> float:
+    """Return by how many samples the displacement follows slow motion."""
+    a = np.concatenate([[1.0], G.a])
+    k_b, k_a = np.arange(G.b.size), np.arange(a.size)
+    return delay.total + float(k_b @ G.b / G.b.sum() - k_a @ a / a.sum())
+
+
+def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
+    """
+    Return the runs with the memory at their start, found on what is fitted of their triangles.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    lag : float, optional
+        As for `fit_starts`.
+
+    Returns
+    -------
+    list of Run
+        Those that do not start at the lowest voltage are known all over then.
+    """
+    excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
+    driven = [i for i, e in enumerate(excerpts) if e.use.any()]
+    unknown = [not bool(np.array_equal(runs[i].known, runs[i].use)) for i in driven]
+    found = list(runs)
+    rules = fit_starts([excerpts[i] for i in driven], unknown, lag)
+    for i, rule in zip(driven, rules, strict=True):
+        if rule is not None:
+            found[i] = replace(runs[i], memory=rule, known=runs[i].use)
+    return found
 
 
 def _rule(u0: float, r: Vector, memory: Vector) -> Rule:

@@ -170,7 +170,7 @@ def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
         triangle = run.mask('triangle') & run.known
         # the same runs either way, so that each keeps its offset
         if np.any(triangle & ~out):
-            excerpts.append(Excerpt(run.u, run.x, triangle & (out if held else ~out)))
+            excerpts.append(run.excerpt(triangle & (out if held else ~out)))
     return excerpts
 
 
@@ -255,7 +255,7 @@ def second_step(
 
     H = undo(G)
     progress('dynamics', 0.45)
-    undone = _noise(run, H(run.u), start, stop)
+    undone = _noise(run, run.through(H), start, stop)
     found = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
     result, G = _best_in_free_run(found, runs, H, delay, progress)
     H = undo(G)
@@ -267,7 +267,8 @@ def second_step(
     # drags along count in both
     noise = slice(max(0, start - WARM_UP), stop)
     g_u, g_w = (
-        filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :] for z in (run.u, H(run.u))
+        filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :]
+        for z in (run.u, run.through(H))
     )
     g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[start:stop]))
     slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
@@ -323,7 +324,7 @@ def _stretches(
             # what lies before the first sample used only has to let the start die away
             first, last = np.flatnonzero(use)[[0, -1]]
             part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
-            w, y = delay.apply(H(run.u))[part], run.x[part]
+            w, y = delay.apply(run.through(H))[part], run.x[part]
             w, y = w - w[0], y - y[:20].mean()
             if run.piece.sample_rate > 2.0 * SLOWEST:
                 # both sides pass the same filter, so G is still what leads from one to the other

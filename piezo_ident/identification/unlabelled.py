@@ -33,7 +33,7 @@ from piezo_ident.identification.results import (
     Settings,
 )
 from piezo_ident.identification.spectra import excited_band
-from piezo_ident.identification.starts import fit_starts
+from piezo_ident.identification.starts import fit_starts, lag_of
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
@@ -83,13 +83,6 @@ class JointFit:
     excerpts: tuple[Excerpt, ...]
     hysteresis: Hysteresis
     not_identified: tuple[tuple[str, str], ...]
-
-
-def _lag(G: Dynamics, delay: Delay) -> float:
-    """Return by how many samples the displacement follows slow motion."""
-    a = np.concatenate([[1.0], G.a])
-    k_b, k_a = np.arange(G.b.size), np.arange(a.size)
-    return delay.total + float(k_b @ G.b / G.b.sum() - k_a @ a / a.sum())
 
 
 def joint_fit(
@@ -142,7 +135,7 @@ def joint_fit(
         progress('dynamics', turn / TURNS)
         masks = motion.calm if turn == 0 else [e.use for e in excerpts]
         slow = [replace(e, use=m) for e, m in zip(excerpts, motion.calm, strict=True)]
-        rules = fit_starts(slow, [True] * len(slow), _lag(G, delay))
+        rules = fit_starts(slow, [True] * len(slow), lag_of(G, delay))
         excerpts = [replace(e, memory=rule) for e, rule in zip(excerpts, rules, strict=True)]
         parts = [replace(e, use=m) for e, m in zip(excerpts, masks, strict=True)]
         n = sum(int(m.sum()) for m in masks)
