@@ -116,18 +116,19 @@ def _slow(n: int) -> Array:
 
 def _solve(A: Array, e: Array) -> Array:
     """Return the least squares of scaled columns, directions that are rounding left out."""
-    scale = np.maximum(np.sqrt(np.mean(A**2, axis=0)), 1e-300)
-    N = (A / scale).T @ (A / scale)
-    values, vectors = linalg.eigh(N)
+    N = A.T @ A
+    scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
+    values, vectors = linalg.eigh(N / scale / scale[:, None])
     kept = values > RANK**1.5 * values[-1]
     part = vectors[:, kept]
-    return np.asarray(part @ ((part.T @ ((A / scale).T @ e)) / values[kept]) / scale)
+    return np.asarray(part @ ((part.T @ (A.T @ e / scale)) / values[kept]) / scale)
 
 
 def _basis(A: Array, rank: float) -> tuple[Array, Array]:
     """Return an orthonormal basis of columns (n, k), and the combinations that make it."""
-    scale = np.maximum(np.sqrt(np.mean(A**2, axis=0)), 1e-300)
-    values, vectors = linalg.eigh((A / scale).T @ (A / scale))
+    N = A.T @ A
+    scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
+    values, vectors = linalg.eigh(N / scale / scale[:, None])
     kept = values > rank * max(float(values[-1]), 1e-300)
     made = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
     return A @ made, made

@@ -14,6 +14,7 @@ from piezo_ident.model.metrics import percent
 from piezo_ident.record.faults import quantum_of
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of, true_runs
+from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
 __all__ = ['FaultSearch', 'find_faults']
@@ -30,6 +31,8 @@ MADE_UP, HELD = 0.7, 0.2
 #: a sensor hangs: equal readings, least motion of the model meanwhile, and share of the stroke by
 #: which no backlash lets it move; the reading then jumps by so many of the steps around it
 STUCK, HANGS, ALONE, AROUND = 20, 3.0, 0.05, 8
+#: least size of a knock, share of the stroke; most times of knocks that are given
+KNOCK, MOST_TIMES = 1e-4, 8
 #: a quantum is named above so many times the rest of the noise, and this share of the stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
 #: deviations of an outlier, and the largest share of it that its surroundings may show
@@ -100,6 +103,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             largest_jitter = max(largest_jitter, jitter)
             faults += _masked(part, missed, outliers, clipped, stuck)
             faults += _of_all(part, stroke, noise, jitter, growth)
+            faults += _knocks(part, stroke, noise, missed | outliers | clipped)
         bad.append(missed | outliers | clipped)
         out.append(clipped | stuck)
         hung.append(stuck)
@@ -148,6 +152,20 @@ def _of_all(
         )
         faults.append(Fault('timing_jitter', where, n, what))
     return faults
+
+
+def _knocks(part: ResidualPart, stroke: float, noise: _Noise, known: Mask) -> list[Fault]:
+    # a code that is left for a moment is no knock
+    found = transients_in(part, known, max(KNOCK * stroke, 1.5 * noise.quantum))
+    if not found.times:
+        return []
+    times = ', '.join(f'{t:.4g}' for t in found.times[:MOST_TIMES])
+    more = ', ...' if len(found.times) > MOST_TIMES else ''
+    what = (
+        f'transients of up to {percent(found.size, stroke):.2g} % of the stroke, '
+        f'{1e3 * found.length:.2g} ms long, at times that the drive does not set: knocks; left in'
+    )
+    return [Fault('outliers', f'in {part.record}, at {times}{more} s', len(found.times), what)]
 
 
 @dataclass(frozen=True)
@@ -340,6 +358,9 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
         return 0.0, 1.0
     base = max(float(np.mean(h2)) - slope2 * float(np.mean(s2)), 1e-3 * float(np.mean(h2)))
     base = max(base, (1e-6 * float(np.ptp(part.piece.y))) ** 2)
+    if slope2 * float(np.quantile(s2, 0.98)) < 0.5 * noise.quantum**2:
+        # steps of a converter scatter with the speed as well
+        return 0.0, 1.0
     growth = 1.0 + slope2 * float(np.quantile(s2, 0.98)) / base
     # what saturates with speed, as a converter's own noise does, is no jitter
     fast = s2 > np.median(s2)
