@@ -4,11 +4,12 @@
 """What a model leaves: noise floor, lines, dependence and faults of the data."""
 
 from piezo_ident.residual.analysis import analyse, ResidualAnalysis
-from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest
+from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest, without_channels
 from piezo_ident.residual.dependence import Curve
 from piezo_ident.residual.faults import FaultSearch, find_faults
 from piezo_ident.residual.lines import find_lines, Line, LineSearch, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
+from piezo_ident.residual.repeatable import Repeatability, repeatability
 from piezo_ident.residual.stretches import all_stretches, ResidualPart, Stretch, stretches_of
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     'Line',
     'LineSearch',
     'NoiseFloor',
+    'Repeatability',
     'ResidualAnalysis',
     'ResidualPart',
     'Stretch',
@@ -26,7 +28,9 @@ __all__ = [
     'channel_tests',
     'find_faults',
     'find_lines',
+    'repeatability',
     'residual_noise_floor',
     'stretches_of',
+    'without_channels',
     'without_lines',
 ]

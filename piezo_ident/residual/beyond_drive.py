@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
-__all__ = ['ChannelTest', 'channel_tests', 'drive_functions', 'without_drive']
+__all__ = ['ChannelTest', 'channel_tests', 'drive_functions', 'without_channels', 'without_drive']
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,8 @@ class ChannelTest:
         Share of that gain that is left in fifths of the data to which it was not fitted.
     why : str
         Why it was not tested; empty when it was.
+    added : tuple of ndarray or None
+        What it adds to the residual of each part [m].
     """
 
     channel: str
@@ -76,6 +78,7 @@ class ChannelTest:
     bound: float = 1.0
     kept: float = 0.0
     why: str = ''
+    added: tuple[Array | None, ...] = field(default=(), repr=False, compare=False)
 
 
 def drive_functions(v: Array, rate: float) -> Array:
@@ -145,9 +148,10 @@ class _Part:
     use: NDArray[np.bool_]
     rate: float
 
-    def beyond(self, x: Array) -> Array:
-        """Return a signal without what the drive explains of it."""
-        return np.asarray(x - self.drive @ _solve(self.drive[self.use], x[self.use]))
+    def beyond(self, x: Array, channel: Array | None = None) -> Array:
+        """Return a signal without what the drive, and a channel, explain of it."""
+        A = self.drive if channel is None else np.hstack([self.drive, channel])
+        return np.asarray(x - A @ _solve(A[self.use], x[self.use]))
 
 
 def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
@@ -170,9 +174,12 @@ def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
 
 def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     having = [part for part in parts if name in part.piece.channels]
-    found = [_part_of(part, part.piece.channels[name]) for part in having]
-    rate = max((p.rate for p in found), default=0.0)
-    found = [p for p in found if p.rate == rate and p.use.sum() > 4 * WHITE]
+    every = [
+        _part_of(part, part.piece.channels[name]) if name in part.piece.channels else None
+        for part in parts
+    ]
+    rate = max((p.rate for p in every if p), default=0.0)
+    found = [p for p in every if p and p.rate == rate and p.use.sum() > 4 * WHITE]
     if not found:
         return ChannelTest(name, why='too little was recorded with it')
     if all(np.ptp(p.own[p.use]) == 0.0 for p in found):
@@ -180,7 +187,8 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     if _follows(having, name, found):
         return ChannelTest(name, why='it follows the drive, or moves as slowly as drift')
     levels = [_level(p) for p in found]
-    at_level = [(p.beyond(p.e) / s)[p.use] for p, s in zip(found, levels, strict=True)]
+    # what the channel adds is not made white: of a single tone nothing would be left
+    at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(found, levels, strict=True)]
     white = _whitening(np.concatenate(at_level))
     weighed = list(zip(found, levels, strict=True))
     E = np.concatenate([_white(p.e[:, None], p, s, white)[:, 0] for p, s in weighed])
@@ -192,19 +200,42 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     chance, gain, bound = _chance(E, P)
     kept = _held_out(E, P) / max(float(np.sum((P.T @ E) ** 2)), 1e-300)
     coefficients = made @ (P.T @ E)
-    added = np.concatenate([_centred((p.channel @ coefficients)[p.use]) for p in found])
+    of_part = {id(p): p.channel @ coefficients for p in found}
+    added = np.concatenate([_centred(of_part[id(p)][p.use]) for p in found])
     whole = np.concatenate([_centred(p.e[p.use]) for p in found])
     power = float(np.mean(added**2))
     return ChannelTest(
         channel=name,
         significant=chance < SIGNIFICANT and gain > bound and kept > KEPT,
         kept=kept,
+        added=tuple(
+            None if p is None or id(p) not in of_part else _at_all(part, of_part[id(p)])
+            for part, p in zip(parts, every, strict=True)
+        ),
         chance=chance,
         share=min(power / max(float(np.mean(whole**2)), 1e-300), 1.0),
         rms=float(np.sqrt(power)),
         coherence=gain,
         bound=bound,
     )
+
+
+def without_channels(
+    parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
+) -> list[ResidualPart]:
+    """Return parts without what significant channels add, so that their lines are not hum."""
+    found = []
+    for k, part in enumerate(parts):
+        added = [t.added[k] for t in tests if t.significant]
+        found.append(part.with_residual(part.e - sum(x for x in added if x is not None)))
+    return found
+
+
+def _at_all(part: ResidualPart, means: Array) -> Array:
+    """Return means over blocks at every sample."""
+    m = max(1, int(part.piece.sample_rate / RATE))
+    middle = np.arange(means.size) * m + 0.5 * (m - 1)
+    return np.asarray(np.interp(np.arange(part.piece.n), middle, means - means.mean()))
 
 
 def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) -> bool:

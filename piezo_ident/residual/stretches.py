@@ -228,13 +228,14 @@ def _motion(
     return found
 
 
-def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
+def find_repeats(v: NDArray[np.float64], halvings: int = 3) -> list[tuple[int, int, int]]:
     """
     Return where a signal repeats itself: (first sample, behind the last, period), in order.
 
     Candidates are minima of the mean square difference between the signal and itself shifted,
     behind its first maximum; each is then held against the signal sample by sample, so that what
-    comes before and after does no harm.  At least three periods are asked for.
+    comes before and after does no harm.  At least three periods are asked for.  Motions of several
+    periods, one behind the other, hide each other: where nothing is found, halves are looked at.
 
     Notes
     -----
@@ -269,6 +270,11 @@ def find_repeats(v: NDArray[np.float64]) -> list[tuple[int, int, int]]:
                 if j - i >= (PERIODS + 1 - SLACK) * period:
                     found.append((a + i, a + j, period))
                     taken[a + i : a + j] = True
+    if not found and halvings:
+        middle = v.size // 2
+        later = find_repeats(v[middle:], halvings - 1)
+        found = find_repeats(v[:middle], halvings - 1)
+        found += [(middle + a, middle + b, period) for a, b, period in later]
     return sorted(found)
 
 

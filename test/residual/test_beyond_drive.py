@@ -5,7 +5,13 @@
 
 import numpy as np
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import channel_tests, ResidualPart
+from piezo_ident.residual import (
+    all_stretches,
+    channel_tests,
+    find_lines,
+    ResidualPart,
+    without_channels,
+)
 import pytest
 from residual_stages import drives, foreign, RATE
 from scipy.signal import lfilter
@@ -14,12 +20,16 @@ STROKE = 75e-6
 DRIVES = drives()
 
 
-def stages(drive: str, *, added=0.0, **channels: np.ndarray):
+def part_of(drive: str, added, channels: dict[str, np.ndarray]) -> ResidualPart:
     v = DRIVES[drive]
     y, y_hat = foreign(v, np.random.default_rng(2))
     e = y + added - y_hat
     piece = Piece(v, STROKE * (y + added), RATE, channels=channels)
-    part = ResidualPart('r', piece, STROKE * e)
+    return ResidualPart('r', piece, STROKE * e)
+
+
+def stages(drive: str, *, added=0.0, **channels: np.ndarray):
+    part = part_of(drive, added, channels)
     return {test.channel: test for test in channel_tests([part])}
 
 
@@ -61,6 +71,15 @@ def test_another_axis_is_found_under_a_misfit(drive, size):
     test = stages(drive, added=moved, other=other)['other']
     assert test.significant
     assert test.rms == pytest.approx(size * STROKE, rel=0.35)
+
+
+def test_lines_of_another_axis_are_no_hum():
+    t = np.arange(DRIVES['sines'].size) / RATE
+    other = np.sin(2 * np.pi * 61.3 * t)
+    part = part_of('sines', 3e-3 * lfilter([0.3], [1, -0.7], other), {'other': other})
+    assert find_lines([part], all_stretches([part])).lines
+    (left,) = without_channels([part], channel_tests([part]))
+    assert find_lines([left], all_stretches([left])).lines == ()
 
 
 def test_too_little_data():
