@@ -20,7 +20,7 @@ from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step1_delay import find_jumps
 from scipy import ndimage, signal
 
-__all__ = ['FastMotion', 'Samples', 'moving']
+__all__ = ['EDGES', 'FAINT', 'HIGH_PASS', 'FastMotion', 'Samples', 'moving', 'rms_above']
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,6 +33,8 @@ WINDOW = 0.1
 FAST = 2e-3
 #: further edges of the bands whose busiest samples are searched [Hz], and the rms they need
 EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
+#: share of motion above the first of these edges from which it is more than a slow sweep
+PURE = 0.3
 #: samples of fast motion that the search uses
 MOST = 40_000
 #: after this time a voltage that moves by less than this share of its range rests [s]
@@ -58,7 +60,7 @@ def moving(u: Vector, rate: float, swing: float) -> Mask:
     return np.asarray(found if found.sum() > u.size // 10 else np.ones(u.size, dtype=bool))
 
 
-def _rms_above(u: Vector, rate: float, edge: float) -> Vector:
+def rms_above(u: Vector, rate: float, edge: float) -> Vector:
     """Return the rms above a frequency around each sample."""
     if 4.0 * edge > rate:
         return np.zeros(u.size)
@@ -90,7 +92,7 @@ class Samples:
     def of(cls, excerpts: Sequence[Excerpt], rate: float, swing: float) -> Samples:
         """Return them for the fitted parts of runs; `swing` is the range of the voltage."""
         jumps = [_windows(e.u, rate) & e.use for e in excerpts]
-        rms = [_rms_above(e.u, rate, HIGH_PASS) for e in excerpts]
+        rms = [rms_above(e.u, rate, HIGH_PASS) for e in excerpts]
         quiet = np.concatenate(
             [r[e.use & ~j] for e, r, j in zip(excerpts, rms, jumps, strict=True)]
         )
@@ -102,10 +104,13 @@ class Samples:
             score = [r / max(float(r.max()), FAST) for r in rms]
             score = [np.where(r > 0.5 * FAST, s, 0.0) for r, s in zip(rms, score, strict=True)]
             for edge in EDGES:
-                band = [_rms_above(e.u, rate, edge) for e in excerpts]
+                band = [rms_above(e.u, rate, edge) for e in excerpts]
                 most = max(float(b.max()) for b in band)
                 if most > FAINT:
                     score = [np.maximum(s, b / most) for s, b in zip(score, band, strict=True)]
+            pure = [_purity(e.u, rate) > PURE for e in excerpts]
+            if sum(int((p | j).sum()) for p, j in zip(pure, jumps, strict=True)) > WINDOW * rate:
+                score = [s * p for s, p in zip(score, pure, strict=True)]
             fast = _busiest(score, jumps, int(0.2 * WINDOW * rate))
             fast = [f & e.use for f, e in zip(fast, excerpts, strict=True)]
         calm = [e.use & (r < FAST) for e, r in zip(excerpts, rms, strict=True)]
@@ -115,6 +120,14 @@ class Samples:
         if not broad or not enough or max(slow, default=0.0) < 0.8 * swing:
             calm = [e.use for e in excerpts]
         return cls(fast, calm)
+
+
+def _purity(u: Vector, rate: float) -> Vector:
+    """Return the share of fast motion in all motion around each sample: H errs with the rest."""
+    width = max(1, int(WINDOW * rate))
+    u = u - u.mean()
+    power = ndimage.uniform_filter1d(u**2, width) - ndimage.uniform_filter1d(u, width) ** 2
+    return np.asarray(rms_above(u, rate, EDGES[0]) / np.sqrt(np.maximum(power, 1e-12)))
 
 
 def _busiest(score: Sequence[Vector], jumps: Sequence[Mask], size: int) -> list[Mask]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.fast_motion import FastMotion, moving, Samples
+from piezo_ident.identification.hold_out import fitted_parts, MOVES
 from piezo_ident.identification.linear_part import (
     find_linear_part,
     LinearPart,
@@ -45,20 +46,13 @@ from piezo_ident.identification.warnings import warn_of_range, warn_of_zeros
 from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.residual.stretches import true_runs
 
 __all__ = ['JointFit', 'fit_unlabelled', 'joint_fit']
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: samples at the end of an unlabelled record that an error needs at least
-MIN_HELD = 10
-#: samples that a fit needs at least
-MIN_FIT = 100
-#: share of its range by which the voltage of a run has to move
-MOVES = 0.02
-#: runs that are fitted, those of the widest range first
-MOST_RUNS = 8
 #: how often starts, H and G are fitted in turn
 TURNS = 3
 #: share of the fitted samples, at their end, that chooses between models
@@ -87,17 +81,17 @@ class JointFit:
 
 def joint_fit(
     runs: Sequence[Run],
-    ends: Sequence[int],
+    fitted: Sequence[Mask],
     settings: Settings,
     progress: Progress,
 ) -> JointFit:
     """
-    Fit delay, dynamics and the memory of each start on the first part of each run.
+    Fit delay, dynamics and the memory of each start on parts of runs.
 
     Parameters
     ----------
     runs : sequence of Run
-    ends : sequence of int
+    fitted : sequence of ndarray of bool
         Samples of each that are fitted.
     settings : Settings
     progress : callable
@@ -107,10 +101,8 @@ def joint_fit(
     IdentificationError
         When the voltage hardly moves.
     """
-    excerpts = [
-        Excerpt(run.u[:n], run.x[:n], run.use[:n]) for run, n in zip(runs, ends, strict=True)
-    ]
-    swing = max(float(np.ptp(e.u)) for e in excerpts)
+    excerpts = [run.excerpt(run.use & mask) for run, mask in zip(runs, fitted, strict=True)]
+    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts if e.use.any())
     if swing < MOVES:
         raise IdentificationError(
             f'{runs[0].record}: the voltage moves by {swing:.1%} of its range in the fitted part; '
@@ -119,7 +111,11 @@ def joint_fit(
     rate = runs[0].piece.sample_rate
     excerpts = [replace(e, use=e.use & moving(e.u, rate, swing)) for e in excerpts]
     progress('delay', 0.0)
-    pieces = [run.piece.cut(0, n) for run, n in zip(runs, ends, strict=True)]
+    pieces = [
+        run.piece.cut(start, stop)
+        for run, mask in zip(runs, fitted, strict=True)
+        for start, stop in true_runs(mask)
+    ]
     least = min(piece.n for piece in pieces) // 10
     step = delay_from_steps(pieces, min(100, least), min(60, least))
     progress('delay', 1.0)
@@ -259,46 +255,6 @@ def _only_jumps(u: Vector) -> bool:
     return bool(du[large].sum() > 0.9 * du.sum() and np.mean(large) < 0.1)
 
 
-def _ends(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], list[int]]:
-    """
-    Return the runs that are fitted, the widest first, and where the held-out end of each begins.
-
-    Raises
-    ------
-    IdentificationError
-        When what is left to fit or to judge by of the widest is too short.
-    """
-    ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
-    fitted: list[Run] = []
-    ends: list[int] = []
-    for run in ranked[:MOST_RUNS]:
-        piece, rate = run.piece, run.piece.sample_rate
-        share = max(1.5, 0.2 * piece.duration)
-        held_time = settings.hold_out or min(share, 0.25 * piece.duration)
-        n_held = round(held_time * rate)
-        n_fit = piece.n - n_held
-        if (
-            n_held >= MIN_HELD
-            and n_fit >= MIN_FIT
-            and (not fitted or float(np.ptp(run.u[:n_fit])) >= MOVES)
-        ):
-            fitted.append(run)
-            ends.append(n_fit)
-        elif run is not ranked[0]:
-            continue
-        elif n_held < MIN_HELD:
-            raise IdentificationError(
-                f'{run.record}: holding out {held_time:.3g} s leaves {n_held} samples to judge '
-                f'by; hold out at least {MIN_HELD / rate:.3g} s (--hold-out)'
-            )
-        else:
-            raise IdentificationError(
-                f'{run.record}: {piece.n} samples, of which {max(n_fit, 0)} are left to fit after '
-                f'holding out {held_time:.3g} s; record longer or hold out less (--hold-out)'
-            )
-    return fitted, ends
-
-
 def fit_unlabelled(
     runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
 ) -> FitOutcome:
@@ -310,42 +266,40 @@ def fit_unlabelled(
     IdentificationError
         When what is left to fit or to judge by is too short, or does not move.
     """
-    chosen, ends = _ends(runs, settings)
-    joint = joint_fit(chosen, ends, settings, progress)
+    chosen, parts = fitted_parts(runs, settings)
+    joint = joint_fit(chosen, parts, settings, progress)
     # what chooses the thresholds is a part of what is fitted in the end, never the held-out end
     whole = list(joint.excerpts)
     early, late = [], []
     for e in whole:
         chooses = np.zeros(e.use.size, dtype=bool)
-        chooses[e.use.size - int(LATE * e.use.sum()) :] = True
+        chooses[np.flatnonzero(e.use)[int((1.0 - LATE) * e.use.sum()) :]] = True
         early.append(replace(e, use=e.use & ~chooses))
         late.append(replace(e, use=e.use & chooses))
     joint = _simplest(joint, early, late)
     delay = Delay(joint.delay.samples, joint.delay.fraction)
     hysteresis = third_step(early, late, joint.G, delay, settings, progress, whole)
     model = model_of(rate, scaling, hysteresis, joint.G, delay)
-    low, high = min(float(e.u.min()) for e in whole), max(float(e.u.max()) for e in whole)
-    model = within(model, low, high)
+    spans = [run.u[mask] for run, mask in zip(chosen, parts, strict=True)]
+    model = within(model, min(map(np.min, spans)), max(map(np.max, spans)))
     memories, offsets = {}, {}
     masks: list[tuple[Mask, Mask]] = []
     for run in runs:
         fitted = np.zeros(run.piece.n, dtype=bool)
         place = next((i for i, other in enumerate(chosen) if other is run), None)
         if place is not None:
-            fitted[: ends[place]] = True
+            fitted = parts[place]
             # where two have one name nobody could tell whose start it is
             if sum(key_of(other) == key_of(run) for other in runs) == 1:
                 memories[key_of(run)] = whole[place].start(model.hysteresis.thresholds)
                 moved = float(hysteresis.offsets[place] - hysteresis.offsets[0])
                 offsets[key_of(run)] = scaling.Y * moved
         masks.append((fitted, np.zeros(run.piece.n, dtype=bool)))
-    names = ', '.join(
-        f'the first {n / rate:.4g} s of {run.record}' for run, n in zip(chosen, ends, strict=True)
-    )
+    names = ', '.join(_named(run, mask) for run, mask in zip(chosen, parts, strict=True))
     warnings = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
         f'together on {names}',
-        *warn_of_range(chosen, ends, scaling),
+        *warn_of_range(chosen, parts, scaling),
         *warn_of_zeros(offsets, scaling),
     ]
     progress('hysteresis', 1.0)
@@ -360,6 +314,15 @@ def fit_unlabelled(
         memories=memories,
         offsets=offsets,
     )
+
+
+def _named(run: Run, fitted: Mask) -> str:
+    """Return what is fitted of a run, in words."""
+    [(start, stop)] = true_runs(~fitted)
+    rate = run.piece.sample_rate
+    if stop == fitted.size:
+        return f'the first {start / rate:.4g} s of {run.record}'
+    return f'{run.record} without {start / rate:.4g} to {stop / rate:.4g} s, which are held out'
 
 
 def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]) -> JointFit:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import DynamicsResult, Identification
 from piezo_ident.model.stage_model import Scaling, StageModel
@@ -119,10 +120,12 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     return warnings
 
 
-def warn_of_range(runs: Sequence[Run], ends: Sequence[int], scaling: Scaling) -> list[str]:
-    """Return a warning when the held-out ends leave the voltages of the fitted parts."""
-    pairs = list(zip(runs, ends, strict=True))
-    parts = [run.u[:n] for run, n in pairs], [run.u[n:] for run, n in pairs]
+def warn_of_range(
+    runs: Sequence[Run], fitted: Sequence[NDArray[np.bool_]], scaling: Scaling
+) -> list[str]:
+    """Return a warning when the held-out parts leave the voltages of the fitted ones."""
+    pairs = list(zip(runs, fitted, strict=True))
+    parts = [run.u[mask] for run, mask in pairs], [run.u[~mask] for run, mask in pairs]
     spans = [(min(map(np.min, part)), max(map(np.max, part))) for part in parts]
     if spans[1][0] > spans[0][0] - 0.01 and spans[1][1] < spans[0][1] + 0.01:
         return []

@@ -43,6 +43,10 @@ def run_of(v, noise=1e-5, memory=None):
     return runs_of([Record((piece,))], FS, scaling)[0], scaling
 
 
+def all_of(run):
+    return np.ones(run.piece.n, dtype=bool)
+
+
 def sine(seconds, f=2.0, phase=0.0):
     return 5 - 5 * np.cos(2 * np.pi * f * np.arange(int(seconds * FS)) / FS + phase)
 
@@ -50,7 +54,7 @@ def sine(seconds, f=2.0, phase=0.0):
 def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
     steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 1500)
     run, _ = run_of(np.concatenate([steps, sine(2.0)]))
-    fit = joint_fit([run], [run.piece.n], Settings(), silent)
+    fit = joint_fit([run], [all_of(run)], Settings(), silent)
     assert fit.delay.samples == 2
     assert fit.delay.source == 'steps'
     assert fit.not_identified == ()
@@ -61,7 +65,7 @@ def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
 
 def test_slow_record_leaves_delay_and_dynamics_neutral_and_says_so():
     run, _ = run_of(sine(2.0))
-    fit = joint_fit([run], [run.piece.n], Settings(), silent)
+    fit = joint_fit([run], [all_of(run)], Settings(), silent)
     assert [what for what, _ in fit.not_identified] == ['delay', 'dynamics']
     assert (fit.delay.samples, fit.delay.source, fit.delay.std) == (0, 'none', float('inf'))
     assert fit.G.a.size == 0
@@ -73,7 +77,7 @@ def test_memory_of_a_start_in_the_middle_is_found():
     r = STAGE.hysteresis.thresholds
     truth = 0.5 - np.cumsum(np.diff(np.concatenate([[0.0], r])) * rng.uniform(0, 1, r.size))
     run, _ = run_of(sine(2.0, phase=np.pi / 2), memory=truth)
-    fit = joint_fit([run], [run.piece.n], Settings(), silent)
+    fit = joint_fit([run], [all_of(run)], Settings(), silent)
     found = fit.excerpts[0].start(fit.hysteresis.thresholds)
     u = run.u
     with_it, without = fit.hysteresis(u, found), fit.hysteresis(u)
@@ -92,10 +96,10 @@ def test_memory_of_a_start_in_the_middle_is_found():
 
 def test_given_delay_is_taken_and_too_little_is_refused():
     run, _ = run_of(sine(1.0))
-    assert joint_fit([run], [run.piece.n], Settings(delay=4), silent).delay.samples == 4
+    assert joint_fit([run], [all_of(run)], Settings(delay=4), silent).delay.samples == 4
     flat, _ = run_of(np.concatenate([np.zeros(1000), sine(1.0)]))
     with pytest.raises(IdentificationError, match='moves by 0'):
-        joint_fit([flat], [900], Settings(), silent)
+        joint_fit([flat], [np.arange(flat.piece.n) < 900], Settings(), silent)
     assert_allclose(flat.u[:900], 0.0)
 
 
