@@ -270,9 +270,11 @@ def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.
     if jitter > 0.0:
         slope = np.gradient(part.y_hat) * part.piece.sample_rate
         level = np.hypot(level, np.sqrt(1.5) * jitter * slope)
-    candidates = np.flatnonzero(
-        (size > FAR * level) & (size > 3.5 * noise.quantum) & part.mask & ~known
-    )
+    # a model whose G answers at once may jump where the drive turns: then the reading did not
+    jumps = np.zeros(e.size)
+    jumps[1:-1] = np.abs(part.y_hat[1:-1] - 0.5 * (part.y_hat[:-2] + part.y_hat[2:]))
+    high = (size > FAR * level) & (size > 3.5 * noise.quantum) & (jumps < 0.5 * size)
+    candidates = np.flatnonzero(high & part.mask & ~known)
     found = np.zeros(e.size, dtype=bool)
     for k in candidates:
         if k < 8 or k >= e.size - 8:

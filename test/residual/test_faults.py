@@ -172,6 +172,13 @@ def test_outliers(truth):
     assert set(np.flatnonzero(found.bad[0])) <= set(places)
 
 
+def test_a_model_that_jumps_is_no_outlier_of_the_readings(truth):
+    v, y, read = truth
+    y_hat = y.copy()
+    y_hat[20_000:120_000:1500] += 1e-7
+    assert faults(v, read, y_hat)[0] == {}
+
+
 def test_ringing_and_steps_are_no_outliers():
     t = np.arange(20_000) / RATE
     rng = np.random.default_rng(7)
