@@ -38,12 +38,11 @@ from piezo_ident.identification.results import (
 )
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
+from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step, TRIANGLE_LAWS
 from piezo_ident.identification.three_steps import (
     first_step,
     model_of,
-    PAPER_COUNT,
     second_step,
-    third_step,
     triangle_excerpts,
     within,
 )
@@ -174,7 +173,7 @@ def _labelled(
     # the same with what is known of the lag by now
     runs = with_starts(unstarted, lag_of(G, delay))
     fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-    hysteresis = third_step(fit, held, G, delay, settings, progress)
+    hysteresis = third_step(fit, held, G, delay, settings, progress, laws=TRIANGLE_LAWS)
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
     if settings.thresholds is None and not any(e.use.any() for e in held):
@@ -278,6 +277,8 @@ def _provenance(result: Identification, names: list[str]) -> dict[str, Any]:
         'reference': 'doi:10.1109/TMECH.2015.2465868',
         'solver': fit.solver,
         'polished': fit.polished,
+        'law': fit.law,
+        'errors_of_laws': dict(fit.errors_of_laws),
         'losses': {'model': fit.loss, 'swarm': fit.swarm_loss, 'optimum': fit.optimum_loss},
         'seed': result.settings.seed,
         'records': names,

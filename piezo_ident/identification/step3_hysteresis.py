@@ -15,8 +15,8 @@ hold the problem without them, and their Gram matrix is all that the swarm needs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -31,18 +31,17 @@ from piezo_ident.identification.solvers.least_squares import (
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.operators.play import weighted_plays
 from scipy.optimize import OptimizeResult
 
 __all__ = [
     'HysteresisFit',
-    'choose_thresholds',
     'even_thresholds',
     'factorise',
+    'filtered_rows',
     'fine_thresholds',
     'fit_hysteresis',
-    'merged',
 ]
 
 Solver = Literal['least_squares', 'swarm']
@@ -53,10 +52,6 @@ WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
 STILL = 1e-8
 #: what may be left of the start of G where the samples used begin
 FORGOTTEN = 1e-13
-#: numbers of evenly spaced thresholds that are tried, one after the other
-COUNTS = (10, 14, 20, 28, 40, 56, 80)
-#: a larger number must lower the held-out error by this share
-GAIN = 0.01
 
 
 def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
@@ -131,49 +126,54 @@ def factorise(
         k is the number of excerpts, size that of the law.
     """
     law = _law(law)
+    rows = filtered_rows(excerpts, law, dynamics, delay)
+    return triangular_factor(rows, len(excerpts) + law.size + 1)
+
+
+def filtered_rows(
+    excerpts: Sequence[Excerpt], law: HysteresisLaw, dynamics: Dynamics, delay: Delay
+) -> Iterator[NDArray[np.float64]]:
+    """Give the rows that `factorise` reduces, in their order in time, excerpt by excerpt."""
     k, r = len(excerpts), law.thresholds
     # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
     part = np.array([1.0 - delay.fraction, delay.fraction])
     G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
-
-    def rows() -> Iterator[NDArray[np.float64]]:
-        for i, excerpt in enumerate(excerpts):
-            row, memory = excerpt.row, excerpt.start(r)
-            stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
-            n = excerpt.rows
-            block = np.zeros((k + law.size + 1, n))
-            block[i] = np.sqrt(row)
-            # the plays need all that came before the samples used, G only what it remembers
-            begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
-            begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
-            # lags along the path start with the excerpt
-            begin = 0 if law.lags else begin
-            stretches -= begin
-            before, u = excerpt.u[:begin], excerpt.u[begin:end]
-            memory = weighted_plays(before, r, np.zeros(r.size), 0.0, 0.0, memory)[1]
-            u = Delay(delay.samples).apply(u)
-            for j, column in enumerate(law.columns(u, memory), start=k):
-                _average(filter_arx(G.a, G.b, column), stretches, row, block[j])
-            _average(excerpt.x[begin:end], stretches, row, block[-1])
-            yield block.T
-
-    return triangular_factor(rows(), k + law.size + 1)
+    for i, excerpt in enumerate(excerpts):
+        row, memory = excerpt.row, excerpt.start(r)
+        stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
+        n = excerpt.rows
+        block = np.zeros((k + law.size + 1, n))
+        block[i] = np.sqrt(row)
+        # the plays need all that came before the samples used, G only what it remembers
+        begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
+        begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
+        # lags along the path start with the excerpt
+        begin = 0 if law.lags else begin
+        stretches -= begin
+        before, u = excerpt.u[:begin], excerpt.u[begin:end]
+        memory = weighted_plays(before, r, np.zeros(r.size), 0.0, 0.0, memory)[1]
+        u = Delay(delay.samples).apply(u)
+        for j, column in enumerate(law.columns(u, memory), start=k):
+            _average(filter_arx(G.a, G.b, column), stretches, row, block[j])
+        _average(excerpt.x[begin:end], stretches, row, block[-1])
+        yield block.T
 
 
 def _law(law: HysteresisLaw | NDArray[np.float64]) -> HysteresisLaw:
     return law if isinstance(law, HysteresisLaw) else HysteresisLaw('plays', law)
 
 
-def _independent(A: NDArray[np.float64], m: int) -> NDArray[np.bool_]:
+def _independent(A: NDArray[np.float64], m: int, densities: int) -> NDArray[np.bool_]:
     """
-    Return which columns of m densities and the powers of v the data tell apart.
+    Return which columns of m plays, further densities and the powers of v the data tell apart.
 
     A voltage that only takes two levels makes every play and the cubic a multiple of v: then the
-    linear term is kept, and weights of any size cannot cancel each other.
+    linear term is kept, and weights of any size cannot cancel each other.  Further densities are
+    sums of plays by themselves; being >= 0, they cannot cancel them, only the powers.
     """
     size = A.shape[1]
     keep, basis = np.zeros(size, dtype=bool), np.empty((A.shape[0], 0))
-    for j in (*reversed(range(m, size)), *range(m)):
+    for j in (*reversed(range(densities, size)), *range(m, densities), *range(m)):
         length = np.linalg.norm(A[:, j])
         if length == 0.0:
             continue
@@ -183,7 +183,8 @@ def _independent(A: NDArray[np.float64], m: int) -> NDArray[np.bool_]:
         length = np.linalg.norm(rest)
         if length > STILL:
             keep[j] = True
-            basis = np.column_stack([basis, rest / length])
+            if not m <= j < densities:
+                basis = np.column_stack([basis, rest / length])
     return keep
 
 
@@ -214,6 +215,11 @@ class HysteresisFit:
     swarm : scipy.optimize.OptimizeResult or None
     coefficients : ndarray, shape (size,)
         Of the law.
+    law : str
+        Name of the law (`piezo_ident.operators.hysteresis_law.LAWS`).
+    errors_of_laws : mapping of str to float
+        Of each law that was tried, the error of parts of the data predicted from all others
+        (`piezo_ident.identification.step3_choice.Choice`); empty where none could be better.
     """
 
     hysteresis: Hysteresis
@@ -227,6 +233,8 @@ class HysteresisFit:
     std: NDArray[np.float64]
     swarm: OptimizeResult | None
     coefficients: NDArray[np.float64]
+    law: LawName = 'plays'
+    errors_of_laws: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def rms(self) -> float:
@@ -276,7 +284,7 @@ def fit_hysteresis(
     # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
     still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
     inner[:, :m][:, still] = 0.0
-    inner[:, :-1][:, ~_independent(inner[:, :-1], m)] = 0.0
+    inner[:, :-1][:, ~_independent(inner[:, :-1], law.thresholds.size, m)] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
     lower = law.lower
@@ -311,94 +319,5 @@ def fit_hysteresis(
         std=law.deviations(covariance),
         swarm=swarm,
         coefficients=x,
+        law=law.name,
     )
-
-
-def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
-    """
-    Return fewer thresholds in better places, from a fit on a fine grid.
-
-    On a grid finer than the truth, least squares puts a weight on the two neighbours of each true
-    threshold and zero elsewhere; each such group becomes one threshold at its centre of weight.
-
-    Examples
-    --------
-    >>> merged(Hysteresis([0.1, 0.2, 0.3, 0.4], [0.0, 0.5, 0.5, 0.0], 0.0, 1.0))
-    array([0.25])
-    """
-    r, q = hysteresis.thresholds, hysteresis.weights
-    alive = q > 1e-6 * max(float(q.max(initial=0.0)), 1e-12)
-    places = []
-    i = 0
-    while i < r.size:
-        if not alive[i]:
-            i += 1
-            continue
-        pair = slice(i, i + 2 if i + 1 < r.size and alive[i + 1] else i + 1)
-        places.append(float(r[pair] @ q[pair] / q[pair].sum()))
-        i = pair.stop
-    return np.array(places)
-
-
-def _held_loss(
-    fit: Sequence[Excerpt],
-    held: Sequence[Excerpt],
-    thresholds: NDArray[np.float64],
-    dynamics: Dynamics,
-    delay: Delay,
-) -> tuple[float, NDArray[np.float64]]:
-    n = int(sum(e.use.sum() for e in fit))
-    result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds, n)
-    h = result.hysteresis
-    R = factorise(held, h.thresholds, dynamics, delay)
-    x = np.concatenate([result.offsets, h.weights, [h.p1, h.p2]])
-    return float(np.linalg.norm(R[:, :-1] @ x - R[:, -1])), merged(h)
-
-
-def choose_thresholds(
-    fit: Sequence[Excerpt],
-    held: Sequence[Excerpt],
-    swing: float,
-    dynamics: Dynamics,
-    delay: Delay,
-    tick: Callable[[float], None] | None = None,
-) -> NDArray[np.float64]:
-    """
-    Refine the thresholds until the held-out error stops falling.
-
-    The grid grows; at each size the plays that least squares left without weight are dropped and
-    neighbours merged, and the merged set is kept where it does no worse.
-
-    Parameters
-    ----------
-    fit, held : sequence of Excerpt
-        The same runs in the same order with the fitted and the held-out samples.
-    swing : float
-        Excited range of the normalised voltage.
-    dynamics, delay
-        As in `factorise`.
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
-    """
-    best = even_thresholds(swing, COUNTS[0])
-    best_loss, places = _held_loss(fit, held, best, dynamics, delay)
-    misses = 0
-    for i, count in enumerate(COUNTS[1:]):
-        if tick is not None:
-            tick(i / len(COUNTS))
-        even = even_thresholds(swing, count)
-        loss, places = _held_loss(fit, held, even, dynamics, delay)
-        candidates = [(loss, even)]
-        if 1 < places.size < even.size:
-            candidates.append((_held_loss(fit, held, places, dynamics, delay)[0], places))
-        # the fewer thresholds win a tie
-        loss, thresholds = min(
-            candidates, key=lambda c: (c[0] * (1 + 1e-3 * c[1].size), c[1].size)
-        )
-        if loss < (1.0 - GAIN) * best_loss:
-            best, best_loss, misses = thresholds, loss, 0
-        else:
-            misses += 1
-            if misses == 2:
-                break
-    return best

@@ -39,8 +39,6 @@ from piezo_ident.identification.step2_dynamics import (
     stabilised,
 )
 from piezo_ident.identification.step3_hysteresis import (
-    choose_thresholds,
-    even_thresholds,
     factorise,
     fine_thresholds,
     fit_hysteresis,
@@ -51,10 +49,14 @@ from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
 
-__all__ = ['first_step', 'model_of', 'second_step', 'third_step', 'triangle_excerpts', 'within']
+__all__ = [
+    'first_step',
+    'model_of',
+    'second_step',
+    'triangle_excerpts',
+    'within',
+]
 
-#: plays of the paper, where the data cannot choose their number
-PAPER_COUNT = 10
 #: delays [samples] that the scan tries, and its na and nb
 MAX_DELAY, SCAN_ORDER = 30, 8
 #: orders within this share of the best held-out error count as equal; smaller ones go first
@@ -334,56 +336,6 @@ def _stretches(
                 if mask.any():
                     stretches.append(Excerpt(w, y, mask[part]))
     return fitted, held
-
-
-def third_step(
-    fit: Sequence[Excerpt],
-    held: Sequence[Excerpt],
-    G: Dynamics,
-    delay: Delay,
-    settings: Settings,
-    progress: Progress,
-    whole: Sequence[Excerpt] | None = None,
-) -> HysteresisFit:
-    """
-    Find H: its thresholds by held-out error unless their number is given, then its weights.
-
-    Parameters
-    ----------
-    fit, held : sequence of Excerpt
-        The same runs in the same order with the fitted and the held-out samples.
-    whole : sequence of Excerpt, optional
-        What the weights are fitted to in the end; `fit` when absent.
-    """
-    progress('hysteresis', 0.0)
-    fitted = whole or fit
-    swing = max(float(np.ptp(e.u[e.use])) for e in fitted)
-    n, rows = int(sum(e.use.sum() for e in fitted)), sum(e.rows for e in fitted)
-    if settings.thresholds is not None:
-        r = even_thresholds(swing, settings.thresholds)
-    elif any(e.use.any() for e in held):
-        r = choose_thresholds(
-            fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.3 * share)
-        )
-    else:
-        r = even_thresholds(swing, PAPER_COUNT)
-    R = factorise(fitted, r, G, delay)
-    progress('hysteresis', 0.3)
-    share = 0.6 / settings.swarm_iterations
-    result = fit_hysteresis(
-        R,
-        r,
-        n,
-        rows=rows,
-        solver=settings.solver,
-        polish=settings.polish,
-        rng=np.random.default_rng(settings.seed),
-        swarm_size=settings.swarm_size,
-        maxiter=settings.swarm_iterations,
-        callback=lambda swarm: progress('hysteresis', 0.3 + share * swarm.nit),
-    )
-    progress('hysteresis', 1.0)
-    return result
 
 
 def model_of(

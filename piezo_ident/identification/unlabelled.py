@@ -36,12 +36,13 @@ from piezo_ident.identification.results import (
 from piezo_ident.identification.spectra import excited_band
 from piezo_ident.identification.starts import fit_starts, lag_of
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
+from piezo_ident.identification.step3_choice import third_step
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     factorise,
     fit_hysteresis,
 )
-from piezo_ident.identification.three_steps import model_of, third_step, within
+from piezo_ident.identification.three_steps import model_of, within
 from piezo_ident.identification.warnings import warn_of_range, warn_of_zeros
 from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import DynamicsResult, Identification
+from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
@@ -23,6 +24,13 @@ HARDLY = 0.1
 SLOPE_TOLERANCE = 0.05
 #: zeros of displacement may differ by this share of the stroke before it is said
 ZERO_MOVED = 2e-3
+#: what each wider law of H has
+LAW_WORDS = {
+    'square': 'a square of the voltage',
+    'bias': 'plays whose weight goes with the voltage',
+    'preisach': 'a Preisach density that goes with the bias',
+    'duhem': 'a Preisach density that goes with the bias, and lags along the path of the voltage',
+}
 
 
 def warnings_of(
@@ -46,6 +54,17 @@ def warnings_of(
     return [*warnings, *_of_errors(result, pieces)]
 
 
+def _of_law(fit: HysteresisFit) -> list[str]:
+    """Say when the loops are no sum of plays."""
+    if fit.law == 'plays':
+        return []
+    ours, plays = (100.0 * fit.errors_of_laws[name] for name in (fit.law, 'plays'))
+    return [
+        f'the hysteresis is not a sum of plays: H has {LAW_WORDS[fit.law]}, which predicts parts '
+        f'of the data from the others to {ours:.2g} % of stroke instead of {plays:.2g} %'
+    ]
+
+
 def _of_fit(result: Identification) -> list[str]:
     delay, dynamics, fit = result.delay, result.dynamics, result.hysteresis
     warnings = []
@@ -62,6 +81,7 @@ def _of_fit(result: Identification) -> list[str]:
         )
     if result.noise_floor is not None and result.noise_floor > 1.0:
         warnings.append(f'the sensor noise is {result.noise_floor:.2g} % of stroke')
+    warnings += _of_law(fit)
     if fit.swarm is not None and fit.swarm_loss is not None:
         excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0 else 0.0
         if excess > 0.01:

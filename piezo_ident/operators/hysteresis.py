@@ -157,9 +157,8 @@ class Hysteresis:
                 raise ModelError(f'hysteresis: {name} must be finite numbers')
             object.__setattr__(self, name, values)
         places = np.linspace(0.0, 1.0, 33)
-        least = np.min(
-            [self.rise(low + s * self._wide[4], low + s * (high - low)) for s in places]
-        )
+        rises = [self.rise(low + s * self._wide[4], low + s * (high - low)) for s in places]
+        least = float(np.min(rises, initial=0.0))
         if least < -ROUNDING * max(1.0, float(q.max(initial=0.0))):
             raise ModelError(
                 'hysteresis: curves and bias must not make the weight of a play negative'

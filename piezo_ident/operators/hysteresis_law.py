@@ -6,12 +6,14 @@ Families of H that are linear in their coefficients, for given thresholds.
 
     plays      q_i F_i,  v^3,  v                                  the paper's law, eqs. (3) and (6)
     square     and v^2
-    bias       and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
-    preisach   and hat_j(r_i) times Bernstein polynomials in F_i as densities
-    duhem      and lags of v, v^2 and v^3 along the path of v, at a few rates
+    bias       square, and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
+    preisach   square, and hat_j(r_i) times Bernstein polynomials in F_i as densities
+    duhem      preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates
+    static     the terms of all but duhem, from which theirs can be taken
+    any        all of these terms
 
-hat_j are piecewise linear functions of the threshold on a few even nodes.  All but the powers of v
-have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  The last one is a
+hat_j are piecewise linear functions of the threshold on a few even nodes.  All but lags and powers
+of v have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  `preisach` is a
 Preisach operator with a density that is smooth along the bias and free along the threshold:
 Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
 doi:10.1007/978-1-4612-4048-8.
@@ -35,8 +37,8 @@ from scipy.optimize import lsq_linear
 
 __all__ = ['LAWS', 'HysteresisLaw', 'LawName']
 
-LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem']
-#: from the narrowest to the widest
+LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'static', 'any']
+#: those that a stage may have, from the narrowest to the widest
 LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach', 'duhem')
 #: nodes of the hats over the threshold, and degree of the density in the place of a play
 NODES, DEGREE = 5, 3
@@ -51,7 +53,7 @@ class HysteresisLaw:
 
     Parameters
     ----------
-    name : {'plays', 'square', 'bias', 'preisach', 'duhem'}
+    name : {'plays', 'square', 'bias', 'preisach', 'duhem', 'static', 'any'}
     thresholds : array_like, shape (m,)
         Ascending, above zero, normalised.
     span : tuple of float, optional
@@ -76,7 +78,7 @@ class HysteresisLaw:
     span: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if self.name not in LAWS:
+        if self.name not in (*LAWS, 'static', 'any'):
             raise ModelError(f'hysteresis: unknown law {self.name!r}; known are {", ".join(LAWS)}')
         object.__setattr__(self, 'thresholds', frozen_array(self.thresholds))
 
@@ -88,7 +90,7 @@ class HysteresisLaw:
     @property
     def lags(self) -> int:
         """Number of the coefficients of lags along the path."""
-        return 3 * len(RATES) if self.name == 'duhem' else 0
+        return 3 * len(RATES) if self.name in ('duhem', 'any') else 0
 
     @property
     def size(self) -> int:
@@ -113,13 +115,12 @@ class HysteresisLaw:
         plays[:, 0] = np.eye(m)
         more: list[NDArray[np.float64]] = []
         low, high = self.span
-        for hat in self._hats() if self.name not in ('plays', 'square') else ():
-            if self.name == 'bias':
-                for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
-                    part = np.zeros((POWERS + 2, m))
-                    part[0], part[-1] = q * hat, kappa * hat
-                    more.append(part)
-                continue
+        for hat in self._hats() if self.name in ('bias', 'static', 'any') else ():
+            for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
+                part = np.zeros((POWERS + 2, m))
+                part[0], part[-1] = q * hat, kappa * hat
+                more.append(part)
+        for hat in self._hats() if self.name in ('preisach', 'duhem', 'static', 'any') else ():
             width = np.maximum(high - low - self.thresholds, 0.0)
             for density in _bernstein():
                 part = np.zeros((POWERS + 2, m))
@@ -140,6 +141,7 @@ class HysteresisLaw:
         """Give piecewise linear functions of the threshold, as shares of a density; shape (m,)."""
         r = self.thresholds
         if not r.size:
+            yield from [r] * NODES
             return
         middles = 0.5 * (r[1:] + r[:-1])
         width = np.diff(np.concatenate([[0.0], middles, [r[-1]]]))
@@ -162,7 +164,7 @@ class HysteresisLaw:
         n = (POWERS + 2) * thresholds.size
         plays, (p0, p1, p2) = x[:n].reshape(POWERS + 2, -1), x[n : n + 3]
         lags = None
-        if self.name == 'duhem':
+        if self.lags:
             rates = np.array(RATES) / (self.span[1] - self.span[0])
             lags = np.column_stack([rates, x[n + 3 :].reshape(-1, 3)])
         return Hysteresis(
@@ -171,8 +173,8 @@ class HysteresisLaw:
             float(p1),
             float(p2),
             float(p0),
-            curves=plays[1:-1].T if self.name in ('preisach', 'duhem') else None,
-            bias=plays[-1] if self.name == 'bias' else None,
+            curves=plays[1:-1].T if self.name in ('preisach', 'duhem', 'static', 'any') else None,
+            bias=plays[-1] if self.name in ('bias', 'static', 'any') else None,
             span=self.span,
             relaxations=lags,
         )
@@ -218,8 +220,8 @@ class HysteresisLaw:
                 plays[0, moved],
                 0.0,
                 0.0,
-                curves=None if self.name == 'bias' else plays[1:-1, moved].T,
-                bias=plays[-1, moved] if self.name == 'bias' else None,
+                curves=plays[1:-1, moved].T if plays[1:-1].any() else None,
+                bias=plays[-1, moved] if plays[-1].any() else None,
                 span=self.span,
             )
             yield part(v, None if start is None else start[moved])
@@ -231,6 +233,20 @@ class HysteresisLaw:
             yield v**2
         yield v**3
         yield v
+
+    def within(self, wider: HysteresisLaw) -> NDArray[np.int64]:
+        """
+        Return the places of the coefficients among those of a wider law, shape (size,).
+
+        The wider one is `any`, or `static`, of the same thresholds.
+        """
+        m, n = self.thresholds.size, wider.densities
+        middle = m + 2 * NODES
+        inner = {'bias': (m, middle), 'preisach': (middle, n), 'duhem': (middle, n)}
+        start, stop = inner.get(self.name, (m, n if self.name in ('any', 'static') else m))
+        powers = range(wider.size - (2 if self.name == 'plays' else 3), wider.size)
+        lags = range(n, n + self.lags)
+        return np.array([*range(m), *range(start, stop), *lags, *powers])
 
     def coefficients(self, hysteresis: Hysteresis) -> NDArray[np.float64]:
         """

@@ -52,10 +52,7 @@ def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
     """Return how a refined model differs from the one that it came from; empty if not at all."""
     texts = []
     # a play without weight is none
-    old, new = (
-        np.concatenate([h.thresholds[h.weights > 0.0], h.weights[h.weights > 0.0], [h.p1, h.p2]])
-        for h in (given.hysteresis, refined.hysteresis)
-    )
+    old, new = (m.hysteresis.without_idle().numbers for m in (given, refined))
     if not np.array_equal(old, new):
         texts.append('H refitted')
     if given.scaling != refined.scaling:

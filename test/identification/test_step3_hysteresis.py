@@ -9,13 +9,12 @@ from paper_stage import A, B
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.signals import triangle
 from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.step3_choice import choose_thresholds, merged
 from piezo_ident.identification.step3_hysteresis import (
-    choose_thresholds,
     even_thresholds,
     factorise,
     fine_thresholds,
     fit_hysteresis,
-    merged,
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis

@@ -140,6 +140,16 @@ def test_law_refuses_other_names_and_foreign_h():
         HysteresisLaw('preisach', R[1:]).coefficients(h)
 
 
+@pytest.mark.parametrize('wider', ['static', 'any'])
+@pytest.mark.parametrize('name', [*LAWS, 'static', 'any'])
+def test_columns_of_a_law_are_among_those_of_a_wider_one(name, wider):
+    if wider == 'static' and name in ('duhem', 'any'):
+        return
+    law, whole, u = HysteresisLaw(name, R[::3]), HysteresisLaw(wider, R[::3]), path()[:400]
+    columns = np.array(list(whole.columns(u)))
+    assert_array_equal(columns[law.within(whole)], np.array(list(law.columns(u))))
+
+
 def test_idle_plays_are_left_out_without_a_change():
     for name in LAWS:
         law, theta, _ = law_and_h(name)
