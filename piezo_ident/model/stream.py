@@ -39,9 +39,7 @@ class Stream:
         self._started = False
         self._cascade: _Cascade | None = None
         match self._chain.operators:
-            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z) if (
-                model.hysteresis.relaxations is None
-            ):
+            case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z):
                 self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:
@@ -148,7 +146,9 @@ class _Cascade:
         self._H, self._G, self._delay = H, G, z.delay
         self._w, self._y = np.empty(past_w + room), np.empty(past_y + room)
         self._scale = np.array([s.v0, s.V, s.y0, s.Y])
-        self._hysteresis = model.hysteresis.for_kernel
+        h = model.hysteresis
+        lags = np.empty((0, 4)) if h.relaxations is None else np.array(h.relaxations)
+        self._hysteresis = (*h.for_kernel, lags)
 
     def reset(self, u0: float) -> float:
         """Come to rest and return the displacement there [m]."""

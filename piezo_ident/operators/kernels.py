@@ -139,14 +139,17 @@ def relaxing(
     for k in range(v.size):
         u = float(v[k])
         length = abs(u - last)
-        total = 0.0
+        total, before, left = 0.0, 0.0, 0.0
         for j in range(n):
             a, d1, d2, d3 = x[j, 0], x[j, 1], x[j, 2], x[j, 3]
             if length > 0.0:
+                # of twice the rate the square is left; an exponential takes ten times as long
+                left = left * left if a == 2.0 * before else np.exp(-a * length)
+                before = a
                 # a line's own answer, in the place of phi: phi - phi' s/a + phi'' (s/a)^2 - ...
                 b = 1.0 / a if u > last else -1.0 / a
                 new = _line(u, b, d1, d2, d3)
-                state[j] = new + (state[j] - _line(last, b, d1, d2, d3)) * np.exp(-a * length)
+                state[j] = new + (state[j] - _line(last, b, d1, d2, d3)) * left
             total += state[j] - u * (d1 + u * (d2 + u * d3))
         last = u
         out[k] += total
@@ -244,6 +247,7 @@ def cascade(
     p0: float,
     low: float,
     c: NDArray[np.float64],
+    lags: NDArray[np.float64],
     memory: NDArray[np.float64],
     b: NDArray[np.float64],
     a: NDArray[np.float64],
@@ -262,8 +266,10 @@ def cascade(
         [V] and [m].
     scale : ndarray, shape (4,)
         v0, V, y0 and Y.
-    r, q, p1, p2, p0, low, c, memory
-        As in `wide_hysteresis`; without rows of c, as in `hysteresis`.
+    r, q, p1, p2, p0, low, c, lags
+        As in `wide_hysteresis` and `relaxing`; without rows of c, as in `hysteresis`.
+    memory : ndarray
+        Of the plays, shape (m,), and behind it that of the lags.
     b, a
         As in `dynamics`.
     w : ndarray, shape (nb - 1 + k,)
@@ -283,9 +289,13 @@ def cascade(
         for k in range(n):
             new[k] = (v[start + k] - v0) / V
         if c.shape[0] == 0:
-            hysteresis(new, r, q, p1, p2, memory, w[past_w : past_w + n])
+            hysteresis(new, r, q, p1, p2, memory[: r.size], w[past_w : past_w + n])
         else:
-            wide_hysteresis(new, r, q, p1, p2, p0, low, c, memory, w[past_w : past_w + n])
+            wide_hysteresis(
+                new, r, q, p1, p2, p0, low, c, memory[: r.size], w[past_w : past_w + n]
+            )
+        if lags.shape[0]:
+            relaxing(new, lags, memory[r.size :], w[past_w : past_w + n])
         dynamics(w[: past_w + n], b, a, y[past_y - a.size : past_y + n])
         now, before = y[past_y - d :], y[past_y - d - 1 :]
         for k in range(n):
