@@ -56,8 +56,6 @@ FINE, PARTS = 40, 8
 #: Wen and of Duhem wrong laws lowered it by up to 17 %, on Preisach loops the right one by 60 to
 #: 95 %
 WORTH = 0.25
-#: a simpler law wins among the wider ones where it errs by no more than this share above the best
-NEAR = 0.1
 
 
 def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
@@ -224,19 +222,13 @@ def choose_law(
         return Choice(None, errors)
     best = min(better, key=errors.__getitem__)
     chosen = next(
-        name
-        for name in better
-        if np.mean(logs[name] - logs[best]) <= min(NEAR, _spread(logs[name] - logs[best]))
+        name for name in better if np.mean(logs[best] - logs[name]) >= np.log(1.0 - WORTH)
     )
     return Choice(law_of[chosen], errors)
 
 
-def _spread(difference: NDArray[np.float64]) -> float:
-    return float(difference.std(ddof=1) / np.sqrt(difference.size))
-
-
 def _upper(difference: NDArray[np.float64]) -> float:
-    return float(difference.mean()) + _spread(difference)
+    return float(difference.mean() + difference.std(ddof=1) / np.sqrt(difference.size))
 
 
 def _parts(

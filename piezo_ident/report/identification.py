@@ -215,6 +215,24 @@ def hysteresis_tables(result: Identification) -> list[Table]:
     ]
     for name, value, e in (('p1', h.p1, std[m]), ('p2', h.p2, std[m + 1])):
         rows.append((name, '', '', number(value, 4), number(e, 2), number(value / PAPER_GAIN, 4)))
+    if h.p0 != 0.0:
+        rows.append(('p0', '', '', number(h.p0, 4), '', number(h.p0 / PAPER_GAIN, 4)))
+    laws = [
+        (f'{name}, chosen' if name == fit.law else name, number(100.0 * error, 3))
+        for name, error in fit.errors_of_laws.items()
+    ]
+    compared = table(
+        'Laws of H compared',
+        ('law', 'error of parts / % of stroke'),
+        laws,
+        'Geometric mean over parts of the data, each predicted from the others. A wider law than '
+        'plays has to err by a quarter less.'
+        + (
+            ''
+            if fit.law == 'plays'
+            else ' The weights above are then those at the lowest voltage.'
+        ),
+    )
     solvers = [('bounded least squares (optimum)', number(fit.optimum_loss, 5), '', '')]
     if fit.swarm_loss is not None and fit.swarm is not None:
         excess = fit.swarm_loss / fit.optimum_loss - 1.0 if fit.optimum_loss > 0.0 else 0.0
@@ -238,6 +256,7 @@ def hysteresis_tables(result: Identification) -> list[Table]:
             f'Normalised, over {fit.n} samples; rms '
             f'{number(percent(fit.rms, result.stroke / abs(s.Y)))} % of stroke.',
         ),
+        *compared,
     ]
 
 
