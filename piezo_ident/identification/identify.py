@@ -38,7 +38,7 @@ from piezo_ident.identification.results import (
 )
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
-from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step, TRIANGLE_LAWS
+from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step
 from piezo_ident.identification.three_steps import (
     first_step,
     model_of,
@@ -173,7 +173,7 @@ def _labelled(
     # the same with what is known of the lag by now
     runs = with_starts(unstarted, lag_of(G, delay))
     fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-    hysteresis = third_step(fit, held, G, delay, settings, progress, laws=TRIANGLE_LAWS)
+    hysteresis = third_step(fit, held, G, delay, settings, progress)
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
     if settings.thresholds is None and not any(e.use.any() for e in held):

@@ -33,7 +33,6 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
 __all__ = [
     'PAPER_COUNT',
-    'TRIANGLE_LAWS',
     'Choice',
     'choose_law',
     'choose_thresholds',
@@ -43,9 +42,6 @@ __all__ = [
 
 #: plays of the paper, where the data cannot choose their number
 PAPER_COUNT = 10
-#: what a triangle from the lowest voltage can tell; how H forgets along its path it cannot: laws
-#: that do so followed the triangle ten times as closely, and erred more on anything else
-TRIANGLE_LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach')
 #: numbers of evenly spaced thresholds that are tried, one after the other
 COUNTS = (10, 14, 20, 28, 40, 56, 80)
 #: a larger number must lower the held-out error by this share

@@ -50,6 +50,8 @@ Solver = Literal['least_squares', 'swarm']
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
 #: a play that moves less than this share of what it is cannot be told from the offset
 STILL = 1e-8
+#: pull of lags along the path to zero, as a share of the size of the linear term
+PULL = 0.01
 #: what may be left of the start of G where the samples used begin
 FORGOTTEN = 1e-13
 
@@ -288,7 +290,13 @@ def fit_hysteresis(
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
     lower = law.lower
-    x, optimum = bounded_least_squares(inner, lower, np.full(law.size, np.inf))
+    # lags of neighbouring rates can be large and cancel each other where they are fitted alone
+    pull = np.zeros((law.lags, inner.shape[1]))
+    pull[:, m : m + law.lags] = PULL * np.linalg.norm(inner[:, -2]) * np.eye(law.lags)
+    pulled = np.asarray(np.linalg.qr(np.vstack([inner, pull]), mode='r')) if law.lags else inner
+    x, optimum = bounded_least_squares(pulled, lower, np.full(law.size, np.inf))
+    if law.lags:
+        optimum = float(np.sum((inner[:, :-1] @ x - inner[:, -1]) ** 2))
     x[np.linalg.norm(inner[:, :-1], axis=0) == 0.0] = 0.0
     swarm, swarm_loss = None, None
     if solver == 'swarm':

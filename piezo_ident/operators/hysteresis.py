@@ -295,11 +295,18 @@ class Hysteresis:
         return self.follow(x, start)[0]
 
     def settled(self, v0: float) -> NDArray[np.float64]:
-        """Return the lags along the path of a stage that rests in the middle of its loop at v0."""
+        """
+        Return the lags along the path of a stage that was swept, came down, and went to `v0`.
+
+        The sweeps are those over the span; the plays of `initial_memory` last came down, too.
+        """
         if self.relaxations is None:
             return np.empty(0)
-        phi = self.relaxations[:, 1:] @ np.array([v0, v0 * v0, v0**3])
-        return np.append(phi, v0)
+        low, high = self.span
+        phi = self.relaxations[:, 1:] @ np.array([low, low * low, low**3])
+        lags, way = np.append(phi, low), np.array([high, low, high, low, v0])
+        relaxing(way, np.array(self.relaxations), lags, np.zeros(way.size))
+        return lags
 
     def follow(
         self, v: NDArray[np.float64], memory: NDArray[np.float64]

@@ -228,7 +228,8 @@ class HysteresisLaw:
         for k in range(self.lags):
             rate = RATES[k // 3] / (self.span[1] - self.span[0])
             lag = np.append(rate, np.eye(3)[k % 3])[None]
-            yield Hysteresis(np.empty(0), np.empty(0), 0.0, 0.0, relaxations=lag)(v)
+            none = np.empty(0)
+            yield Hysteresis(none, none, 0.0, 0.0, span=self.span, relaxations=lag)(v)
         if self.name != 'plays':
             yield v**2
         yield v**3
