@@ -47,6 +47,7 @@ class AmplifierLag(Effect):
 
     name = 'amplifier_lag'
     slot = 'input'
+    in_dynamics = True
     description = 'RC lag of amplifier and piezo before the hysteresis; corner at 0.5 .. 10 kHz'
     needs = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
     parameters = (

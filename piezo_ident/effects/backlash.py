@@ -45,6 +45,7 @@ class Backlash(Effect):
 
     name = 'backlash'
     slot = 'output'
+    rate_independent = True
     description = 'lost motion after each turn of the displacement; 0.1 .. 2 % of stroke'
     needs = 'sweeps with turns, both slow and near the first resonance'
     parameters = (

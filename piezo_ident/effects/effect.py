@@ -132,6 +132,11 @@ class Effect:
     time_driven : bool
         Whether it depends on time alone and not on the command: then its amplitudes differ from
         record to record.
+    rate_independent : bool
+        Whether it follows the path of the command alone, however fast: then a wide enough H
+        imitates it.
+    in_dynamics : bool
+        Whether it is linear: had it been there at the identification, G would hold it.
     in_delay_line : bool
         Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
@@ -159,6 +164,8 @@ class Effect:
     description: ClassVar[str] = ''
     needs: ClassVar[str] = ''
     time_driven: ClassVar[bool] = False
+    rate_independent: ClassVar[bool] = False
+    in_dynamics: ClassVar[bool] = False
     in_delay_line: ClassVar[bool] = False
 
     def __init__(

@@ -60,6 +60,7 @@ class Saturation(Effect):
 
     name = 'saturation'
     slot = 'input'
+    rate_independent = True
     description = (
         'the amplifier goes flat at the ends of its range; nothing elsewhere, large there'
     )

@@ -31,6 +31,7 @@ class SensorNonlinearity(Effect):
 
     name = 'sensor_nonlinearity'
     slot = 'output'
+    rate_independent = True
     description = (
         'a curved characteristic of the sensor; strain gauge 0.1 .. 1 %, capacitive 0.01 .. 0.1 %'
     )
