@@ -21,6 +21,12 @@ from __future__ import annotations
 SMALLEST_EFFECT = 0.05
 #: size of a difference that means nothing: no weights of H describe a stage to better than that
 INDISTINCT = 0.01
+#: gain [% of stroke, rms] of a refit of H that is a finding: ten plays describe a smooth
+#: hysteresis to about 0.15
+REFIT_FINDING = 0.2
+#: share of what plays leave and a wider H does not, below which no effect is named: the wider H
+#: misses about as much of a hysteresis that is not of its kind
+OF_MISFIT = 0.15
 #: share from which a law fits; real effects deviate from their law by a little
 LAW_FITS = 0.99
 #: ratio of what is left by which a law that fits rules out a simpler one that fits, too: further
@@ -48,6 +54,8 @@ STANDARD_ERRORS = 2.0
 #: share of a candidate's columns outside the span of the base below which it is not testable:
 #: its amplitude is then known a hundred times less well
 SWALLOWED = 1e-4
+#: factor of an effect where it alone acts, as fitted to all data: 1 is exact
+SHOWS = (0.5, 2.0)
 #: share of the variance beyond which the displacement does not follow the voltage
 UNRELATED = 0.99
 #: share of samples with a fault up to which they are left out; beyond it little else is there
@@ -61,8 +69,10 @@ NAMED, ADDED = 0.92, 0.5
 FURTHER = 0.6
 #: least gain of an effect, share
 LEAST_GAIN = 0.10
-#: factor by which an effect may raise the rms of any kind of excitation
-HARM = 1.25
+#: a wider law of H must leave less than this of the rms on held-out kinds of excitation
+WIDER = 0.9
+#: share of the gain of an effect that it may cost at kinds of excitation where the error grows
+HARM = 0.1
 #: a rival that leaves less than this times what the best leaves is not separated from it
 AHEAD = 1.6
 #: a rival with more parameters must leave less than this times what a law that fits leaves
@@ -84,7 +94,9 @@ STARTS, FIRST, FINAL = 2, 3, 2
 POLISHING, POLISH = 6, 0.02
 #: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
 TUNED = 0.05
+#: mean error of a record, in units of the rms of the rest, from which a sensor's zero has moved
+MOVED_ZERO = 3.0
 #: factor by which a refit of H may raise the rms of a kind of excitation that was held out
 REFIT_HARM = 1.05
-#: gain in rms from which a refit of H alone is kept, and the same if structure is unexplained
-WORTH_REFIT, WORTH_REFIT_IN_DOUBT = 0.05, 0.5
+#: gain in rms from which a refit of H alone is kept
+WORTH_REFIT = 0.05

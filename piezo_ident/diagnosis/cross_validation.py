@@ -127,19 +127,22 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
     return np.maximum(errors, 0.0)
 
 
-def held_out_residual(rows: Rows, M: Array, e: Array, prior: Array) -> Array:
+def held_out_residual(
+    rows: Rows, M: Array, e: Array, prior: Array, sets: NDArray[np.int64]
+) -> Array:
     """
     Return the residual of every row, predicted with parameters fitted to other blocks.
 
-    M are the derivatives of the prediction and e is the residual of the fit to all rows.  Near the
+    M are the derivatives of the prediction and e is the residual of the fit to all rows; blocks of
+    one number in `sets`, shape (blocks,), are left out together.  Near the
     optimum the model is linear in its parameters, so leaving a set of blocks out moves them by one
     Gauss-Newton step.
     """
     equations = normal_equations(rows, M, e[:, None])
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
     left = e.copy()
-    for one in np.unique(rows.fold):
-        out = rows.fold == one
+    for one in np.unique(sets):
+        out = sets == one
         if out.all():
             continue
         theta = solve(A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior)

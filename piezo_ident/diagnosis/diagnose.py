@@ -14,24 +14,21 @@ From a model and measured data to the effect that the model lacks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.base_refit import effects_beside, hidden_by, refits
+from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.forward_selection import (
     ForwardSelection,
     Selected,
     smallest_detectable,
 )
-from piezo_ident.diagnosis.joint_fit import (
-    base_thresholds,
-    fit_base,
-    fit_jointly,
-    Fitted,
-    standard_deviations,
-)
+from piezo_ident.diagnosis.joint_fit import Fitted, standard_deviations
 from piezo_ident.diagnosis.messages import left_over, part_searched, sentence, warnings_of
 from piezo_ident.diagnosis.refined_model import refine, Refined
 from piezo_ident.diagnosis.results import (
@@ -43,19 +40,22 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.verdict import candidates_of, judge, untestable_of
+from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, untestable_of
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record, records_of
 from piezo_ident.residual import (
     all_stretches,
+    channel_tests,
+    ChannelTest,
     find_faults,
     find_lines,
     LineSearch,
     NoiseFloor,
     residual_noise_floor,
     ResidualPart,
+    without_channels,
     without_lines,
 )
 
@@ -187,18 +187,37 @@ def _diagnosed(
         rows = make_rows(model, records, few)
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    # 2. the base model refitted
-    base = _base(simulator, given)
+    # 2. the base model refitted, as plays and as the widest law
+    # a sensor may have been set to zero again since: an offset of each record is no error
+    shifts = _means(rows, rows.x - simulator.run(given))
+    given = replace(given, offsets=shifts)
+    plays, wide = refits(simulator, given)
+    _check_related(rows, plays)
     # 3. lines and noise of what it leaves
-    lines, floor = _lines_and_floor(simulator, base.state)
+    channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = _noise(floor, faults.quantum, rows.m, abs(model.scaling.Y))
     progress('residual', 1.0)
     # 4. effects, one after another
     frequencies = [line.frequency for line in lines.lines]
-    selected = ForwardSelection(simulator, frequencies, noise, settings, progress).run(base)
+    shown = [HUM] * bool(frequencies)
+    shown += ['cross_coupling'] * any(test.significant for test in channels)
+    misfit = rows.percent(plays.mean_square - wide.mean_square)
+    search = ForwardSelection(
+        simulator,
+        frequencies,
+        noise,
+        settings,
+        progress,
+        certain=shown,
+        smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * misfit),
+        missed=_missed(model),
+    )
+    base, selected = effects_beside(simulator, search, plays, wide)
     # 5. the verdict, and what holds
     progress('verdict', 0.0)
     findings = judge(rows, base, selected, noise)
+    if not findings.effects:
+        findings = _with_refit(simulator, given, findings, selected, noise)
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
@@ -206,7 +225,7 @@ def _diagnosed(
         for e in (
             rows.x - simulator.run(given),
             base.held_out_residual(rows),
-            selected.fitted.held_out_residual(rows),
+            selected.fitted.held_out_residual(rows, rows.group),
         )
     )
     refined = refine(simulator, given, base, selected.fitted, findings, before, refit)
@@ -249,6 +268,32 @@ def _diagnosed(
     )
 
 
+def _missed(model: StageModel) -> float:
+    """Return the error of the model where it was identified, % of stroke; 0 where unknown."""
+    errors = model.identification.get('errors')
+    known = errors.values() if isinstance(errors, Mapping) else ()
+    return max((float(x) for x in known if isinstance(x, int | float)), default=0.0)
+
+
+def _means(rows: Rows, e: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean of each record."""
+    return np.bincount(rows.of_record, e) / np.bincount(rows.of_record)
+
+
+def _with_refit(
+    simulator: Simulator, given: State, findings: Findings, selected: Selected, noise: float
+) -> Findings:
+    """Return the finding that a refit of H alone brought what there was to gain, where it did."""
+    rows, refit = simulator.rows, selected.fitted
+    e = rows.x - simulator.run(given)
+    gain = float(np.mean(e * e)) - refit.mean_square
+    if rows.percent(gain) < criteria.REFIT_FINDING or gain < refit.mean_square - noise:
+        return findings
+    if not refit_holds(rows, e, refit.transfer):
+        return findings
+    return findings.refitted(hidden_by(simulator, given, refit, selected.imitated))
+
+
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
     """Return the residual of each run [m]; `whole` with what the unknown start still touches."""
     Y = simulator.model.scaling.Y
@@ -258,24 +303,19 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
     ]
 
 
-def _base(simulator: Simulator, given: State) -> Fitted:
-    """Return the base model refitted on a fine grid of thresholds."""
-    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
-    if swing == 0.0:
-        raise IdentificationError('the voltage never moves; record the stage while it is driven')
-    base = fit_jointly(simulator, *fit_base(simulator, given, base_thresholds(swing)))
-    _check_related(simulator.rows, base)
-    return base
-
-
-def _lines_and_floor(simulator: Simulator, state: State) -> tuple[LineSearch, NoiseFloor]:
-    """Return the lines in the residual of a state, and the noise floor without them."""
+def _beside_the_drive(
+    simulator: Simulator, state: State
+) -> tuple[tuple[ChannelTest, ...], LineSearch, NoiseFloor]:
+    """Return what further channels and lines a state's residual holds, and the noise without."""
     parts = _parts(simulator, state)
+    channels = channel_tests(parts)
+    # another axis that moves in sines leaves lines, too
+    parts = without_channels(parts, channels)
     found = find_lines(parts, all_stretches(parts))
     # hum is no noise: it can be explained
     resting = _parts(simulator, state, whole=True)
     quiet = [without_lines(part, found.lines) for part in resting]
-    return found, residual_noise_floor(quiet, all_stretches(resting))
+    return channels, found, residual_noise_floor(quiet, all_stretches(resting))
 
 
 def _noise(floor: NoiseFloor, quantum: float, m: int, span: float) -> tuple[float, float | None]:

@@ -22,11 +22,15 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round, score_trials, search_round, started
+from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import RETUNING, Simulator
-from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
-__all__ = ['ForwardSelection', 'Selected', 'smallest_detectable', 'takes']
+__all__ = ['TESTED', 'ForwardSelection', 'Selected', 'smallest_detectable', 'takes']
+
+#: effects that have a test of their own, by lines and by coherence with a further channel
+TESTED = ('periodic_disturbance', 'cross_coupling')
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,8 @@ class Selected:
         What an effect that bent G would leave, where a linear change was preferred.
     left_out : frozenset of str
         Effects that were not tried.
+    imitated : Round or None
+        Effects that follow the path of the command alone, beside plays.
     """
 
     rounds: tuple[Round, ...]
@@ -51,10 +57,17 @@ class Selected:
     fitted: Fitted
     bent: Round | None
     left_out: frozenset[str]
+    imitated: Round | None = None
 
 
 class ForwardSelection:
-    """Effects are added one after another as long as held-out data gain."""
+    """
+    Effects are added one after another as long as held-out data gain.
+
+    `certain` are effects that a test of their own has shown, whatever they explain of the rest;
+    `smallest` is the rms of the smallest other effect that is taken, and `missed` what the model
+    missed when it was identified, % of stroke: no change of the dynamics since is smaller.
+    """
 
     def __init__(
         self,
@@ -63,10 +76,17 @@ class ForwardSelection:
         noise: float,
         settings: DiagnosisSettings,
         progress: Progress,
+        *,
+        certain: Sequence[str] = (),
+        smallest: float = criteria.SMALLEST_EFFECT,
+        missed: float = 0.0,
     ) -> None:
         self._simulator = simulator
         self._lines = lines
         self._noise = noise
+        self._smallest = smallest
+        self._missed = missed
+        self._certain = certain
         self._most = settings.most_effects
         self._progress = progress
         self._rng = np.random.default_rng(settings.seed)
@@ -76,33 +96,83 @@ class ForwardSelection:
         self._count = 0
 
     def run(self, base: Fitted) -> Selected:
-        """Select, from the base model refitted; where nothing is taken the base is the fit."""
-        self._base = base
-        state = replace(base.state, retuning=(0.0,) * len(RETUNING))
-        retuned = fit_jointly(self._simulator, state, base.base)
+        """
+        Select what no H imitates, from the widest base; without any, the base is the fit.
+
+        What follows the path of the command alone is left to `beside`.
+        """
+        size = self._simulator.rows.percent(self._beyond_noise(base))
+        self._allowed = [
+            effect
+            for effect in self._candidates
+            if not effect.rate_independent
+            and effect.name not in TESTED
+            and not (effect.in_dynamics and size < self._missed)
+        ]
+        shown = list[Round]()
+        self._base, retuned = base, self._retuned(base)
+        for name in self._certain:
+            this = self._round(retuned, [e for e in self._candidates if e.name == name])
+            if this.contenders:
+                shown.append(this)
+                retuned = this.contenders[0]
+        if shown:
+            state = replace(retuned.state, retuning=())
+            base = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
-        if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
-            return self._from(retuned, self._round(retuned))
+        gain = base.mean_square - retuned.mean_square
+        if gain < criteria.LINEAR * explainable or size < self._missed:
+            return self._from(retuned, self._round(retuned), shown)
         # a linear change is the larger part: is it the whole of it?
         linear, bent = self._round(base), None
         if self._left(linear) > self._least:
             bent = self._round(retuned)
         if bent is not None and self._takes(bent, self._beyond_noise(bent.before), first=True):
             if self._left(bent) < criteria.BENT * self._left(linear):
-                return self._from(retuned, bent)
-            return self._from(base, linear, bent)
-        return self._from(base, linear)
+                return self._from(retuned, bent, shown)
+            return self._from(base, linear, shown, bent)
+        return self._from(base, linear, shown)
+
+    def beside(self, plays: Fitted, wide: Fitted, found: Selected) -> Selected:
+        """
+        Select one effect that follows the path of the command alone, beside what was found.
+
+        A wide H imitates it.  So it has to be nearly all that is left beside a sum of plays, and
+        to leave as little as the wide H does without it (`wide`).
+        """
+        self._allowed = [effect for effect in self._candidates if effect.rate_independent]
+        # G was identified with the effect, and may be bent by it
+        plays, wide = (self._retuned(fitted) for fitted in (plays, wide))
+        left = self._beyond_noise(plays)
+        if left < self._least or len(found.taken) == self._most:
+            return found
+        this = self._round(plays)
+        found = replace(found, rounds=(*found.rounds, this), imitated=this)
+        floor = (criteria.INDISTINCT * self._simulator.rows.stroke / 100.0) ** 2
+        allowed = min(
+            criteria.AHEAD * self._beyond_noise(wide) + floor, (1.0 - criteria.NAMED) * left
+        )
+        if not self._takes(this, left, first=True) or self._left(this) > allowed:
+            return found
+        return replace(found, taken=(*found.taken, this), fitted=this.contenders[0])
+
+    def _retuned(self, fitted: Fitted) -> Fitted:
+        """Return a fit with G retuned, too."""
+        if fitted.state.retuning:
+            return fitted
+        state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
+        return fit_jointly(self._simulator, state, fitted.base)
 
     def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
         rows = self._simulator.rows
         return rows.passes >= criteria.PASSES and takes(
-            rows, this, self._noise, explainable, first=first
+            rows, this, self._noise, explainable, self._smallest, first=first
         )
 
     @property
     def _least(self) -> float:
         """Mean square of the smallest effect."""
-        return (criteria.SMALLEST_EFFECT * self._simulator.rows.stroke / 100.0) ** 2
+        return (self._smallest * self._simulator.rows.stroke / 100.0) ** 2
 
     def _beyond_noise(self, fitted: Fitted) -> float:
         return max(fitted.mean_square - self._noise, 0.0)
@@ -110,9 +180,10 @@ class ForwardSelection:
     def _left(self, this: Round) -> float:
         return self._beyond_noise(this.contenders[0] if this.contenders else this.before)
 
-    def _round(self, fitted: Fitted) -> Round:
+    def _round(self, fitted: Fitted, effects: Sequence[type[Effect]] | None = None) -> Round:
         have = self._have | {added.name for added in fitted.state.effects}
-        candidates = [effect for effect in self._candidates if effect.name not in have]
+        chosen = self._allowed if effects is None else effects
+        candidates = [effect for effect in chosen if effect.name not in have]
         done = self._count
         self._count += 1
 
@@ -120,17 +191,27 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        return search_round(
+        this = search_round(
             self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
         )
+        shown = tuple(c for c in this.contenders if shows(self._simulator, c, self._noise))
+        return replace(this, contenders=shown)
 
-    def _from(self, start: Fitted, first: Round, bent: Round | None = None) -> Selected:
+    def _from(
+        self,
+        start: Fitted,
+        first: Round,
+        shown: Sequence[Round],
+        bent: Round | None = None,
+    ) -> Selected:
         fitted, this = start, first
-        rounds, taken = [first], list[Round]()
+        rounds, taken = [*shown, first], [*shown]
         explainable = self._beyond_noise(start)
-        while self._takes(this, explainable, first=not taken):
+        while self._takes(this, explainable, first=len(taken) == len(shown)):
             taken.append(this)
-            fitted, dropped = _without_needless(self._simulator, this.contenders[0], self._least)
+            fitted, dropped = _without_needless(
+                self._simulator, this.contenders[0], self._least, len(shown)
+            )
             for i in dropped:
                 del taken[i]
             if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
@@ -144,27 +225,29 @@ class ForwardSelection:
         self._progress('candidates', 1.0)
         tried = self._have | {effect.name for effect in self._candidates}
         left_out = frozenset(catalogue()) - tried
-        if not taken:
-            fitted = self._base
+        if len(taken) == len(shown):
+            fitted = shown[-1].contenders[0] if shown else self._base
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
 
 
 # -- is it an effect? ----------------------------------------------------------------------------
 
 
-def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: bool) -> bool:
+def takes(
+    rows: Rows, this: Round, noise: float, explainable: float, smallest: float, *, first: bool
+) -> bool:
     """
     Return whether the best contender of a round is an effect, the `first` one or a further one.
 
     `noise` is the mean square of the noise of a row, `explainable` what there was to be explained
-    before anything was added.
+    before anything was added, `smallest` the least size [% of stroke].
     """
     if not this.contenders:
         return False
     best = this.contenders[0]
     before, after = this.before.mean_square, best.mean_square
     gain, left = before - after, max(before - noise, 1e-300)
-    if rows.percent(gain) < criteria.SMALLEST_EFFECT or gain < criteria.LEAST_GAIN * explainable:
+    if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
         return False
     # what follows time alone fits a shifted residual as well; its lines and trends have tests
     # of their own
@@ -173,17 +256,13 @@ def takes(rows: Rows, this: Round, noise: float, explainable: float, *, first: b
         return False
     if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
         return False
-    return not _harms(rows, this.before, best, noise)
+    return not _harms(rows, this.before, best)
 
 
-def _harms(rows: Rows, before: Fitted, after: Fitted, noise: float) -> bool:
-    """Return whether the error of a kind of excitation grows, where it was no trifle."""
-    kinds = np.unique(rows.group)
-    counts = np.bincount(rows.group[rows.block], minlength=kinds.size)
-    one = np.bincount(rows.group, before.errors) / counts
-    other = np.bincount(rows.group, after.errors) / counts
-    trifle = noise + (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2
-    return bool(np.any(other > criteria.HARM**2 * one + trifle))
+def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:
+    """Return whether what an effect costs some kinds of excitation is much of what it gains."""
+    change = np.bincount(rows.group, after.errors - before.errors)
+    return bool(change[change > 0.0].sum() > -criteria.HARM * change.sum())
 
 
 def smallest_detectable(
@@ -212,15 +291,15 @@ def smallest_detectable(
 
 
 def _without_needless(
-    simulator: Simulator, fitted: Fitted, least: float
+    simulator: Simulator, fitted: Fitted, least: float, stay: int
 ) -> tuple[Fitted, tuple[int, ...]]:
     """
-    Take out effects that the last one, which stays, has made needless.
+    Take out effects that the last one, which stays like the first few, has made needless.
 
     Each must be worth a mean square of `least`.  Places of those that went come along, falling.
     """
     dropped: list[int] = []
-    for i in range(len(fitted.state.effects) - 2, -1, -1):
+    for i in range(len(fitted.state.effects) - 2, stay - 1, -1):
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
         without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
         if without.mean_square - fitted.mean_square < least:

@@ -24,7 +24,7 @@ from piezo_ident.diagnosis.cross_validation import (
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import free_parameters, FreeParameter, Simulator, State
-from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from scipy.optimize import lsq_linear
 
 __all__ = [
@@ -47,9 +47,9 @@ WEIGHT_STEP = 1e-3
 @dataclass(frozen=True, eq=False)
 class BaseColumns:
     """
-    Columns of a refit of the base model, shape (n, m + 2 + records), and ``columns' columns``.
+    Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
 
-    They are the filtered plays, v^3, v, and the offset of each record.
+    They are those of the law of H behind G, and the offset of each record.
     """
 
     columns: Array
@@ -69,7 +69,7 @@ class Fitted:
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
     J : ndarray, shape (n, p)
-        Derivatives of the prediction: weights, p1, p2, offsets, then the free parameters.
+        Derivatives of the prediction: coefficients of H, offsets, then the free parameters.
     free : ndarray of bool, shape (p,)
         Columns that are not on a bound.
     parameters : tuple of FreeParameter
@@ -98,9 +98,14 @@ class Fitted:
         """Mean square error of the blocks held out in spread sets, normalised."""
         return float(self.errors.sum() / self.e.size)
 
-    def held_out_residual(self, rows: Rows) -> Array:
-        """Return the residual of every row, fitted to other blocks; shape (n,), normalised."""
-        return held_out_residual(rows, self.J[:, self.free], self.e, self.prior[self.free])
+    def held_out_residual(self, rows: Rows, sets: NDArray[np.int64] | None = None) -> Array:
+        """
+        Return the residual of every row, fitted to other blocks; shape (n,), normalised.
+
+        Blocks of one number in `sets` are held out together; spread over all data when absent.
+        """
+        sets = rows.fold if sets is None else sets
+        return held_out_residual(rows, self.J[:, self.free], self.e, self.prior[self.free], sets)
 
 
 def base_thresholds(swing: float) -> Array:
@@ -109,29 +114,26 @@ def base_thresholds(swing: float) -> Array:
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
-def fit_base(simulator: Simulator, state: State, thresholds: Array) -> tuple[State, BaseColumns]:
-    """Return H refitted on other thresholds, effects kept as they are, and the columns used."""
-    rows, m = simulator.rows, thresholds.size
-    columns = np.hstack([simulator.base_columns(thresholds), _offset_columns(rows)])
+def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
+    """Return H refitted as one of a family, effects kept as they are, and the columns used."""
+    rows, m = simulator.rows, law.size
+    columns = np.hstack([simulator.base_columns(law), _offset_columns(rows)])
     base = BaseColumns(columns, columns.T @ columns)
-    own = simulator.base_columns(state.hysteresis.thresholds)
-    h = state.hysteresis
-    linear = own @ np.concatenate([h.weights, [h.p1, h.p2]])
-    target = rows.x - (simulator.run(state) - state.offsets[rows.of_record] - linear)
+    effects = simulator.run(state) - state.offsets[rows.of_record] - simulator.bare(state)
     lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
-    lower[:m] = 0.0
-    step = _Step(base, np.empty((rows.n, 0)), target, np.zeros(columns.shape[1]))
+    lower[:m] = law.lower
+    prior = np.zeros(columns.shape[1])
+    step = _Step(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
-    new = Hysteresis(thresholds, theta[:m], float(theta[m]), float(theta[m + 1]))
-    return replace(state, hysteresis=new, offsets=theta[m + 2 :]), base
+    return replace(state, offsets=theta[m:]).with_coefficients(law, theta[:m]), base
 
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
     """Return the columns of a refit of H in a state, its effects and a retuned G included."""
-    prediction, m = simulator.run(state), state.hysteresis.thresholds.size
+    prediction, m = simulator.run(state), state.coefficients.size
     columns = [
         (simulator.run(_moved(state, (), step)) - prediction) / WEIGHT_STEP
-        for step in WEIGHT_STEP * np.eye(m + 2, m + 2 + state.offsets.size)
+        for step in WEIGHT_STEP * np.eye(m, m + state.offsets.size)
     ]
     whole = np.hstack([np.stack(columns, axis=1), _offset_columns(simulator.rows)])
     return BaseColumns(whole, whole.T @ whole)
@@ -159,7 +161,7 @@ def fit_jointly(
     """
     rows = simulator.rows
     parameters = free_parameters(state, len(rows.names))
-    m = state.hysteresis.thresholds.size
+    m = state.coefficients.size
     p = base.columns.shape[1] + len(parameters)
     damping = 1e-4
     prediction = simulator.remember(state)
@@ -249,7 +251,7 @@ def _prior(rows: Rows, e: Array, p: int, m: int) -> Array:
     prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
-    prior[: m + 2] = float(e @ e) / count / WEIGHT_SPREAD**2
+    prior[:m] = float(e @ e) / count / WEIGHT_SPREAD**2
     return prior
 
 
@@ -280,27 +282,19 @@ def _derivatives(
 
 def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[Array, Array]:
     lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
-    m = state.hysteresis.thresholds.size
-    lower[:m] = np.minimum(-state.hysteresis.weights, 0.0)
+    if state.law is not None:
+        lower[: state.coefficients.size] = np.minimum(state.law.lower - state.coefficients, 0.0)
     for j, parameter in enumerate(parameters, start=p - len(parameters)):
         lower[j], upper[j] = parameter.room(state)
     return lower, upper
 
 
 def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> State:
-    h = state.hysteresis
-    m, k = h.thresholds.size, state.offsets.size
-    new = replace(
-        state,
-        hysteresis=Hysteresis(
-            h.thresholds,
-            np.maximum(h.weights + step[:m], 0.0),
-            h.p1 + float(step[m]),
-            h.p2 + float(step[m + 1]),
-        ),
-        offsets=state.offsets + step[m + 2 : m + 2 + k],
-    )
-    for parameter, delta in zip(parameters, step[m + 2 + k :], strict=True):
+    m, k = state.coefficients.size, state.offsets.size
+    new = replace(state, offsets=state.offsets + step[m : m + k])
+    if state.law is not None:
+        new = new.with_coefficients(state.law, state.coefficients + step[:m])
+    for parameter, delta in zip(parameters, step[m + k :], strict=True):
         new = parameter.moved(new, float(delta))
     return new
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import TUNED, WORTH_REFIT_IN_DOUBT
+from piezo_ident.diagnosis.criteria import TUNED
 from piezo_ident.diagnosis.refined_model import lasting, Refined
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.simulator import Added
@@ -63,6 +63,11 @@ def warnings_of(
             'identification, or they have changed since'
         )
     found += [_of_time_driven(a, bool(stays)) for a in state.effects if a.effect.time_driven]
+    for shift in refined.shifts[refined.shifts != 0.0]:
+        found.append(
+            f'the zero of the displacement has moved by {1e6 * shift:.3g} um in a record; that is '
+            'no part of any error, and the refined model keeps the zero of the given one'
+        )
     (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
     if low > least or high < most:
         found.append(
@@ -101,7 +106,7 @@ def sentence(
     before, refit, after = (e.overall for e in errors)
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
     missed = 'what the model missed'
-    if findings.effects and refit < (1.0 - WORTH_REFIT_IN_DOUBT) * before:
+    if findings.effects and refit < 0.5 * before:
         # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
         fall += f', with the refit alone to {refit:.3g} %'
@@ -117,6 +122,10 @@ def sentence(
     elif findings.verdict == 'partly_explained':
         text = f'{names} explains {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
         text += f'{fall}.'
+    elif findings.verdict == 'refitted':
+        text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}'
+        hidden = _or(findings.group)
+        text += f'; {hidden} may hide in that, and these data do not tell.' if hidden else '.'
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'
         if smallest is None:

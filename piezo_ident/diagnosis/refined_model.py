@@ -7,16 +7,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import Errors
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['Refined', 'lasting', 'refine']
+__all__ = ['Refined', 'lasting', 'moved_zeros', 'refine']
+
+Array = NDArray[np.float64]
 
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
@@ -24,10 +29,15 @@ NOTHING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """The refined model, the fit that it comes from, and whether it stays as it was given."""
+    """
+    The refined model, the fit that it comes from, and whether it stays as it was given.
+
+    `shifts` is how far the sensor's zero has moved in each record [m], shape (records,).
+    """
 
     model: StageModel
     state: State
+    shifts: Array
     is_given: bool = False
 
 
@@ -51,22 +61,44 @@ def refine(
     `before` and `refit` are the errors of the model as given and of the base refitted.
     """
     rows, model = simulator.rows, simulator.model
-    in_doubt = findings.verdict == 'unexplained'
-    worth = criteria.WORTH_REFIT_IN_DOUBT if in_doubt else criteria.WORTH_REFIT
+    e = rows.x - simulator.run(given)
+    shifts = moved_zeros(rows, given, e)
+    metres = shifts * model.scaling.Y
     if not findings.effects and (
-        refit.overall > (1.0 - worth) * before.overall
-        or not refit_holds(rows, rows.x - simulator.run(given), base.transfer)
+        refit.overall > (1.0 - criteria.WORTH_REFIT) * before.overall
+        or not refit_holds(rows, e, fitted.transfer)
     ):
-        return Refined(model, given, is_given=True)
+        return Refined(model, given, metres, is_given=True)
+    if fitted.transfer.sum() > e @ e:
+        # of a kind of excitation that was not fitted the given model knows more
+        return Refined(model, given, metres, is_given=True)
+    if shifts.any():
+        offsets = fitted.state.offsets - shifts
+        fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
     if findings.effects and not lasting(findings.effects):
         # H was refitted together with a drift that another record will not repeat
         effects = tuple(
             Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
             for added in fitted.state.effects
         )
-        state = replace(given, effects=effects)
-        return Refined(_model(simulator, state, findings, model.scaling.range), fitted.state)
-    return Refined(_model(simulator, fitted.state, findings, _range(simulator)), fitted.state)
+        state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
+        return Refined(
+            _model(simulator, state, findings, model.scaling.range), fitted.state, metres
+        )
+    return Refined(
+        _model(simulator, fitted.state, findings, _range(simulator)), fitted.state, metres
+    )
+
+
+def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
+    """
+    Return by how much the sensor's zero has moved in each record, normalised; zero where not.
+
+    A model that errs has a mean error, too.  A zero that has moved is one of many times the rest;
+    e is the residual of the model as given without the mean, shape (n,).
+    """
+    rms = np.sqrt(np.bincount(rows.of_record, e * e) / np.bincount(rows.of_record))
+    return np.where(np.abs(given.offsets) > criteria.MOVED_ZERO * rms, given.offsets, 0.0)
 
 
 def _range(simulator: Simulator) -> tuple[float, float]:
@@ -86,9 +118,7 @@ def _model(
     """Return the model of a state, in the record that holds the most rows, and its range."""
     rows = simulator.rows
     k = rows.longest
-    h = state.hysteresis
-    alive = h.weights > NOTHING
-    slim = replace(h, thresholds=h.thresholds[alive], weights=h.weights[alive])
+    slim = state.hysteresis.without_idle(NOTHING)
     kept = tuple(_elsewhere(added) for added in state.effects)
     model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
     scaling = model.scaling

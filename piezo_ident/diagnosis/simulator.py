@@ -11,7 +11,7 @@ other effects.  What lies before the change in the chain is kept from the run be
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -24,7 +24,8 @@ from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
-from piezo_ident.operators.play import play_columns
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.residual.stretches import block_means
 
 __all__ = [
     'RETUNING',
@@ -90,12 +91,23 @@ class State:
     effects : tuple of Added
     retuning : tuple of float
         Coefficients of `retuned`, empty where G stays as it is.
+    law : HysteresisLaw or None
+        The family of H; None for an H that is taken as it is.
+    coefficients : ndarray, shape (size,)
+        Those of the law.
     """
 
     hysteresis: Hysteresis
     offsets: Array
     effects: tuple[Added, ...] = ()
     retuning: tuple[float, ...] = ()
+    law: HysteresisLaw | None = None
+    coefficients: Array = field(default_factory=lambda: np.empty(0))
+
+    def with_coefficients(self, law: HysteresisLaw, coefficients: Array) -> State:
+        """Return the state with another H of a family."""
+        theta = np.maximum(coefficients, law.lower)
+        return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
 
     def with_effect(self, added: Added) -> State:
         """Return the state with one more effect."""
@@ -200,26 +212,34 @@ class Simulator:
             effects=(*self.model.effects, *settings),
         )
 
-    def base_columns(self, thresholds: Array) -> Array:
+    def base_columns(self, law: HysteresisLaw) -> Array:
         """
-        Return ``[G F_r | G v^3 | G v]`` as rows; shape (n, m + 2).
+        Return what G makes of the columns of a law, as rows; shape (n, size).
 
         Effects are left out of these columns: they change them by a few percent, and only the
         path to the optimum depends on that.
         """
         G, delay = self.model.dynamics, self.model.delay
-        columns = []
-        for j in range(thresholds.size + 2):
-            signals = []
-            for run, memory in zip(self.rows.runs, self.rows.memories, strict=True):
-                if j < thresholds.size:
-                    r = thresholds[j : j + 1]
-                    raw = play_columns(run.u, r, memory(r))[0]
-                else:
-                    raw = run.u ** (3 if j == thresholds.size else 1)
-                signals.append(filter_arx(G.a, G.b, delay.apply(raw)))
-            columns.append(self.rows.of(signals))
-        return np.stack(columns, axis=1)
+        out = np.empty((self.rows.n, law.size))
+        start = 0
+        for run, memory, keep in zip(
+            self.rows.runs, self.rows.memories, self.rows.keep, strict=True
+        ):
+            stop = start + int(keep.sum())
+            for j, raw in enumerate(law.columns(run.u, memory(law.thresholds))):
+                passed = filter_arx(G.a, G.b, delay.apply(raw))
+                out[start:stop, j] = block_means(passed, self.rows.m)[keep]
+            start = stop
+        return out
+
+    def bare(self, state: State) -> Array:
+        """Return the rows of H, G and the delay alone; shape (n,)."""
+        G, delay, h = self.model.dynamics, self.model.delay, state.hysteresis
+        signals = [
+            filter_arx(G.a, G.b, delay.apply(h(run.u, memory(h.thresholds))))
+            for run, memory in zip(self.rows.runs, self.rows.memories, strict=True)
+        ]
+        return self.rows.of(signals)
 
     def run(self, state: State) -> Array:
         """Return the predicted rows; shape (n,)."""

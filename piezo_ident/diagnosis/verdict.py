@@ -14,7 +14,7 @@ more than the difference scatters over held-out blocks.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria
@@ -64,6 +64,13 @@ class Findings:
     effects: tuple[str, ...]
     group: Class | None
     left: float
+
+    def refitted(self, hidden: tuple[str, ...]) -> Findings:
+        """Return that a refit of H alone brought what there was to gain; what it may hide."""
+        group = None
+        if len(hidden) > 1:
+            group = Class(hidden, f'record {separating_experiment(hidden)}')
+        return replace(self, verdict='refitted', group=group)
 
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""

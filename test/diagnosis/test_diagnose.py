@@ -29,6 +29,7 @@ from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program, slow_model
 import pytest
@@ -93,7 +94,7 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
     assert effect in {e.name for e in result.effects} | set(
         result.group.names if result.group else ()
     )
-    assert result.refit.overall > 0.2
+    assert result.refit.overall > 0.1
     assert result.after.overall < result.refit.overall / 3
     before, after = unseen_errors(result, unseen)
     assert after < before / 3
@@ -196,15 +197,18 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
     assert not [w for w in whole.warnings if 'was refitted' in w]
 
 
-def test_a_share_is_of_what_a_refit_leaves(truths):
-    model, record, _ = measured('creep', 0.3, 1)
-    # the sensor was set to zero again
+def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
+    model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
     moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
-    result = diagnose(model, moved, DiagnosisSettings(effects=('creep',)))
-    assert 'of what a refit of the hysteresis leaves' in result.sentence
-    assert f'with the refit alone to {result.refit.overall:.3g} %' in result.sentence
-    assert result.after.overall < result.refit.overall < 0.1 * result.before.overall
+    few = DiagnosisSettings(effects=('creep',))
+    result, still = diagnose(model, moved, few), diagnose(model, record, few)
+    assert result.before.overall == pytest.approx(still.before.overall)
+    assert result.after.overall == pytest.approx(still.after.overall)
+    assert any('zero of the displacement' in warning for warning in result.warnings)
+    before, after = unseen_errors(result, unseen)
+    # the zero of the given model is a little off: it met creep when it was identified
+    assert after < 0.7 * before
 
 
 def test_hum_stays_in_its_record(truths):
@@ -299,16 +303,16 @@ def test_a_singular_fit_is_an_error_of_ours(scale):
 def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatch):
     fit = search.fit_jointly
 
-    def fails_for_drift(simulator, state, *args, **kwargs):
-        if state.effects and state.effects[-1].name == 'thermal_drift':
+    def fails_for_one(simulator, state, *args, **kwargs):
+        if state.effects and state.effects[-1].name != 'creep':
             raise IdentificationError('singular')
         return fit(simulator, state, *args, **kwargs)
 
-    monkeypatch.setattr(search, 'fit_jointly', fails_for_drift)
-    few = DiagnosisSettings(effects=('creep', 'thermal_drift', 'gain_drift'))
+    monkeypatch.setattr(search, 'fit_jointly', fails_for_one)
+    few = DiagnosisSettings(effects=('creep', 'rate_dependent_hysteresis', 'gain_drift'))
     result = diagnose(slow_model(), example_record(), few)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
-    assert 'thermal_drift was not judged: singular' in result.warnings
+    assert any('was not judged: singular' in warning for warning in result.warnings)
 
 
 def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
@@ -408,7 +412,11 @@ def test_columns_near_the_optimum_are_derivatives(truths):
     model, record, _ = measured(None, 0.0, 1)
     rows = make_rows(model, [record])
     simulator = Simulator(model, rows)
-    state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), base_thresholds(1.0))
+    state, base = fit_base(
+        simulator,
+        State(model.hysteresis, np.zeros(1)),
+        HysteresisLaw('duhem', base_thresholds(1.0)),
+    )
     # without effects the quick columns are the exact ones
     np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-8)
     fitted = fit_jointly(simulator, state, base)

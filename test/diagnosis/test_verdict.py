@@ -150,29 +150,29 @@ def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
 def test_an_effect_that_costs_a_kind_is_not(rows):
     worse = np.where(rows.group == 2, 1.0, 0.05)
     best = contender('creep', 0.3, shape=worse)
-    assert not takes(rows, a_round(best), 0.0, WHOLE, first=True)
+    assert not takes(rows, a_round(best), 0.0, WHOLE, 0.05, first=True)
 
 
 # -- a change of G, or an effect that bent it ---------------------------------------------------
 
 
 @pytest.fixture
-def choose(rows, monkeypatch):
+def choose(rows):
     """Return what a search starts from, given what either round leaves, and the rival it keeps."""
 
     def chosen(linear, bent):
         search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
-        search._noise = 0.0
+        search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
+        search._candidates, search._certain = [], ()
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
         starts = {
             key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
             for key, this in rounds.items()
         }
-        monkeypatch.setattr(forward_selection, 'fit_jointly', lambda *_: starts['retuned'])
-        monkeypatch.setattr(forward_selection, 'replace', lambda *_, **__: None)
+        search._retuned = lambda fitted: starts['retuned']
         search._round = lambda start: rounds[next(k for k, v in starts.items() if v is start)]
-        search._from = lambda start, first, bent=None: (
+        search._from = lambda start, first, shown, bent=None: (
             next(k for k, v in starts.items() if v is start),
             bent,
         )

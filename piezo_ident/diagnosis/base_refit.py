@@ -1,0 +1,115 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Refits of H, as a sum of plays and as wider laws, and the effects found beside them.
+
+The hysteresis of a piezo is never a sum of plays.  What goes with a wider law is no effect, and
+what follows the path of the command alone may hide in one: see `ForwardSelection.beside`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
+from piezo_ident.diagnosis.joint_fit import base_thresholds, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.next_experiment import look_alikes
+from piezo_ident.diagnosis.rows import centred
+from piezo_ident.diagnosis.search import Round, score_trials
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
+
+__all__ = ['effects_beside', 'hidden_by', 'refits']
+
+
+def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
+    """
+    Return H refitted as plays on a fine grid, and as the widest law.
+
+    Raises
+    ------
+    IdentificationError
+        When the voltage never moves.
+    """
+    if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
+        raise IdentificationError('the voltage never moves; record the stage while it is driven')
+    plays, wide = (_refit(simulator, given, name) for name in ('plays', LAWS[-1]))
+    return plays, wide
+
+
+def _is_better(wide: Fitted, narrow: Fitted) -> bool:
+    """Return whether a wider law predicts held-out kinds of excitation clearly better."""
+    return bool(wide.transfer.sum() < criteria.WIDER**2 * narrow.transfer.sum())
+
+
+def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:
+    runs = simulator.rows.runs
+    low, high = min(float(run.u.min()) for run in runs), max(float(run.u.max()) for run in runs)
+    swing = max(float(np.ptp(run.u)) for run in runs)
+    law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
+    return fit_jointly(simulator, *fit_base(simulator, state, law))
+
+
+def effects_beside(
+    simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
+) -> tuple[Fitted, Selected]:
+    """Return the effects found, fitted with the narrowest law that serves, and their base."""
+    base, alone = wide if _is_better(wide, plays) else plays, plays
+    found = search.run(base)
+    if found.taken:
+        plays = _refit(simulator, found.fitted.state, 'plays')
+        wide = found.fitted if base is wide else _refit(simulator, found.fitted.state, LAWS[-1])
+    both = search.beside(plays, wide, found)
+    if len(both.taken) > len(found.taken):
+        return alone, both
+    fitted = both.fitted
+    if base is not plays:
+        for narrower in ('plays', 'preisach'):
+            other = plays if narrower == 'plays' else _refit(simulator, fitted.state, 'preisach')
+            if not _is_better(fitted, other):
+                fitted = other
+                break
+    return base, replace(both, fitted=fitted)
+
+
+def hidden_by(
+    simulator: Simulator, given: State, refit: Fitted, imitated: Round | None
+) -> tuple[str, ...]:
+    """
+    Return the effects that may hide in a refit of H: none, or two and more.
+
+    Those go a long way beside plays, or, added to the model as it was given, take half of what the
+    refit takes.
+    """
+    names: list[str] = []
+    if imitated is not None:
+        least = (1.0 - criteria.ADDED) * imitated.before.mean_square
+        names = [c.name for c in imitated.contenders if c.mean_square < least]
+    names = list(dict.fromkeys([*names, *_instead(simulator, given, refit)]))
+    if len(names) == 1:
+        names += [n for n in look_alikes(names[0]) if find_effect(n).rate_independent][:1]
+    return tuple(names[: criteria.CLASS_SIZE]) if len(names) > 1 else ()
+
+
+def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
+    """Return the effects, best first, that do half of what a refit does."""
+    rows = simulator.rows
+    e = centred(rows.x - simulator.run(given), rows.of_record)
+    of = np.equal.outer(rows.of_record, np.arange(len(rows.names))).astype(np.float64)
+    start = replace(
+        refit, state=given, e=e, J=of, free=np.ones(of.shape[1], bool), prior=np.zeros(of.shape[1])
+    )
+    effects = [effect for effect in catalogue().values() if effect.rate_independent]
+    left: dict[str, float] = {}
+    for scored in score_trials(simulator, start, effects, (), np.zeros((rows.n, 0))):
+        name = scored.effect.name
+        if scored.is_possible:
+            left[name] = min(left.get(name, np.inf), scored.error)
+    whole, least = float(e @ e), float(refit.errors.sum())
+    found = [name for name, x in left.items() if whole - x > 0.5 * (whole - least)]
+    return sorted(found, key=lambda name: left[name])
