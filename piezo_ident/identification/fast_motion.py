@@ -31,12 +31,12 @@ HIGH_PASS = 30.0
 WINDOW = 0.1
 #: rms above `HIGH_PASS` from which the voltage excites the dynamics, normalised
 FAST = 2e-3
-#: further edges of the bands whose busiest samples are searched [Hz], and the rms they need
+#: further edges of the bands whose motion is searched [Hz], and the rms they need
 EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
 #: share of motion above the first of these edges from which it is more than a slow sweep
 PURE = 0.3
 #: samples of fast motion that the search uses
-MOST = 40_000
+MOST = 100_000
 #: after this time a voltage that moves by less than this share of its range rests [s]
 SETTLED, STILL = 0.2, 1e-3
 #: time ahead of the samples that count, in which the start of G dies away [s]
@@ -101,17 +101,10 @@ class Samples:
             np.sqrt(np.mean(quiet**2)) > FAST or quiet.max() > 2 * FAST
         )
         if broad:
-            score = [r / max(float(r.max()), FAST) for r in rms]
-            score = [np.where(r > 0.5 * FAST, s, 0.0) for r, s in zip(rms, score, strict=True)]
-            for edge in EDGES:
-                band = [rms_above(e.u, rate, edge) for e in excerpts]
-                most = max(float(b.max()) for b in band)
-                if most > FAINT:
-                    score = [np.maximum(s, b / most) for s, b in zip(score, band, strict=True)]
             pure = [_purity(e.u, rate) > PURE for e in excerpts]
-            if sum(int((p | j).sum()) for p, j in zip(pure, jumps, strict=True)) > WINDOW * rate:
-                score = [s * p for s, p in zip(score, pure, strict=True)]
-            fast = _busiest(score, jumps, int(0.2 * WINDOW * rate))
+            if sum(int((p | j).sum()) for p, j in zip(pure, jumps, strict=True)) <= WINDOW * rate:
+                pure = [e.use for e in excerpts]
+            fast = _spread(excerpts, pure, jumps, rate)
             fast = [f & e.use for f, e in zip(fast, excerpts, strict=True)]
         calm = [e.use & (r < FAST) for e, r in zip(excerpts, rms, strict=True)]
         # where the stage lags behind a fast drive, H alone would take the lag for hysteresis
@@ -130,15 +123,29 @@ def _purity(u: Vector, rate: float) -> Vector:
     return np.asarray(rms_above(u, rate, EDGES[0]) / np.sqrt(np.maximum(power, 1e-12)))
 
 
-def _busiest(score: Sequence[Vector], jumps: Sequence[Mask], size: int) -> list[Mask]:
-    """Return the jumps, and with them the whole blocks of the highest score."""
-    size = max(1, size)
-    of = [np.maximum.reduceat(s, np.arange(0, s.size, size)) for s in score]
-    ranked = np.sort(np.concatenate(of))[::-1]
-    least = max(float(ranked[min(MOST // size, ranked.size - 1)]), 1e-3)
+def _spread(
+    excerpts: Sequence[Excerpt], pure: Sequence[Mask], jumps: Sequence[Mask], rate: float
+) -> list[Mask]:
+    """Return the jumps, and blocks all over the motion of each band: a chirp passes them all."""
+    size = max(1, int(0.2 * WINDOW * rate))
+    above = [[rms_above(e.u, rate, edge) ** 2 for e in excerpts] for edge in (HIGH_PASS, *EDGES)]
+    above.append([np.zeros(e.u.size) for e in excerpts])
+    places = [np.arange(0, e.u.size, size) for e in excerpts]
+    chosen = np.zeros(sum(p.size for p in places), dtype=bool)
+    for band, higher in itertools.pairwise(above):
+        power = np.concatenate(
+            [
+                np.maximum.reduceat((b - h) * p, at)
+                for b, h, p, at in zip(band, higher, pure, places, strict=True)
+            ]
+        )
+        if power.max() > FAINT**2:
+            found = np.flatnonzero(power > 0.1 * power.max())
+            quota = max(1, MOST // size // (len(EDGES) + 1))
+            chosen[found[:: 1 + (found.size - 1) // quota]] = True
+    parts = np.split(chosen, np.cumsum([p.size for p in places])[:-1])
     return [
-        jump | np.repeat(blocks > least, size)[: jump.size]
-        for jump, blocks in zip(jumps, of, strict=True)
+        jump | np.repeat(part, size)[: jump.size] for jump, part in zip(jumps, parts, strict=True)
     ]
 
 

@@ -11,6 +11,7 @@ same length is held out, one that leaves most of every band and of the range in 
 from __future__ import annotations
 
 from collections.abc import Sequence
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +89,9 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
 def _place(run: Run, n_held: int) -> int:
     """Return where the held-out stretch begins."""
     u, n = run.u, run.u.size
-    bands = [rms_above(u, run.piece.sample_rate, edge) for edge in (HIGH_PASS, *EDGES)]
-    energy = [np.cumsum(np.concatenate([[0.0], b**2])) for b in bands if b.max() > FAINT]
+    above = [rms_above(u, run.piece.sample_rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]
+    bands = [np.maximum(b - h, 0.0) for b, h in itertools.pairwise([*above, np.zeros(n)])]
+    energy = [np.cumsum(np.concatenate([[0.0], b])) for b in bands if b.max() > FAINT**2]
     travel = np.cumsum(np.concatenate([[0.0], np.abs(np.diff(u, prepend=u[0]))]))
     best, best_share = n - n_held, -1.0
     for start in np.linspace(n - n_held, 0, PLACES).astype(int):

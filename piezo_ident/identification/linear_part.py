@@ -78,6 +78,8 @@ class LinearPart:
         That loss.
     errors : dict of str to float
         Held-out errors of nothing, of a pure delay, and of G, normalised.
+    judged : int
+        Samples held out.
     """
 
     delay: Delay
@@ -85,6 +87,12 @@ class LinearPart:
     scan: int | None
     loss: Vector | None
     errors: dict[str, float]
+    judged: int = 0
+
+    @property
+    def gain(self) -> float:
+        """Sum of squares by which it errs less than nothing on the held-out blocks."""
+        return self.judged * (self.errors['nothing'] ** 2 - min(self.errors.values()) ** 2)
 
     @property
     def methods(self) -> dict[str, float]:
@@ -292,13 +300,14 @@ def find_linear_part(
     if pure_error > (1.0 - GAIN) * nothing:
         pure, pure_error = Delay(given or 0), nothing
     errors = {'nothing': nothing, 'delay': pure_error}
+    judges = sum(int(e.use.sum()) for e in motion.held)
     size = max(max_order, *(order or (1, 1)))
     factor, loss, scan = None, None, None
     while size >= 2 and factor is None:
         factor = _factor(motion, size, size + max([MAX_DELAY, *delays, given or 0]))
         size = size if factor is not None else size // 2
     if factor is None:
-        return LinearPart(pure, None, None, None, errors)
+        return LinearPart(pure, None, None, None, errors, judges)
     low = min(SCAN_ORDER, size)
     loss = np.array([factor.fit(low, low, d)[1] for d in range(MAX_DELAY)])
     scan = delay_from_loss(loss)
@@ -319,12 +328,13 @@ def find_linear_part(
         found += [(error, d, fit) for fit, error in fits]
     least = min((error for error, *_ in found), default=np.inf)
     if least > (1.0 - GAIN) * pure_error:
-        return LinearPart(pure, None, scan, loss, errors)
+        return LinearPart(pure, None, scan, loss, errors, judges)
     best = min(
         (f for f in found if f[0] <= (1.0 + SLACK) * least),
         key=lambda f: f[2].dynamics.a.size + f[2].dynamics.b.size,
     )
-    return LinearPart(Delay(best[1]), best[2], scan, loss, {**errors, 'dynamics': best[0]})
+    errors['dynamics'] = best[0]
+    return LinearPart(Delay(best[1]), best[2], scan, loss, errors, judges)
 
 
 def refined_linear_part(motion: FastMotion, linear: LinearPart) -> LinearPart:

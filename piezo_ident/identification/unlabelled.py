@@ -58,7 +58,7 @@ Mask = NDArray[np.bool_]
 TURNS = 3
 #: share of the fitted samples, at their end, that chooses between models
 LATE = 0.25
-#: G goes where it errs by this share more than hysteresis alone on what chooses
+#: G goes where its squares are by this share more than those of hysteresis alone on what chooses
 WORSE = 0.02
 
 
@@ -68,8 +68,9 @@ class JointFit:
     What unlabelled runs gave.
 
     `excerpts` are the fitted parts of the runs with the memory at their start; `hysteresis` is
-    the H that went with the search for G; `not_identified` says what stayed at its neutral value,
-    and why.
+    the H that went with the search for G; `gain` is the sum of squares by which delay and G err
+    less than nothing on fast motion that was not fitted; `not_identified` says what stayed at its
+    neutral value, and why.
     """
 
     delay: DelayResult
@@ -77,6 +78,7 @@ class JointFit:
     G: Dynamics
     excerpts: tuple[Excerpt, ...]
     hysteresis: Hysteresis
+    gain: float
     not_identified: tuple[tuple[str, str], ...]
 
 
@@ -184,6 +186,7 @@ def joint_fit(
         G=G,
         excerpts=tuple(excerpts),
         hysteresis=H,
+        gain=0.0 if linear is None else linear.gain,
         not_identified=tuple(_missing(excerpts, found, linear, settings, band)),
     )
 
@@ -338,12 +341,13 @@ def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]
         fit = fit_hysteresis(factorise(early, r, G, delay), r, n)
         R = factorise(late, r, G, delay)
         theta = np.concatenate([fit.offsets, fit.coefficients])
-        return float(np.linalg.norm(R[:, :-1] @ theta - R[:, -1]))
+        return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
 
     if not any(e.use.any() for e in late) or not all(e.use.any() for e in early):
         return joint
     unit = Dynamics.unit()
-    if error(joint.G, delay) <= (1.0 + WORSE) * error(unit, Delay(0)):
+    # what G is worth counts where it is fast, what it costs where the record goes on
+    if error(joint.G, delay) <= (1.0 + WORSE) * error(unit, Delay(0)) + joint.gain:
         return joint
     reason = 'G errs more than the hysteresis alone on the part that chooses; add steps or noise'
     return replace(
