@@ -39,6 +39,7 @@ from scipy import optimize, signal
 
 __all__ = [
     'LinearPart',
+    'fast_part',
     'find_linear_part',
     'refined_linear_part',
     'without_slow_part',
@@ -154,6 +155,11 @@ def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128],
     """Return residues and poles of G, and the terms without a pole."""
     residues, poles, direct = signal.residuez(G.b, np.concatenate([[1.0], G.a]))
     return residues, poles, np.real(np.atleast_1d(direct))
+
+
+def fast_part(G: Dynamics, rate: float) -> Dynamics:
+    """Return G with G(1) = 1, without its slow real poles where it can do without them."""
+    return without_slow_part(G, rate) or G.normalised()
 
 
 def _supported(G: Dynamics, motion: FastMotion) -> bool:

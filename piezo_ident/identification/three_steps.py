@@ -20,6 +20,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.linear_part import fast_part
 from piezo_ident.identification.prepare import END_HELD, Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
@@ -244,7 +245,7 @@ def second_step(
     raw = _noise(run, run.u, start, stop)
     [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
     del raw  # of an hour's record it is a gigabyte
-    G = first.without_slow_poles(SLOWEST, rate).normalised()
+    G = fast_part(first, rate)
 
     excerpts = triangle_excerpts(runs)
     n = int(sum(e.use.sum() for e in excerpts))
@@ -263,7 +264,7 @@ def second_step(
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
     fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
-    G = fit.dynamics.normalised()
+    G = fast_part(fit.dynamics, rate)
     progress('dynamics', 0.95)
     # the same regression on the measured and on the modelled answer: the plays that the noise
     # drags along count in both
@@ -299,16 +300,16 @@ def _best_in_free_run(
     stretches, held = _stretches(runs, H, delay)
     rate = runs[0].piece.sample_rate
     best, (result, G) = float('inf'), found[0]
-    G = G.without_slow_poles(SLOWEST, rate).normalised()
+    G = fast_part(G, rate)
     for i, (candidate, start) in enumerate(found):
         tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
-        fast = start.without_slow_poles(SLOWEST, rate).normalised()
+        fast = fast_part(start, rate)
         fit = output_error(stretches, fast, maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
         # a larger model comes later, and must earn its size
         if score < best / (1.0 + GAIN):
             best, result = score, candidate
-            G = fit.dynamics.without_slow_poles(SLOWEST, rate).normalised()
+            G = fast_part(fit.dynamics, rate)
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
     return result, G
 
