@@ -65,7 +65,7 @@ def rms_above(u: Vector, rate: float, edge: float) -> Vector:
     if 4.0 * edge > rate:
         return np.zeros(u.size)
     width = max(1, int(WINDOW * rate))
-    sos = signal.butter(1, edge, btype='highpass', fs=rate, output='sos')
+    sos = signal.butter(2, edge, btype='highpass', fs=rate, output='sos')
     # both ways, with the ends turned over: a record that starts on the move does not jump there
     pad = min(u.size - 1, int(3.0 * rate / edge))
     power = ndimage.uniform_filter1d(signal.sosfiltfilt(sos, u, padlen=pad) ** 2, width)
@@ -112,6 +112,8 @@ class Samples:
         enough = sum(int(c.sum()) for c in calm) > sum(e.u.size for e in excerpts) // 20
         if not broad or not enough or max(slow, default=0.0) < 0.8 * swing:
             calm = [e.use for e in excerpts]
+        # every run keeps some, for its offset
+        calm = [c if c.any() else e.use for e, c in zip(excerpts, calm, strict=True)]
         return cls(fast, calm)
 
 

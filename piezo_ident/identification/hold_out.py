@@ -68,7 +68,8 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
             start = n_fit if settings.hold_out else _place(run, n_held)
             fitted = np.ones(piece.n, dtype=bool)
             fitted[start : start + n_held] = False
-            if not chosen or float(np.ptp(run.u[fitted])) >= MOVES:
+            enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
+            if enough or not chosen:
                 chosen.append(run)
                 masks.append(fitted)
         elif run is not ranked[0]:

@@ -49,7 +49,7 @@ from piezo_ident.identification.three_steps import (
 from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.metrics import FORMULA, percent
-from piezo_ident.model.stage_model import Scaling
+from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record, records_of
 import scipy
@@ -176,6 +176,15 @@ def _labelled(
     hysteresis = third_step(fit, held, G, delay, settings, progress)
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
+    if not _worth_its_dynamics(model, runs):
+        warnings.append(
+            'G errs more than the hysteresis alone on the data that choose, and was left out; '
+            'record noise of larger amplitude'
+        )
+        delay, G = Delay(0), Dynamics.unit()
+        dynamics = replace(dynamics, order=(0, 1), covariance=np.zeros((1, 1)))
+        hysteresis = third_step(fit, held, G, delay, settings, progress)
+        model = model_of(rate, scaling, hysteresis, G, delay)
     if settings.thresholds is None and not any(e.use.any() for e in held):
         warnings.append(
             'the triangle turns too often to hold a part of it out: the number of thresholds '
@@ -205,6 +214,19 @@ def _labelled(
     return FitOutcome(
         model, delay_result, dynamics, hysteresis, masks, warnings, memories=memories
     )
+
+
+def _worth_its_dynamics(model: StageModel, runs: Sequence[Run]) -> bool:
+    """Return whether the model errs less with G than without on what chooses."""
+    errors = np.zeros(2)
+    for run in runs:
+        kept = run.held_out() & run.use
+        if kept.any():
+            memory = run.start(model.hysteresis.thresholds)
+            for i, m in enumerate((model, model.without_dynamics())):
+                e = (run.piece.y - m.predict_piece(run.piece, memory))[kept]
+                errors[i] += float(np.sum((e - e.mean()) ** 2))
+    return bool(errors[0] <= errors[1])
 
 
 def _either(

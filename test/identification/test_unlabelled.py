@@ -111,3 +111,43 @@ def test_steps_alone_do_not_identify_hysteresis():
     record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
     missing = dict(identify(record).not_identified)
     assert 'triangle' in missing['hysteresis']
+
+
+def test_several_records_are_all_fitted_each_with_its_own_zero():
+    def record(name, v, zero, seed):
+        y = STAGE.stream(None).process(v) + zero
+        y += 1e-5 * 75e-6 * np.random.default_rng(seed).standard_normal(v.size)
+        return Record((Piece(v, y, FS),), name)
+
+    one = record('one', sine(3.0), 0.0, 0)
+    two = record('two', 0.8 * sine(3.0, f=5.0), 4e-6, 1)
+    result = identify([one, two])
+    of = {row.record: row for row in result.errors if row.data == 'fitted'}
+    assert set(of) == {'one', 'two'}
+    # the zero that moved is no error of the model
+    assert max(row.percent for row in result.errors) < 0.5
+    assert any('two: its zero of displacement' in said for said in result.warnings)
+
+
+def test_a_multisine_does_not_only_jump():
+    t = np.arange(int(3.0 * FS)) / FS
+    rng = np.random.default_rng(3)
+    tones = [
+        np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.3)) for f in np.arange(40.0, 1200.0, 9)
+    ]
+    v = np.sum(tones, axis=0)
+    v = 5.0 + 4.5 * v / np.abs(v).max()
+    result = identify(Record((Piece(v, STAGE.simulate(v), FS),), 'multisine'))
+    assert 'hysteresis' not in dict(result.not_identified)
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+
+
+def test_the_only_chirp_is_not_held_out():
+    t = np.arange(int(1.0 * FS)) / FS
+    drive = (
+        0.3 * np.sin(2.0 * np.pi * (20.0 * t + 590.0 * t**2)) * np.minimum(1.0, 20.0 * (1.0 - t))
+    )
+    v = np.concatenate([sine(4.0), drive])
+    result = identify(Record((Piece(v, STAGE.simulate(v), FS),), 'ends in a chirp'))
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    assert 'held out' in result.warnings[0]

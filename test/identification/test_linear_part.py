@@ -1,0 +1,129 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delay and G from any fast motion, on modes in continuous time behind a held voltage."""
+
+import numpy as np
+from piezo_ident.identification.fast_motion import FastMotion, moving, Samples
+from piezo_ident.identification.linear_part import find_linear_part, without_slow_part
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.operators.dynamics import Dynamics
+import pytest
+from scipy import signal
+
+FS, OVER = 20_000.0, 8
+#: natural frequency [Hz], damping, share of the static gain: an antiresonance lies between them
+MODES = ((900.0, 0.01, 0.8), (2300.0, 0.015, 0.2))
+DELAY = 2.375
+
+
+def stage(w):
+    """Return the answer of the modes to a held signal, a fraction of a sample late."""
+    held = np.concatenate([np.zeros(round(DELAY * OVER)), np.repeat(w, OVER)])[: w.size * OVER]
+    x = np.zeros(held.size)
+    for f, zeta, share in MODES:
+        s = 2.0 * np.pi * f
+        system = ([share * s * s], [1.0, 2.0 * zeta * s, s * s])
+        b, a, _ = signal.cont2discrete(system, 1.0 / FS / OVER, 'zoh')
+        x += signal.lfilter(np.ravel(b), a, held)
+    return x[::OVER]
+
+
+def truth(f):
+    s = 2j * np.pi * f
+    modal = sum(
+        share * (2 * np.pi * f0) ** 2 / (s * s + 4 * np.pi * zeta * f0 * s + (2 * np.pi * f0) ** 2)
+        for f0, zeta, share in MODES
+    )
+    # the hold is half a sample late
+    return modal * np.exp(-s * (DELAY + 0.5) / FS) * np.sinc(f / FS)
+
+
+def chirp(seconds, top):
+    t = np.arange(int(seconds * FS)) / FS
+    return 0.05 * signal.chirp(t, 10.0, seconds, top) * np.minimum(1.0, 50.0 * t)
+
+
+def steps():
+    return np.repeat(np.arange(24) % 2 * 0.1, 1500).astype(float)
+
+
+def noise():
+    white = np.random.default_rng(2).standard_normal(30_000)
+    return 0.02 * signal.sosfilt(signal.butter(4, 4000.0, fs=FS, output='sos'), white)
+
+
+def found_in(w, x, **options):
+    whole = np.ones(w.size, dtype=bool)
+    return find_linear_part(FastMotion.of([Excerpt(w, x, whole)], FS), 12, **options)
+
+
+@pytest.mark.parametrize('drive', [lambda: chirp(1.2, 4000.0), steps, noise])
+def test_modes_antiresonance_and_delay_come_out_of_any_broad_motion(drive):
+    w = drive()
+    x = stage(w) + 2e-5 * np.random.default_rng(1).standard_normal(w.size)
+    found = found_in(w, x)
+    G = found.fit.dynamics.normalised()
+    modes = sorted(m.frequency for m in G.modes(FS) if m.damping < 0.1)
+    np.testing.assert_allclose(modes, [f for f, *_ in MODES], rtol=3e-3)
+    f = np.array([50.0, 300.0, 700.0, 1200.0, 1500.0, 2000.0])
+    late = np.exp(-2j * np.pi * f * found.delay.total / FS)
+    expected = truth(f)
+    # a ring of some samples tells the phase of the whole
+    np.testing.assert_allclose(G.response(f, FS) * late, expected, atol=0.02 * abs(expected).max())
+    assert G.a.size <= 6
+    assert found.errors['dynamics'] < 0.2 * found.errors['nothing']
+
+
+def test_creep_in_the_displacement_leaves_no_slow_pole():
+    w = steps()
+    creep = signal.lfilter([1.0 - np.exp(-2e-3)], [1.0, -np.exp(-2e-3)], w)
+    found = found_in(w, stage(w) + 0.05 * creep)
+    poles = found.fit.dynamics.poles
+    slow = (poles.imag == 0.0) & (poles.real > np.exp(-2.0 * np.pi * 40.0 / FS))
+    assert not slow.any()
+
+
+def test_one_slow_sine_shows_neither_modes_nor_order():
+    w = 0.5 * np.sin(2.0 * np.pi * 40.0 * np.arange(20_000) / FS)
+    x = stage(w) + 1e-3 * np.random.default_rng(1).standard_normal(w.size)
+    found = found_in(w, x)
+    assert found.fit is None or not [m for m in found.fit.dynamics.modes(FS) if m.damping < 0.1]
+
+
+def test_pure_delay_is_found_to_a_part_of_a_sample():
+    w = chirp(0.6, 400.0)
+    later = np.interp(np.arange(w.size) - 1.4, np.arange(w.size), w)
+    found = found_in(w, later + 1e-4 * np.random.default_rng(1).standard_normal(w.size))
+    assert found.fit is None
+    assert found.delay.total == pytest.approx(1.4, abs=0.05)
+
+
+def test_slow_real_poles_go_and_slow_pairs_are_refused():
+    slow, fast = np.exp(-2.0 * np.pi * np.array([5.0, 1500.0]) / FS)
+    G = Dynamics(np.poly([slow, fast])[1:], np.poly([0.9995 * slow]) * (1.0 - fast))
+    left = without_slow_part(G, FS)
+    np.testing.assert_allclose(left.poles, [fast], rtol=1e-9)
+    assert left.gain == pytest.approx(1.0)
+    pair = np.exp(2.0 * np.pi * 10.0 / FS * (-0.1 + 1j))
+    assert (
+        without_slow_part(Dynamics(np.real(np.poly([pair, np.conj(pair)]))[1:], [1.0]), FS) is None
+    )
+
+
+def test_fast_motion_under_a_slow_sweep_is_left_where_there_is_better():
+    t = np.arange(40_000) / FS
+    sweep = 0.45 * np.sin(2.0 * np.pi * 60.0 * t) + 0.02 * np.sin(2.0 * np.pi * 400.0 * t)
+    u = np.concatenate([sweep, np.zeros(4000), chirp(1.0, 3000.0)])
+    samples = Samples.of([Excerpt(u, u, np.ones(u.size, dtype=bool))], FS, 0.9)
+    [fast] = samples.fast
+    assert fast[44_000:].mean() > 0.5
+    assert fast[:38_000].mean() < 0.01
+
+
+def test_of_a_rest_only_its_beginning_counts():
+    u = np.concatenate([np.zeros(1000), np.linspace(0.0, 1.0, 1000), np.ones(1000)])
+    moves = moving(u, 1000.0, 1.0)
+    assert not moves[:990].any()
+    assert moves[1010:2190].all()
+    assert not moves[2210:].any()
