@@ -43,6 +43,7 @@ from piezo_ident.identification.three_steps import (
     first_step,
     model_of,
     second_step,
+    small_excerpts,
     triangle_excerpts,
     within,
 )
@@ -173,7 +174,7 @@ def _labelled(
     # the same with what is known of the lag by now
     runs = with_starts(unstarted, lag_of(G, delay))
     fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-    hysteresis = third_step(fit, held, G, delay, settings, progress)
+    hysteresis = third_step(fit, held, G, delay, settings, progress, others=small_excerpts(runs))
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
     if not _worth_its_dynamics(model, runs):

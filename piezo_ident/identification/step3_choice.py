@@ -52,6 +52,9 @@ FINE, PARTS = 40, 8
 #: Wen and of Duhem wrong laws lowered it by up to 17 %, on Preisach loops the right one by 60 to
 #: 95 %
 WORTH = 0.25
+#: error that it may leave on small motion, in parts of what plays leave; lags along the path have
+#: to be worth as much there, too (6 to 27 % on their own kinds of loops, 84 % under creep)
+NO_WORSE = 1.1
 
 
 def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
@@ -145,6 +148,15 @@ def choose_thresholds(
 
 
 @dataclass(frozen=True, eq=False)
+class _Means(Excerpt):
+    """Fast motion, of which only means over rows are compared: what G leaves is not of H."""
+
+    @property
+    def row(self) -> int:
+        return max(1, min(int(self.use.sum()) // 1000, 50))
+
+
+@dataclass(frozen=True, eq=False)
 class Choice:
     """
     The law that was chosen for H.
@@ -168,6 +180,7 @@ def choose_law(
     delay: Delay,
     laws: Sequence[LawName] = LAWS,
     tick: Callable[[float], None] = lambda share: None,
+    others: Sequence[Excerpt] = (),
 ) -> Choice:
     """
     Choose the law of H by parts of the data that are predicted from all others.
@@ -181,6 +194,9 @@ def choose_law(
         Those to choose from, plays first.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
+    others : sequence of Excerpt, optional
+        Small motion, on which a wider law must not err more than plays, and one with lags must err
+        less: what creeps follows a triangle of one speed as if it lagged along the path.
     """
     low = min(float(e.u[e.use].min()) for e in excerpts)
     high = max(float(e.u[e.use].max()) for e in excerpts)
@@ -214,6 +230,19 @@ def choose_law(
         if _upper(logs[name] - logs['plays']) < np.log(1.0 - WORTH)
         and fitted(whole, law_of[name]).hysteresis.lowest_slope() > 0
     ]
+    for excerpt in others if better else ():
+        means = _Means(excerpt.u, excerpt.x, excerpt.use, excerpt.memory)
+        [rows] = filtered_rows([means], all_terms, dynamics, delay)
+        R = triangular_factor([rows], rows.shape[1])
+        left = {
+            name: _left_out(R, fitted(whole, law_of[name]).coefficients, law_of[name], all_terms)
+            for name in ('plays', *better)
+        }
+        better = [
+            name
+            for name in better
+            if left[name] <= (1.0 - WORTH if law_of[name].lags else NO_WORSE) ** 2 * left['plays']
+        ]
     if not better:
         return Choice(None, errors)
     best = min(better, key=errors.__getitem__)
@@ -276,6 +305,7 @@ def third_step(
     progress: Progress,
     whole: Sequence[Excerpt] | None = None,
     laws: Sequence[LawName] = LAWS,
+    others: Sequence[Excerpt] = (),
 ) -> HysteresisFit:
     """
     Find H: law and thresholds by held-out error unless their number is given, then the weights.
@@ -288,6 +318,8 @@ def third_step(
         What the weights are fitted to in the end; `fit` when absent.
     laws : sequence of str, optional
         What H may be.
+    others : sequence of Excerpt, optional
+        Small motion, which can speak against a wider law.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit
@@ -295,7 +327,7 @@ def third_step(
     choice = Choice(None)
     if settings.thresholds is None and settings.solver == 'least_squares':
         choice = choose_law(
-            fitted, G, delay, laws, lambda share: progress('hysteresis', 0.2 * share)
+            fitted, G, delay, laws, lambda share: progress('hysteresis', 0.2 * share), others
         )
     law: HysteresisLaw | NDArray[np.float64]
     if choice.law is not None:

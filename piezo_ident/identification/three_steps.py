@@ -54,6 +54,7 @@ __all__ = [
     'first_step',
     'model_of',
     'second_step',
+    'small_excerpts',
     'triangle_excerpts',
     'within',
 ]
@@ -175,6 +176,16 @@ def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
         if np.any(triangle & ~out):
             excerpts.append(run.excerpt(triangle & (out if held else ~out)))
     return excerpts
+
+
+def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
+    """Return steps and noise for judging H by small motion."""
+    uses = [run.mask('step', 'settle', 'noise') & run.known & ~run.held_out() for run in runs]
+    return [
+        Excerpt(run.u, run.x, use, run.memory)
+        for run, use in zip(runs, uses, strict=True)
+        if use.any()
+    ]
 
 
 def _orders(

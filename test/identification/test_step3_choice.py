@@ -166,3 +166,22 @@ def test_several_excerpts_have_offsets_of_their_own():
 def test_noise_chooses_nothing():
     given = excerpt('plays', TRIANGLE, noise=0.01)
     assert choose_law([given], G, D).law is None
+
+
+def test_creep_is_not_taken_for_lags_along_the_path():
+    k = np.arange(12_000)
+    small = 0.5 + 0.05 * np.sin(2 * np.pi * k / 200) * (k < 4000)
+    u = np.concatenate([TRIANGLE, legs(0, 0.5), small])
+    w = CORES['plays'](u)
+    creep = sum(c * (filter_arx(np.array([-p]), np.array([1 - p]), w) - w) for c, p in SLOW_POLES)
+    x = filter_arx(G.a, G.b, D.apply(w + creep) / np.ptp(w))
+    first = np.arange(u.size) < TRIANGLE.size
+    triangle, other = (Excerpt(u, x, use) for use in (first, ~first))
+    # follows the triangle far better, and says so
+    alone = choose_law([triangle], G, D)
+    assert alone.errors['duhem'] < 0.75 * alone.errors['plays']
+    judged = choose_law([triangle], G, D, others=[other])
+    assert judged.law is None or judged.law.name != 'duhem'
+
+
+SLOW_POLES = ((0.03, 1 - 1 / 300), (0.03, 1 - 1 / 1500))
