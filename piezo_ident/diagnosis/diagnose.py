@@ -28,19 +28,25 @@ from piezo_ident.diagnosis.forward_selection import (
     Selected,
     smallest_detectable,
 )
-from piezo_ident.diagnosis.joint_fit import Fitted, standard_deviations
+from piezo_ident.diagnosis.found_effects import found_effects
+from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.messages import left_over, part_searched, sentence, warnings_of
 from piezo_ident.diagnosis.refined_model import refine, Refined
 from piezo_ident.diagnosis.results import (
     Diagnosis,
     DiagnosisSettings,
-    FoundEffect,
-    FoundParameter,
     Residual,
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, untestable_of
+from piezo_ident.diagnosis.verdict import (
+    candidates_of,
+    errors_of_laws,
+    Findings,
+    judge,
+    set_aside,
+    untestable_of,
+)
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
@@ -201,7 +207,7 @@ def _diagnosed(
     frequencies = [line.frequency for line in lines.lines]
     shown = [HUM] * bool(frequencies)
     shown += ['cross_coupling'] * any(test.significant for test in channels)
-    misfit = rows.percent(plays.mean_square - wide.mean_square)
+    missed, misfit = _missed(model), rows.percent(plays.mean_square - wide.mean_square)
     search = ForwardSelection(
         simulator,
         frequencies,
@@ -210,7 +216,7 @@ def _diagnosed(
         progress,
         certain=shown,
         smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * misfit),
-        missed=_missed(model),
+        missed=missed,
     )
     base, selected = effects_beside(simulator, search, plays, wide)
     # 5. the verdict, and what holds
@@ -233,10 +239,11 @@ def _diagnosed(
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
-    tested = {setting.name for setting in model.effects}
-    if lines.searched:
-        # where no line stands out there is nothing to fit
-        tested.add(HUM)
+    # where no line stands out, and no channel, there is nothing to fit
+    tested = {HUM} if lines.searched else set()
+    tested |= {'cross_coupling'} if channels else set()
+    tested |= {*settings.without, *(setting.name for setting in model.effects)}
+    aside = set_aside(rows, selected, settings, noise, missed, tested)
     explainable = max(base.mean_square - noise, 1e-300)
     bent = (base.mean_square - selected.rounds[0].before.mean_square) / explainable
     progress('verdict', 1.0)
@@ -245,17 +252,17 @@ def _diagnosed(
         sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
         given=model,
         model=refined.model,
-        effects=_effects(rows, base, selected, explainable),
+        effects=found_effects(rows, base, selected, explainable),
         group=findings.group,
         unexplained=rest,
-        candidates=candidates_of(rows, selected.rounds, findings, noise),
+        candidates=candidates_of(rows, selected.rounds, findings, noise, aside),
         before=before,
         refit=refit,
         after=after,
         noise_floor=None if single is None else rows.percent(single),
         noise_source=floor.source,
         smallest_detectable=smallest,
-        untestable=untestable_of(selected.rounds[0], settings, tested),
+        untestable=untestable_of(selected.rounds, settings, {*tested, *aside}),
         faults=faults.faults,
         residuals=_residuals(simulator, given, base, refined),
         records=rows.names,
@@ -265,6 +272,9 @@ def _diagnosed(
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,
+        law=law.name if (law := selected.fitted.state.law) else '',
+        errors_of_laws=errors_of_laws(rows, (selected.fitted, plays, wide)),
+        kinds=rows.kinds,
     )
 
 
@@ -354,54 +364,14 @@ def _residuals(
     simulator: Simulator, given: State, base: Fitted, refined: Refined
 ) -> tuple[Residual, ...]:
     Y = simulator.model.scaling.Y
-    full = [simulator.full(s) for s in (given, base.state, refined.state)]
+    # of a refit alone there is no model between the given and the refined one
+    is_refit = not refined.is_given and not refined.state.effects
+    before = refined.state if is_refit else base.state
+    full = [simulator.full(s) for s in (given, before, refined.state)]
     residuals = []
     for i, run in enumerate(simulator.rows.runs):
-        as_given, before, after = ((run.x - x[i]) * Y for x in full)
-        residuals.append(Residual(run.record, run.piece, as_given, before, after, sound=run.known))
-    return tuple(residuals)
-
-
-def _effects(
-    rows: Rows, base: Fitted, selected: Selected, explainable: float
-) -> tuple[FoundEffect, ...]:
-    """Return the effects that were added, with parameters as in the record with most rows."""
-    if not selected.taken:
-        return ()
-    fitted = selected.fitted
-    std = standard_deviations(rows, fitted)
-    steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
-    levels = [base.mean_square, *steps, fitted.mean_square]
-    found = []
-    for i, (added, level, left) in enumerate(
-        zip(fitted.state.effects, levels[:-1], levels[1:], strict=True)
-    ):
-        gain = max(level - left, 0.0)
-        values = added.values[rows.longest]
-        parameters = {}
-        for p in added.effect.parameters:
-            keys = [(i, p.name, k) for k in range(np.size(values[p.name]) if p.vector else 1)]
-            spread = tuple(std.get(key, 0.0) for key in keys)
-            known = any(key in std for key in keys)
-            parameters[p.name] = FoundParameter(
-                value=_plain(values[p.name]),
-                unit=p.unit,
-                std=None if not known else spread if p.vector else spread[0],
-            )
-        found.append(
-            FoundEffect(
-                name=added.name,
-                slot=added.effect.slot,
-                share=float(np.clip(gain / explainable, 0.0, 1.0)),
-                rms_percent=rows.percent(gain),
-                parameters=parameters,
-            )
+        as_given, between, after = ((run.x - x[i]) * Y for x in full)
+        residuals.append(
+            Residual(run.record, run.piece, as_given, between, after, sound=run.known)
         )
-    return tuple(found)
-
-
-def _plain(value: object) -> float | str | tuple[float, ...]:
-    if isinstance(value, str):
-        return value
-    array = np.asarray(value, dtype=np.float64)
-    return tuple(float(x) for x in array) if array.ndim else float(array)
+    return tuple(residuals)

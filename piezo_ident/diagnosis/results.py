@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,8 @@ __all__ = [
 ]
 
 FORMULA = (
-    '100 rms(y - y_hat) / (max y - min y), free run; before: the model as it was given; after: '
-    'each block of data with the parameters fitted to the others'
+    '100 rms(y - y_hat) / (max y - min y), free run, the zero of each record free; before: the '
+    'model as it was given; after: each kind of motion with the parameters fitted to the others'
 )
 
 
@@ -208,7 +208,7 @@ class Diagnosis(Showable):
 
     Attributes
     ----------
-    verdict : {'named', 'class', 'partly_explained', 'unexplained', 'none'}
+    verdict : {'named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none'}
     sentence : str
         The verdict for a reader.
     given, model : StageModel
@@ -216,13 +216,15 @@ class Diagnosis(Showable):
     effects : tuple of FoundEffect
         In the order in which they were found.
     group : Class or None
+        Effects that these data cannot tell apart; those that may hide in a refit of H alone.
     unexplained : Unexplained
     candidates : tuple of Candidate
         Best first.
     before, refit, after : Errors
-        Of the model as given, of the base model refitted (held out), of the refined model (held
-        out); what follows time counts as it was found in these records, and H as refitted with
-        it, though the model leaves both out where there is nothing else.
+        Of the model as given; of the base model refitted, blocks held out; of the refined model,
+        kinds of motion held out as a whole; what follows time counts as it was found in these
+        records, and H as refitted with it, though the model leaves both out where there is
+        nothing else.
     noise_floor : float or None
         Rms of single samples, % of stroke.
     noise_source : str
@@ -238,6 +240,12 @@ class Diagnosis(Showable):
     settings : DiagnosisSettings
     unseen : tuple of Unseen
         Errors on records that took no part.
+    law : str
+        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`.
+    errors_of_laws : mapping of str to float
+        Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
+    kinds : tuple of str
+        Kinds of motion held out in turn; empty where fifths of the data stood for them.
 
     Examples
     --------
@@ -273,3 +281,6 @@ class Diagnosis(Showable):
     warnings: tuple[str, ...]
     settings: DiagnosisSettings
     unseen: tuple[Unseen, ...] = ()
+    law: str = ''
+    errors_of_laws: Mapping[str, float] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()

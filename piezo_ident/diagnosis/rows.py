@@ -39,6 +39,8 @@ ROW_RATE, MOST_ROWS = 5000.0, 200_000
 BLOCKS, FOLDS = 80, 5
 #: whole stretches of one kind that are held out in turn, at most
 GROUPS = 8
+#: name of the kinds that are too small, and of a fifth of what has one kind alone
+REST, PART = 'the rest', ', part '
 
 Memory = Callable[[Array], Array]
 
@@ -103,6 +105,12 @@ class Rows:
     def n(self) -> int:
         """Number of rows."""
         return int(self.x.size)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of excitation that are held out in turn; empty where fifths stand for them."""
+        fifths = all(x == REST or PART in x for x in self.labels)
+        return () if fifths else self.labels
 
     @property
     def passes(self) -> float:
@@ -269,7 +277,7 @@ def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
     if not run.piece.segments:
         # without labels, fifths of the time stand for kinds
         edges = np.linspace(0, n, 6).astype(int)
-        names = [f'{run.record}, part {i + 1}' for i in range(5)]
+        names = [f'{run.record}{PART}{i + 1}' for i in range(5)]
         return [
             (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
         ]
@@ -299,11 +307,11 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
     rest = len(names)
     group = np.array([number.get(label, rest) for label in labels])
     if np.any(group == rest):
-        names = [*names, 'the rest']
+        names = [*names, REST]
     if len(names) == 1:
         # of one kind nothing would be left to predict it from: fifths of it stand for kinds
         group = np.arange(group.size) * 5 // group.size
-        names = [f'{names[0]}, part {i + 1}' for i in range(int(group.max()) + 1)]
+        names = [f'{names[0]}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
     return group, tuple(names)
 
 

@@ -6,14 +6,17 @@ The verdict: what was found, how sure that is, and what the data cannot tell.
 
 A name needs nearly all that can be explained, and must be clearly ahead of every other candidate;
 otherwise the names that remain are reported as a class, or the residual as partly explained or
-unexplained.  No real effect has quite the form of a textbook law, so of two laws the one that
-leaves less need not be the cause: it must leave clearly less, by more than laws deviate, and by
-more than the difference scatters over held-out blocks.
+unexplained.  Where a refit of H alone brought what there was to gain, that is the finding, and
+what may hide in it is a class.
+
+No real effect has quite the form of a textbook law, so of two laws the one that leaves less need
+not be the cause: it must leave clearly less, by more than laws deviate, and by more than the
+difference scatters over held-out blocks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,8 +39,10 @@ from piezo_ident.effects import catalogue, find_effect
 __all__ = [
     'Findings',
     'candidates_of',
+    'errors_of_laws',
     'judge',
     'rivals_of',
+    'set_aside',
     'untestable_of',
 ]
 
@@ -161,41 +166,96 @@ def _as_good(rival: Fitted, best: Fitted, noise: float, explainable: float, floo
 
 
 def candidates_of(
-    rows: Rows, rounds: Sequence[Round], findings: Findings, noise: float
+    rows: Rows,
+    rounds: Sequence[Round],
+    findings: Findings,
+    noise: float,
+    aside: Mapping[str, str],
 ) -> tuple[Candidate, ...]:
-    """Return every candidate that was not added, its share when added alone, and why not."""
-    first, last = rounds[0], rounds[-1]
+    """
+    Return every candidate that was not added, its share when added alone, and why not.
+
+    `aside` are those that were not tried, and why.
+    """
     possible = {name for one in rounds for name in one.best}
     possible |= {*findings.effects, *(findings.group.names if findings.group else ())}
-    left = max(first.before.mean_square - noise, 1e-300)
-    shares = {
-        name: (first.before.errors.sum() - s.errors.sum()) / rows.n / left
-        for name, s in first.best.items()
-    }
-    for c in first.contenders:
-        gain = (first.before.mean_square - c.mean_square) / left
-        shares[c.name] = max(shares[c.name], gain)
+    shares: dict[str, float] = {}
+    last: dict[str, Round] = {}
+    for one in rounds:
+        left = max(one.before.mean_square - noise, 1e-300)
+        new = {
+            name: (one.before.errors.sum() - s.errors.sum()) / rows.n / left
+            for name, s in one.best.items()
+            if name not in shares
+        }
+        for c in one.contenders:
+            if c.name in new:
+                gain = (one.before.mean_square - c.mean_square) / left
+                new[c.name] = max(new[c.name], gain)
+        shares |= new
+        last |= dict.fromkeys(one.best, one)
     found = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
         if name in findings.effects:
             continue
         value = float(np.clip(share, 0.0, 1.0))
-        why = _why_not(name, value, findings, last, rows.passes)
+        why = _why_not(name, value, findings, last[name], rows.passes)
         is_partly = findings.verdict == 'partly_explained'
         if is_partly and value >= shares.get(findings.effects[0], 1.0):
             why = f'explains no less than {findings.effects[0]}, which is as simple or simpler'
         found.append(Candidate(name, value, why))
     found += [
         Candidate(name, 0.0, 'these data speak against it')
-        for name, share in first.visible.items()
+        for name, share in _visible(rounds).items()
         if share >= criteria.SWALLOWED and name not in possible
     ]
-    return tuple(found)
+    return (*found, *(Candidate(name, 0.0, why) for name, why in aside.items()))
+
+
+def _visible(rounds: Sequence[Round]) -> dict[str, float]:
+    """Return the share of the columns of each candidate that the rest could not make at best."""
+    found: dict[str, float] = {}
+    for one in rounds:
+        for name, share in one.visible.items():
+            found[name] = max(share, found.get(name, 0.0))
+    return found
+
+
+def set_aside(
+    rows: Rows,
+    selected: Selected,
+    settings: DiagnosisSettings,
+    noise: float,
+    missed: float,
+    tested: Collection[str],
+) -> dict[str, str]:
+    """
+    Return the candidates that were not tried though data might show them, and why not.
+
+    `missed` is what the model missed when it was identified, % of stroke.
+    """
+    tried = _visible(selected.rounds)
+    size = rows.percent(selected.rounds[0].before.mean_square - noise)
+    found = {}
+    for name in settings.effects or tuple(catalogue()):
+        effect = find_effect(name)
+        if name in tried or name in tested:
+            continue
+        if effect.in_dynamics and size < missed:
+            found[name] = (
+                f'{size:.2g} % of stroke are left for it, less than the {missed:.2g} % that the '
+                'model missed when it was identified'
+            )
+        elif effect.rate_independent and selected.imitated is None:
+            found[name] = 'a sum of plays leaves nothing for it'
+    return found
 
 
 def _why_not(name: str, share: float, findings: Findings, last: Round, passes: float) -> str:
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
+        if not findings.effects:
+            return 'may hide in the refit of the hysteresis'
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
     if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'
@@ -207,7 +267,9 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
             return f'{explains}, of a range that was passed too rarely to test that'
         if share < criteria.ADDED:
             return f'{explains}, too little for a cause'
-        return f'{explains}, as chance might, or at the expense of another kind of excitation'
+        if find_effect(name).rate_independent:
+            return f'{explains} beside plays; a wider hysteresis may explain as much'
+        return f'{explains}, but not where it alone acts, not beyond chance, or at a price'
     if name in last.best and last.before.mean_square > 0.0:
         more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
         if more < criteria.LEAST_GAIN:
@@ -216,14 +278,21 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
 
 
 def untestable_of(
-    first: Round, settings: DiagnosisSettings, tested: Collection[str]
+    rounds: Sequence[Round], settings: DiagnosisSettings, tested: Collection[str]
 ) -> tuple[Untestable, ...]:
     """Return the candidates that these data cannot show, but for those `tested` otherwise."""
-    names = settings.effects or tuple(catalogue())
+    names, visible = settings.effects or tuple(catalogue()), _visible(rounds)
     return tuple(
         Untestable(name, find_effect(name).needs or 'data in which it shows')
         for name in names
-        if name not in settings.without
-        and name not in tested
-        and first.visible.get(name, 0.0) < criteria.SWALLOWED
+        if name not in tested and visible.get(name, 0.0) < criteria.SWALLOWED
     )
+
+
+def errors_of_laws(rows: Rows, fits: Iterable[Fitted]) -> dict[str, float]:
+    """Return how far the laws of H miss kinds of excitation held out, % of stroke."""
+    return {
+        fitted.state.law.name: rows.percent(float(fitted.transfer.sum()) / rows.n)
+        for fitted in fits
+        if fitted.state.law is not None and not fitted.state.effects
+    }

@@ -1,0 +1,63 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The effects that were added, with their shares and parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+from piezo_ident.diagnosis.forward_selection import Selected
+from piezo_ident.diagnosis.joint_fit import Fitted, standard_deviations
+from piezo_ident.diagnosis.results import FoundEffect, FoundParameter
+from piezo_ident.diagnosis.rows import Rows
+
+__all__ = ['found_effects']
+
+
+def found_effects(
+    rows: Rows, base: Fitted, selected: Selected, explainable: float
+) -> tuple[FoundEffect, ...]:
+    """
+    Return the effects that were added, with parameters as in the record with most rows.
+
+    `explainable` is the mean square that there was to explain.
+    """
+    if not selected.taken:
+        return ()
+    fitted = selected.fitted
+    std = standard_deviations(rows, fitted)
+    steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
+    levels = [base.mean_square, *steps, fitted.mean_square]
+    found = []
+    for i, (added, level, left) in enumerate(
+        zip(fitted.state.effects, levels[:-1], levels[1:], strict=True)
+    ):
+        gain = max(level - left, 0.0)
+        values = added.values[rows.longest]
+        parameters = {}
+        for p in added.effect.parameters:
+            keys = [(i, p.name, k) for k in range(np.size(values[p.name]) if p.vector else 1)]
+            spread = tuple(std.get(key, 0.0) for key in keys)
+            known = any(key in std for key in keys)
+            parameters[p.name] = FoundParameter(
+                value=_plain(values[p.name]),
+                unit=p.unit,
+                std=None if not known else spread if p.vector else spread[0],
+            )
+        found.append(
+            FoundEffect(
+                name=added.name,
+                slot=added.effect.slot,
+                share=float(np.clip(gain / explainable, 0.0, 1.0)),
+                rms_percent=rows.percent(gain),
+                parameters=parameters,
+            )
+        )
+    return tuple(found)
+
+
+def _plain(value: object) -> float | str | tuple[float, ...]:
+    if isinstance(value, str):
+        return value
+    array = np.asarray(value, dtype=np.float64)
+    return tuple(float(x) for x in array) if array.ndim else float(array)
