@@ -84,16 +84,19 @@ def example(verdict: str = 'named') -> Diagnosis:
     Return a diagnosis with a verdict of one's choice.
 
     'named' has creep in it; 'class' adds what it cannot be told from, 'partly_explained' leaves
-    something; 'unexplained' and 'none' have no effect.
+    something; 'unexplained' and 'none' have no effect, 'refitted' another H and a class.
     """
     record = measured()
     (piece,) = record.pieces
     given = piece.y - slow_model().predict_piece(piece)
     before = given - given.mean()
     added = verdict in ('named', 'class', 'partly_explained')
+    refit = verdict == 'refitted'
     after = piece.y - refined_model().predict_piece(piece) if added else before
     if verdict == 'none':
         given = before = after = NOISE * np.random.default_rng(4).standard_normal(piece.n)
+    if refit:
+        before = after = NOISE * np.random.default_rng(4).standard_normal(piece.n)
     effect = FoundEffect(
         name='creep',
         slot='hidden',
@@ -108,6 +111,7 @@ def example(verdict: str = 'named') -> Diagnosis:
         'named': 'Creep explains 93 % of what the model missed.',
         'class': 'Creep or thermal drift explains 93 % of what the model missed.',
         'partly_explained': 'Creep explains 60 % of what the model missed; 0.2 % is left.',
+        'refitted': 'The hysteresis of the model is not that of these data.',
         'unexplained': 'No candidate explains what the model misses.',
         'none': 'Nothing is missing that these data could show.',
     }
@@ -118,7 +122,7 @@ def example(verdict: str = 'named') -> Diagnosis:
         given=slow_model(),
         model=refined_model() if added else slow_model(),
         effects=(effect,) if added else (),
-        group=group if verdict == 'class' else None,
+        group=group if verdict in ('class', 'refitted') else None,
         unexplained=Unexplained(
             0.07 if added else 1.0,
             errors(record, after).overall,
@@ -148,6 +152,9 @@ def example(verdict: str = 'named') -> Diagnosis:
         blocks=40,
         warnings=('no repeated periods',),
         settings=DiagnosisSettings(seed=5),
+        law='preisach' if refit else 'plays',
+        errors_of_laws={'plays': 0.3, 'duhem': 0.1},
+        kinds=('sine:5Hz', 'staircase', 'sine:50Hz') if refit else (),
     )
 
 

@@ -16,7 +16,7 @@ from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['warn_of_range', 'warn_of_zeros', 'warnings_of']
+__all__ = ['LAW_WORDS', 'warn_of_range', 'warn_of_zeros', 'warnings_of']
 
 #: change of G within the excited band below which the band is too narrow to know G by
 HARDLY = 0.1

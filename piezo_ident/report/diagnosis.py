@@ -14,6 +14,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter
 from piezo_ident.effects import find_effect
+from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model import metrics
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.refined import changes
@@ -65,10 +66,13 @@ def headline(result: Diagnosis) -> str:
 
 def error_table(result: Diagnosis) -> Table:
     """Return the errors before and after: overall, by segment and by frequency of a sine."""
-    states = (result.before, result.refit, result.after)
+    states, names = [result.before, result.refit, result.after], [*STATES]
+    if result.verdict == 'refitted':
+        # the refined model is the same with H refitted
+        del states[1], names[1]
 
     def row(name: str, values: list[float]) -> tuple[str, ...]:
-        ratio = values[0] / values[2] if values[2] > 0.0 else math.nan
+        ratio = values[0] / values[-1] if values[-1] > 0.0 else math.nan
         return (name, *map(number, values), number(ratio, 2))
 
     # rests and ramps come last
@@ -81,12 +85,13 @@ def error_table(result: Diagnosis) -> Table:
     for f in frequencies:
         values = [s.by_frequency.get(f, math.nan) for s in states]
         rows.append(row(f'sines of {float(f):g} Hz', values))
-    note = (
-        f'{FORMULA}. H refitted: the same model with its hysteresis and offsets '
-        f'fitted to these data and nothing added, held out likewise. {result.blocks} blocks of '
-        'data were predicted in turn from the others.'
-    )
-    return Table('Errors in % of stroke', ('', *STATES, 'times smaller'), rows, note)
+    note = f'{FORMULA}.'
+    if len(names) > 2:
+        note += (
+            ' H refitted: the same model with its hysteresis and offsets fitted to these data and '
+            f'nothing added; {result.blocks} blocks were predicted in turn from the others.'
+        )
+    return Table('Errors in % of stroke', ('', *names, 'times smaller'), rows, note)
 
 
 def unseen_tables(result: Diagnosis) -> list[Table]:
@@ -154,27 +159,63 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
     """Return the few numbers that stand beside the verdict."""
     errors = zip(STATES, (result.before, result.refit, result.after), strict=True)
+    nothing = 'nothing'
+    if result.verdict == 'refitted':
+        errors = zip(STATES[::2], (result.before, result.after), strict=True)
+        nothing = 'nothing; H was refitted'
     return [
         ('verdict', result.verdict.replace('_', ' ')),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
-        ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
+        ('added', ', '.join(e.name for e in result.effects) or nothing),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
 
 
 def remains(result: Diagnosis) -> list[tuple[str, str]]:
-    """Return what is left, the noise and the smallest effect that would have been added."""
+    """Return what is left, what the errors stand for, H, the noise, and what would be found."""
     left, smallest, floor = result.unexplained, result.smallest_detectable, result.noise_floor
     source = result.noise_source.removeprefix(UNKNOWN)
     rest = f': {left.description}' if left.description else ''
     noise = 'unknown' if floor is None else f'{number(floor)} % of stroke, rms of single samples'
+    size = f'{number(left.rms_percent)} % of stroke'
     rows = [
-        ('unexplained', _left(left.share, left.rms_percent) + rest),
+        # nothing was added that could have a share
+        ('unexplained', (_left(left.share, left.rms_percent) if result.effects else size) + rest),
+        ('error holds', _stands_for(result)),
+        *(('hysteresis', text) for text in _law(result)),
         ('noise floor', f'{noise} ({source})'),
     ]
     if smallest is not None:
         rows.append(('detectable', f'effects from {number(smallest)} % of stroke rms'))
     return rows
+
+
+def _stands_for(result: Diagnosis) -> str:
+    """Return the motions for which the error of the refined model stands."""
+    if not result.kinds:
+        return (
+            'for motion like that of these data alone: fifths of them were predicted in turn from '
+            'the rest'
+        )
+    return (
+        'for motion of the kinds in these data, each predicted from the others: '
+        f'{", ".join(result.kinds)}'
+    )
+
+
+def _law(result: Diagnosis) -> list[str]:
+    """Return whether H is a sum of plays, and what each law leaves on kinds held out."""
+    errors = result.errors_of_laws
+    if not errors:
+        return []
+    words = LAW_WORDS.get(result.law)
+    compared = ', '.join(
+        f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
+    )
+    return [
+        ('a sum of plays' if words is None else f'not a sum of plays: H has {words}')
+        + f'; refitted with nothing added, laws of H predict what was held out to {compared}'
+    ]
 
 
 def _left(share: float, rms_percent: float) -> str:
@@ -245,7 +286,10 @@ def _added(result: Diagnosis) -> list[str]:
 def _alike(result: Diagnosis) -> list[str]:
     if result.group is None:
         return []
-    return [', '.join(result.group.names), f'what would: {result.group.separating_experiment}']
+    names, what = ', '.join(result.group.names), 'what would'
+    if result.verdict == 'refitted':
+        names, what = f'{names}, which may hide in the refit', 'what would tell'
+    return [names, f'{what}: {result.group.separating_experiment}']
 
 
 def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]:
@@ -254,7 +298,8 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     if most is not None and n > most:
         title, rows = f'{title}, the first {most} of {n}', rows[:most]
     note = (
-        'Share of the explainable part of the residual that each explains when it is added alone.'
+        'Share of the explainable part of the residual that each explains when it is added alone; '
+        'for effects that follow the path of the voltage alone, of what a sum of plays leaves.'
     )
     return table(title, ('effect', 'share', 'why not'), rows, note)
 

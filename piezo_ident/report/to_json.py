@@ -227,6 +227,8 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
         },
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
         'smallest_detectable': {'percent_of_stroke': result.smallest_detectable},
+        'hysteresis': {'law': result.law, 'errors_of_laws': dict(result.errors_of_laws)},
+        'held_out_kinds': list(result.kinds),
         'untestable': [asdict(x) for x in result.untestable],
         'data_faults': [asdict(fault) for fault in result.faults],
         'records': list(result.records),

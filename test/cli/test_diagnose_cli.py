@@ -68,7 +68,8 @@ def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
     assert [e['name'] for e in data['effects']] == ['creep']
     assert data['sentence'] in text.replace('\n', ' ')
     # the noise of the example is 0.0053 % of its stroke
-    assert data['error']['before']['overall'] > 0.5
+    # without its mean: the zero of each record is free
+    assert data['error']['before']['overall'] > 0.4
     assert data['error']['after']['overall'] < 0.01
     model = load(refined)
     assert [e.name for e in model.effects] == ['creep']

@@ -26,8 +26,10 @@ from piezo_ident.report.table import number
 from programs import slow_model
 import pytest
 
+VERDICTS = ['named', 'partly_explained', 'refitted', 'unexplained', 'none']
 
-@pytest.mark.parametrize('verdict', ['named', 'partly_explained', 'unexplained', 'none'])
+
+@pytest.mark.parametrize('verdict', VERDICTS)
 def test_page_and_summary_hold_for_every_verdict(verdict):
     result = example(verdict)
     html = page_html(diagnosis_page(result, [], []))
@@ -36,6 +38,19 @@ def test_page_and_summary_hold_for_every_verdict(verdict):
     assert ('<h3>Parameters</h3>' in html) == bool(result.effects)
     for errors in (result.before, result.refit, result.after):
         assert number(errors.overall) in html
+
+
+def test_a_refit_tells_of_its_law_of_what_may_hide_and_of_the_motions_it_stands_for():
+    result = example('refitted')
+    for text in (page_html(diagnosis_page(result, [], [])), diagnosis_text(result)):
+        words = ' '.join(text.split())
+        assert 'creep, thermal_drift, gain_drift, which may hide in the refit' in words
+        assert 'not a sum of plays: H has a Preisach density' in words
+        assert 'plays 0.300 %, duhem 0.100 %' in words
+        assert 'each predicted from the others: sine:5Hz, staircase, sine:50Hz' in words
+    assert error_table(result).head == ('', 'as given', 'refined', 'times smaller')
+    words = ' '.join(diagnosis_text(example('named')).split())
+    assert 'fifths of them were predicted' in words and 'hysteresis a sum of plays' in words
 
 
 def test_unknown_numbers_are_dashes_or_left_out():

@@ -102,6 +102,25 @@ def test_without_a_refinement_nothing_is_drawn_as_refined():
     assert len(residual_figure(refined).axes) == 4
 
 
+def test_a_refit_is_drawn_as_one_model_beside_the_given_one():
+    result = example('refitted')
+    axes = errors_figure(result).axes[0]
+    assert axes.get_legend_handles_labels()[1] == [
+        'noise',
+        'as given',
+        'H refitted, nothing added',
+    ]
+    n = 1 + len(result.before.by_segment)
+    assert [bar.get_width() for bar in axes.patches][::n] == [
+        result.before.overall,
+        result.after.overall,
+    ]
+    # both on one scale, and the refit enlarged
+    assert len(residual_figure(result.residuals[0]).axes) == 3
+    captions = [p.caption for p in draw_diagnosis(result).pictures]
+    assert sum('after: H refitted, nothing added' in text for text in captions) >= 2
+
+
 def test_names_of_short_segments_keep_apart():
     (residual,) = example().residuals
     edges = np.linspace(2000, 4000, 41).astype(int)

@@ -15,7 +15,7 @@ from piezo_ident.diagnosis.results import Errors, FORMULA, FoundParameter
 from piezo_ident.report.to_json import diagnosis_schema, json_text, to_json
 import pytest
 
-VERDICTS = ('named', 'class', 'partly_explained', 'unexplained', 'none')
+VERDICTS = ('named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none')
 
 nan, inf = math.nan, math.inf
 
@@ -100,7 +100,19 @@ def test_what_it_says():
     assert data['class'] is None
     assert data['seed'] == 5
     assert data['records'] == ['val.npz']
+    assert (data['hysteresis']['law'], data['held_out_kinds']) == ('plays', [])
     assert to_json(example('class'))['class']['names'] == ['creep', 'thermal_drift', 'gain_drift']
+
+
+def test_a_refit_says_what_may_hide_in_it():
+    data = to_json(example('refitted'))
+    assert data['verdict'] == 'refitted' and data['effects'] == []
+    assert len(data['class']['names']) == 3
+    assert data['hysteresis'] == {
+        'law': 'preisach',
+        'errors_of_laws': {'plays': 0.3, 'duhem': 0.1},
+    }
+    assert data['held_out_kinds'] == ['sine:5Hz', 'staircase', 'sine:50Hz']
 
 
 def test_what_is_not_finite():

@@ -32,6 +32,7 @@ TRACES = 4
 #: segments that are shown, at most
 SEGMENTS = 18
 SAME = 'Before: H refitted, nothing added; after: the refined model.'
+REFIT = 'Before: the model as given; after: H refitted, nothing added.'
 
 
 def draw_diagnosis(
@@ -42,8 +43,9 @@ def draw_diagnosis(
         (
             'errors',
             'Error before and after',
-            'Free run. Of the model as it was given; of the same with H refitted to other parts '
-            'of these data and nothing added; of the refined model, held out likewise.',
+            'Free run. Of the model as it was given; where an effect was added, of the same with '
+            'H refitted to other blocks of these data and nothing added; of the refined model, '
+            'fitted to other kinds of motion.',
             lambda: errors_figure(diagnosis),
         ),
     ]
@@ -58,11 +60,12 @@ def draw_diagnosis(
             )
         )
     analyses = cache(lambda: _analyses(diagnosis))
+    what = REFIT if _is_refit(diagnosis) else SAME
     wanted += [
         (
             'signature',
             'What the residual depends on',
-            f'{SAME} Mean over the voltage, its rate, and the time since a step '
+            f'{what} Mean over the voltage, its rate, and the time since a step '
             '(there multiplied by the size of the step), with two standard '
             'deviations; the share of variance is held out. What is left should be flat.',
             lambda: residual_dependence_figure(*analyses()),
@@ -70,13 +73,13 @@ def draw_diagnosis(
         (
             'spectrum',
             'Spectrum of the residual',
-            f'{SAME} Amplitude spectral density of the longest stretch; green: lines.',
+            f'{what} Amplitude spectral density of the longest stretch; green: lines.',
             lambda: residual_spectrum_figure(*analyses()),
         ),
         (
             'coherence',
             'Does the residual follow the voltage?',
-            f'{SAME} Noise alone leaves the bound at one frequency of a hundred.',
+            f'{what} Noise alone leaves the bound at one frequency of a hundred.',
             lambda: residual_coherence_figure(*analyses()),
         ),
     ]
@@ -101,15 +104,27 @@ def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis 
         )
 
     try:
+        if _is_refit(diagnosis):
+            return analysed('given'), analysed('after')
         after = analysed('after') if differ(diagnosis.residuals) else None
         return analysed('before'), after
     except DataError as error:
         raise NothingToDraw(str(error)) from None
 
 
+def _is_refit(diagnosis: Diagnosis) -> bool:
+    """Return whether the refined model is the given one with another H alone."""
+    return not differ(diagnosis.residuals) and not all(
+        np.array_equal(r.given, r.after) for r in diagnosis.residuals
+    )
+
+
 def _states(diagnosis: Diagnosis) -> list[tuple[Errors, str, str]]:
     """Return the errors that are compared, with their names and colours."""
     errors = (diagnosis.before, diagnosis.refit, diagnosis.after)
+    if _is_refit(diagnosis):
+        # of the refit, the error on kinds of motion that were held out
+        return [(errors[0], STATES[0][1], STATES[0][2]), (errors[2], STATES[1][1], STATES[1][2])]
     shown = 3 if differ(diagnosis.residuals) else 2
     return [
         (e, name, colour) for e, (_, name, colour) in zip(errors, STATES[:shown], strict=False)

@@ -73,11 +73,13 @@ def residual_figure(residual: Residual) -> Figure:
     e = {name: getattr(residual, name)[residual.sound] for name, _, _ in STATES}
     limit, largest = style.axis_limit(np.concatenate(list(e.values())))
     rows: list[tuple[tuple[str, ...], float, str]] = [(('given', 'before'), limit, '')]
+    last = 'before'
     if differ([residual]):
-        rows.append((('after',), limit, 'on the same scale'))
-        small, _ = style.axis_limit(e['after'])
-        if 0.0 < small < limit / ENLARGED:
-            rows.append((('after',), small, f'{limit / small:.2g} times enlarged'))
+        last = 'after'
+        rows.append(((last,), limit, 'on the same scale'))
+    small, _ = style.axis_limit(e[last])
+    if 0.0 < small < limit / ENLARGED:
+        rows.append(((last,), small, f'{limit / small:.2g} times enlarged'))
     fig = style.figure(1.2 + 1.6 * len(rows))
     ratios = {'height_ratios': [0.8, *[1.5] * len(rows)]}
     axes = fig.subplots(1 + len(rows), 1, sharex=True, gridspec_kw=ratios)
@@ -243,9 +245,18 @@ def residual_dependence_figure(
         # means over lg t, in which a decade counts as much as any other
         what = 'the means' if name == 'time since the step' else 'the variance'
         style.note(axes, f'explains {" → ".join(shares)} of {what}')
-        style.legend(axes)
-    for axes in grid.ravel()[len(names) :]:
+    free = grid.ravel()[len(names) :]
+    for axes in free:
         axes.set_axis_off()
+    shown: dict[str, Any] = {}
+    for axes in grid.ravel()[: len(names)]:
+        lines, labels = axes.get_legend_handles_labels()
+        shown |= dict(zip(labels, lines, strict=True))
+        if not free.size:
+            style.legend(axes)
+    if free.size:
+        # an empty place holds the legend of all, and covers no curve
+        style.legend(free[0], handles=list(shown.values()), labels=list(shown), loc='center')
     fig.align_ylabels(list(grid.ravel()))
     return fig
 
