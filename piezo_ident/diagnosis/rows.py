@@ -320,6 +320,6 @@ def _memory(model: StageModel, run: Run) -> Memory:
     if is_at_rest(model, run.piece):
         return lambda r: initial_memory(u0, r)
     at = np.concatenate([[0.0], model.hysteresis.thresholds])
-    value = np.concatenate([[u0], fit_memory(model, run.piece)])
+    value = np.concatenate([[u0], fit_memory(model, run.piece)[: at.size - 1]])
     # a play output falls by at most its threshold; between known ones it is interpolated
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)

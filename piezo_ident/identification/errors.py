@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.results import ErrorRow, Memories
-from piezo_ident.model.initial_memory import start_memory
+from piezo_ident.model.initial_memory import forgetting, forgotten, start_memory
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
@@ -55,6 +55,9 @@ def predictions_of(
         memory, judged = (memories or {}).get(key_of(run)), run.use
         if memory is None:
             memory, judged = start_memory(model, run.piece), run.known
+            if memory is not None:
+                late = forgotten(run.piece.v, way=forgetting(model))
+                judged = judged & (np.arange(judged.size) >= late)
         # a sensor may be set to zero between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
         y_hat, y_static = (m.predict_piece(run.piece, memory) + zero for m in (model, static))

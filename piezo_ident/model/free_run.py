@@ -18,7 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
-from piezo_ident.model.initial_memory import connected_pieces, forgotten, start_memory
+from piezo_ident.model.initial_memory import (
+    connected_pieces,
+    forgetting,
+    forgotten,
+    start_memory,
+)
 from piezo_ident.model.metrics import nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import without_faults
@@ -166,7 +171,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             parts = [piece.v for piece in pieces]
             v = parts[0] if len(parts) == 1 else np.concatenate(parts)
             # a voltage that rests forgets nothing
-            start = forgotten(v) if v.min() < v.max() else v.size
+            start = forgotten(v, way=forgetting(model)) if v.min() < v.max() else v.size
         for piece in pieces:
             starts.append(min(start, piece.n))
             start -= starts[-1]

@@ -182,8 +182,8 @@ class StageModel:
 
         Parameters
         ----------
-        memory : array_like, shape (m,), optional
-            Play outputs at the start, normalised.
+        memory : array_like, shape (m,) or (m + k,), optional
+            Play outputs at the start, normalised; behind them the lags along the path, if any.
         """
         core: Operator = HysteresisOperator(self.hysteresis, memory)
         for setting in self.effects_in('hysteresis'):
@@ -255,9 +255,9 @@ class StageModel:
             Voltage [V], sampled at `sample_rate`; the stage is at rest under the first sample.
         channels : mapping of str to array_like, shape (n,), optional
             Further signals that effects of the model depend on.
-        start : array_like, shape (m,), optional
-            Play outputs before the first sample, normalised; those of a stage that last came
-            down to zero when absent.
+        start : array_like, shape (m,) or (m + k,), optional
+            Play outputs before the first sample, normalised, and behind them the lags along the
+            path; those of a stage that last came down to zero when absent.
 
         Returns
         -------
@@ -296,7 +296,7 @@ class StageModel:
 
         Parameters
         ----------
-        memory : array_like, shape (m,), optional
+        memory : array_like, shape (m,) or (m + k,), optional
             As `start` of `simulate`.
 
         Examples

@@ -283,8 +283,8 @@ class Hysteresis:
         ----------
         v : array_like, shape (n,)
             Normalised input.
-        memory : array_like, shape (m,), optional
-            Play outputs before the first sample.
+        memory : array_like, shape (m,) or (m + k,), optional
+            Play outputs before the first sample, and the lags along the path behind them.
 
         Returns
         -------
@@ -294,14 +294,24 @@ class Hysteresis:
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
         return self.follow(x, start)[0]
 
+    @functools.cached_property
+    def lag_range(self) -> NDArray[np.float64]:
+        """Least and largest phi_j over the span, between which a lag stays; shape (2, k)."""
+        if self.relaxations is None:
+            return np.empty((2, 0))
+        v = np.linspace(*self.span, 65)
+        phi = self.relaxations[:, 1:] @ np.array([v, v**2, v**3])
+        return np.array([phi.min(axis=1), phi.max(axis=1)])
+
     def settled(self, v0: float) -> NDArray[np.float64]:
         """
         Return the lags along the path of a stage that was swept, came down, and went to `v0`.
 
-        The sweeps are those over the span; the plays of `initial_memory` last came down, too.
+        Behind them, as they are carried on, stands `v0`: shape (k + 1,).  The sweeps are those
+        over the span; the plays of `initial_memory` last came down, too.
         """
         if self.relaxations is None:
-            return np.empty(0)
+            return np.array([v0])
         low, high = self.span
         phi = self.relaxations[:, 1:] @ np.array([low, low * low, low**3])
         lags, way = np.append(phi, low), np.array([high, low, high, low, v0])
@@ -315,7 +325,8 @@ class Hysteresis:
         Return w for the next inputs, shape (n,), and the memory after them.
 
         That are the play outputs, shape (m,), and behind them the lags along the path; without
-        lags these begin as `settled` at the first input.
+        lags these begin as `settled` at the first input.  Behind the lags stands the last input;
+        without it, shape (m + k,), they begin at the first.
         """
         x, m = np.ascontiguousarray(v), self.thresholds.size
         plays = memory[:m]
@@ -329,6 +340,8 @@ class Hysteresis:
         if not x.size:
             return out, memory
         lags = memory[m:].copy() if memory.size > m else self.settled(float(x[0]))
+        if lags.size == len(self.relaxations):
+            lags = np.append(lags, x[0])
         relaxing(x, np.array(self.relaxations), lags, out)
         return out, np.concatenate([end, lags])
 
@@ -369,10 +382,13 @@ class HysteresisOperator:
     def __init__(self, hysteresis: Hysteresis, memory: ArrayLike | None = None) -> None:
         self.hysteresis = hysteresis
         self._given = None if memory is None else np.array(memory, np.float64)
-        if self._given is not None and self._given.shape != hysteresis.thresholds.shape:
+        m, k = hysteresis.thresholds.size, hysteresis.lag_range.shape[1]
+        sizes = {m, m + k, m + k + 1} if k else {m}
+        if self._given is not None and (self._given.ndim != 1 or self._given.size not in sizes):
+            also = f', and behind them that of each of {k} lags' if k else ''
             raise ModelError(
-                f'hysteresis: {self._given.size} play outputs at the start for '
-                f'{hysteresis.thresholds.size} thresholds; give one each'
+                f'hysteresis: {self._given.size} play outputs at the start for {m} thresholds; '
+                f'give one each{also}'
             )
         self.memory = hysteresis.initial_memory(0.0)
 

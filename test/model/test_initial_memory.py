@@ -12,7 +12,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
 from piezo_ident.model import initial_memory as memory_module
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.initial_memory import fit_memory, forgotten, is_at_rest, start_memory
+from piezo_ident.model.initial_memory import (
+    fit_memory,
+    forgetting,
+    forgotten,
+    is_at_rest,
+    start_memory,
+)
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Piece, Record
@@ -132,3 +138,38 @@ def test_a_gap_does_not_make_an_unknown_start_known():
     assert found.errors_after_start.n == piece.n - forgotten(V)
     still = Record((replace(piece, v=np.full(piece.n, 5.0)),))
     assert free_run(PAPER, still).errors_after_start is None
+
+
+def with_lags(gap=0.2):
+    """Return the paper's stage with three lags along the path behind its plays."""
+    lags = [[2.0, gap, 0.1, 0.0], [4.0, -0.1, 0.3, -0.2], [8.0, 0.1, 0.0, 0.1]]
+    return replace(PAPER, hysteresis=replace(PAPER.hysteresis, relaxations=lags))
+
+
+@pytest.mark.parametrize('v0', [2.0, 5.0, 8.0])
+def test_lags_of_a_record_that_starts_in_its_middle_are_found(v0):
+    model = with_lags()
+    k = np.arange(9000)
+    before = np.interp(k, [0, 2000, 4000, 6000, 7000, 9000], [0, 9, 1, 10, v0, v0])
+    after = v0 + np.minimum(k / 4000, 1) * min(v0, 10 - v0) * np.sin(2 * np.pi * 4 * k / FS)
+    v = np.concatenate([before, after, np.interp(k, [0, 3000, 6000, 9000], [v0, 10, 0, 10])])
+    noise = 75e-6 * 2e-5 * np.random.default_rng(1).standard_normal(v.size)
+    piece = Piece(v, model.simulate(v) + noise, FS).cut(k.size, v.size)
+    found = fit_memory(model, piece)
+    assert found.size == 9 + 3
+    error = np.std(piece.y - model.predict_piece(piece, found)) / 75e-6
+    # 2 to 5 % with the memory of a stage at rest
+    assert error < 1e-4
+    run = free_run(model, Record((piece,)))
+    # all three forget within 1.5 spans
+    path = np.cumsum(np.abs(np.diff(piece.v, prepend=piece.v[0])))
+    start = np.argmax(path >= forgetting(model))
+    assert forgetting(model) == pytest.approx(10 * np.log(20) / 2)
+    assert run.errors_after_start.n <= piece.n - start
+
+
+def test_lags_that_are_long_forgotten_keep_their_default():
+    model = with_lags()
+    piece = Piece(V, model.simulate(V), FS)
+    rest = model.hysteresis.settled(0.5)[:-1]
+    assert_allclose(fit_memory(model, piece)[9:], rest, atol=1e-9)

@@ -116,6 +116,26 @@ def test_memory_that_is_given_counts_and_one_of_another_size_is_refused():
         PAPER.stream(memory[:-1])
 
 
+def test_lags_that_are_given_count_and_cuts_change_nothing():
+    lags = [[2.0, 0.3, 0.1, 0.0], [4.0, -0.1, 0.3, -0.2]]
+    model = replace(PAPER, hysteresis=replace(PAPER.hysteresis, relaxations=lags))
+    v = signal(1500)
+    plays = v[0] / 10.0 - 0.5 * PAPER.hysteresis.thresholds
+    starts = [plays, np.append(plays, [0.2, 0.1]), np.append(plays, [0.2, 0.1, v[0] / 10.0])]
+    ran = [model.simulate(v, start=start) for start in starts]
+    assert_allclose(ran[1], ran[2], rtol=0, atol=1e-18)
+    assert np.abs(ran[0] - ran[1]).max() > 1e-7
+    for start, whole in zip(starts, ran, strict=True):
+        stream = model.stream(start)
+        assert_array_equal(
+            np.concatenate([stream.process(part) for part in np.split(v, [1, 7, 700])]), whole
+        )
+        assert_array_equal(unfused(model, v, start), whole)
+    for start in (np.append(plays, 0.2), np.append(ran[2], 0.0)):
+        with pytest.raises(ModelError, match='2 lags'):
+            model.stream(start)
+
+
 def test_frozen_lists_views_and_integers_are_read_like_any_array():
     v = np.round(signal(2 * CHUNK + 5))
     expected = PAPER.stream().process(v)
