@@ -50,6 +50,8 @@ def effects_command(args: argparse.Namespace, console: Console) -> None:
     for effect in effects:
         console.say(_title(effect))
         console.say(f'    {_about(effect)}')
+        if effect.needs:
+            console.say(f'    shows in: {effect.needs}')
         console.say(f'    parameters: {", ".join(p.name for p in effect.parameters)}')
     console.say('\npiezo_ident effects NAME says more about one of them')
     console.result([_data(effect) for effect in effects])
@@ -74,6 +76,10 @@ def _at_length(effect: type[Effect]) -> list[str]:
     lines = [_title(effect), *textwrap.wrap(_about(effect), WIDTH)]
     if effect.needs:
         lines += textwrap.wrap(f'shows in: {effect.needs}', WIDTH, subsequent_indent='  ')
+    if effect.rate_independent:
+        lines.append('follows the path of the voltage alone: a wide enough hysteresis imitates it')
+    if effect.in_dynamics:
+        lines.append('changes the dynamics: named beyond what the model missed at identification')
     if effect.time_driven:
         lines.append('driven by time: its amplitudes differ from record to record')
     head = ('parameter', 'unit', 'from', 'to', 'neutral', 'default', '')

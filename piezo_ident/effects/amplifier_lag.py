@@ -49,7 +49,7 @@ class AmplifierLag(Effect):
     slot = 'input'
     in_dynamics = True
     description = 'RC lag of amplifier and piezo before the hysteresis; corner at 0.5 .. 10 kHz'
-    needs = 'fast sines or a multisine up to a tenth of the corner, two amplitudes'
+    needs = 'a fast sine at two amplitudes, or a multisine up to a tenth of the corner'
     parameters = (
         Parameter(
             'time_constant', 's', 'time constant tau', 0.0, 0.0, 1.0, step=1e-4, scale='linear'

@@ -41,7 +41,7 @@ class ChangedDynamics(Effect):
         'a resonance added or moved since G was identified, as by a load; linear, the static gain '
         'stays'
     )
-    needs = 'a multisine or noise, or steps, across the resonance'
+    needs = 'a multisine or noise, or steps, across the resonance, at two amplitudes'
     parameters = (
         Parameter('frequency', 'Hz', 'frequency of mode m', NAN, 1e-3, 1e6, True, scale='log'),
         Parameter('damping', '1', 'damping ratio zeta_m', NAN, 1e-4, 10.0, True, scale='log'),

@@ -58,7 +58,7 @@ class Creep(Effect):
     description = (
         'slow motion after each change of the voltage; 1 .. 2 % a decade of time, 1 .. 5 % in all'
     )
-    needs = 'a hold of at least 2 s after a step'
+    needs = 'holds of 2 s and more after steps of both signs'
     parameters = (
         Parameter(
             'gain', '1', 'share c_i of each element', 0.0, -1.0, 1.0, vector=True, step=1e-3

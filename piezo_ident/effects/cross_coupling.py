@@ -32,7 +32,7 @@ class CrossCoupling(Effect):
     name = 'cross_coupling'
     slot = 'output'
     description = "motion that follows another axis's voltage; 0.5 .. 3 % of that axis's stroke"
-    needs = "a further channel with the other axis's voltage while that axis moves"
+    needs = "the other axis's voltage as a further channel, while that axis moves by itself"
     parameters = (
         Parameter(
             'channel',

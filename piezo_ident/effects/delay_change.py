@@ -38,7 +38,7 @@ class DelayChange(Effect):
     description = (
         'a delay other than the one identified; a sample at 20 kHz is 1.3 % of stroke at 120 Hz'
     )
-    needs = 'fast sines, a multisine or steps'
+    needs = 'a multisine, noise or steps well beyond the first resonance'
     in_delay_line = True
     parameters = (Parameter('samples', 'samples', 'added delay delta', 0.0, -1e5, 1e5, step=0.1),)
 

@@ -68,7 +68,7 @@ class NoncongruentMinorLoops(Effect):
     slot = 'hysteresis'
     rate_independent = True
     description = 'minor loops of one width that differ with the bias; 0.3 .. 2 % of stroke'
-    needs = 'equal minor loops at three biases'
+    needs = 'equal minor loops at three biases, in two widths'
     parameters = (
         Parameter(
             'threshold', '1', 'threshold rho_j', NAN, 1e-6, 10.0, vector=True, scale='fixed'

@@ -29,7 +29,7 @@ class PeriodicDisturbance(Effect):
     name = 'periodic_disturbance'
     slot = 'output'
     description = 'lines in the displacement, from the mains or a machine; 0.01 .. 0.2 % of stroke'
-    needs = 'an idle stretch of 2 s, or motion at frequencies other than the lines'
+    needs = 'a rest of 2 s, or motion at frequencies other than its lines'
     time_driven = True
     parameters = (
         # found as a line, far more sharply than a fit of neighbouring columns could move it

@@ -99,7 +99,7 @@ class RateDependentHysteresis(Effect):
     name = 'rate_dependent_hysteresis'
     slot = 'hysteresis'
     description = 'loops that widen with speed; 10 .. 30 % a decade of frequency above 10 .. 50 Hz'
-    needs = 'two amplitudes at one fast frequency, and a slow sweep'
+    needs = 'two amplitudes at one fast frequency, a slow sweep, and a hold of 2 s'
     parameters = (
         Parameter('gain', 's^eps', 'growth beta of all thresholds', 0.0, -1.0, 1.0, step=1e-5),
         Parameter('exponent', '1', 'power eps of the speed', NAN, 0.05, 2.0, scale='log'),

@@ -64,7 +64,7 @@ class Saturation(Effect):
     description = (
         'the amplifier goes flat at the ends of its range; nothing elsewhere, large there'
     )
-    needs = 'a slow sweep over the full range, out to both of its ends'
+    needs = 'slow sweeps out to both ends of the range, and turns short of them'
     parameters = (
         Parameter('low', '1', 'lower end', -inf, -inf, inf, default=-inf),
         Parameter('high', '1', 'upper end', inf, -inf, inf, default=inf),

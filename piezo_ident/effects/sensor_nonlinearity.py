@@ -35,7 +35,7 @@ class SensorNonlinearity(Effect):
     description = (
         'a curved characteristic of the sensor; strain gauge 0.1 .. 1 %, capacitive 0.01 .. 0.1 %'
     )
-    needs = 'the full range both slowly and near the first resonance'
+    needs = 'the full range both slowly and near the first resonance, and loops at five biases'
     parameters = (
         Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -10.0, 10.0, step=1e-3),
         Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -10.0, 10.0, step=1e-3),

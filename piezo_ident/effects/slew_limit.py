@@ -52,7 +52,7 @@ class SlewLimit(Effect):
         'the amplifier charges the piezo no faster than its current allows; acts on jumps and on '
         'fast, large motion alone'
     )
-    needs = 'steps, or sines fast and large enough to pass the limit'
+    needs = 'steps or sines fast and large enough to pass the limit, and the same at a tenth'
     parameters = (
         Parameter(
             'limit',

@@ -31,7 +31,7 @@ class ThermalDrift(Effect):
     name = 'thermal_drift'
     slot = 'output'
     description = 'displacement that grows with time whatever the voltage does; 1 .. 100 nm/min'
-    needs = 'idle stretches at one voltage at the start and at the end'
+    needs = 'rests at one voltage at the start and at the end'
     time_driven = True
     parameters = (
         Parameter('rate', '1/s', 'steady drift b', 0.0, -1.0, 1.0, step=1e-4),

@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 from effect_table import (
     alone,
@@ -370,3 +371,16 @@ def test_trials_of_an_effect_that_only_declares_are_a_product():
         parameters = (*Mine.parameters, Parameter('width', '1', 'w', nan, 0.0, 1.0))
 
     assert Shapeless.trials(VIEW) == ()
+
+
+def test_the_page_has_a_row_for_each_name_with_what_it_needs():
+    page = Path(__file__).resolve().parents[2] / 'docs/diagnosis.md'
+    body = page.read_text(encoding='utf-8').partition('<!-- table: names -->')[2]
+    rows = [
+        [cell.strip() for cell in line.split('|')[1:-1]]
+        for line in body.partition('<!-- end -->')[0].strip().splitlines()[2:]
+    ]
+    assert {row[0].strip('`'): row[2] for row in rows} == {
+        name: catalogue()[name].needs for name in VISIBLE
+    }
+    assert all(imitated for _, _, _, imitated in rows)
