@@ -245,7 +245,7 @@ class Diagnosis(Showable):
     errors_of_laws : mapping of str to float
         Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
     kinds : tuple of str
-        Kinds of motion held out in turn; empty where fifths of the data stood for them.
+        Kinds of motion held out in turn; empty where parts of the data stood for them.
 
     Examples
     --------

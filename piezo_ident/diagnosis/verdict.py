@@ -259,17 +259,19 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
     if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'
-    if not findings.effects:
-        if findings.verdict == 'none':
-            return f'there is only {findings.left:.2g} % of stroke to explain'
-        explains = f'explains {100.0 * share:.0f} % of what could be explained'
+    if findings.verdict == 'none':
+        return f'there is only {findings.left:.2g} % of stroke to explain'
+    follows_path = find_effect(name).rate_independent
+    if not findings.effects or follows_path:
+        of = 'what a sum of plays leaves' if follows_path else 'what could be explained'
+        explains = f'explains {100.0 * share:.0f} % of {of}'
         if passes < criteria.PASSES:
-            return f'{explains}, of a range that was passed too rarely to test that'
+            return f'{explains}; the range was passed too rarely to test that'
         if share < criteria.ADDED:
             return f'{explains}, too little for a cause'
-        if find_effect(name).rate_independent:
-            return f'{explains} beside plays; a wider hysteresis may explain as much'
-        return f'{explains}, but not where it alone acts, not beyond chance, or at a price'
+        if follows_path:
+            return f'{explains}; a wider hysteresis may explain as much'
+        return f'{explains}: as chance might, at a price elsewhere, or not where it alone acts'
     if name in last.best and last.before.mean_square > 0.0:
         more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
         if more < criteria.LEAST_GAIN:

@@ -194,7 +194,7 @@ def _stands_for(result: Diagnosis) -> str:
     """Return the motions for which the error of the refined model stands."""
     if not result.kinds:
         return (
-            'for motion like that of these data alone: fifths of them were predicted in turn from '
+            'for motion like that of these data alone: parts of them were predicted in turn from '
             'the rest'
         )
     return (
