@@ -102,6 +102,11 @@ def _each(args: argparse.Namespace, task: Task, console: Console) -> None:
     )
 
 
+def _told(row: Row) -> tuple[str, str]:
+    """Return the columns of a verdict: of a refit, what may hide in it."""
+    return 'verdict', 'alike' if row.values.get('verdict') == 'refitted' else 'effects'
+
+
 def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
@@ -109,7 +114,7 @@ def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
     if len(bad) > PRINTED:
         console.say(f'  and {len(bad) - PRINTED} more')
     verdicts = [
-        ' '.join(str(row.values.get(key) or '') for key in ('verdict', 'effects')).strip()
+        ' '.join(str(row.values.get(key) or '') for key in _told(row)).strip()
         for row in rows
         if row.values.get('verdict')
     ]

@@ -21,6 +21,7 @@ from piezo_ident.report.refined import changes
 from piezo_ident.report.table import (
     FAULTS,
     length,
+    listed,
     number,
     origin_tables,
     plain_text,
@@ -199,7 +200,7 @@ def _stands_for(result: Diagnosis) -> str:
         )
     return (
         'for motion of the kinds in these data, each predicted from the others: '
-        f'{", ".join(result.kinds)}'
+        f'{listed(result.kinds)}'
     )
 
 

@@ -12,12 +12,14 @@ import math
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.identification.results import ErrorRow, Identification
+from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.sines import SineError
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.table import (
     FAULTS,
     length,
+    listed,
     number,
     origin_tables,
     plain_text,
@@ -81,7 +83,8 @@ def facts(result: Identification) -> list[tuple[str, str]]:
         'sampling rate': f'{model.sample_rate:g} Hz',
         'delay': f'{delay.samples} ± {number(delay.std, 2)} samples = {lag:.4g} µs',
         'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
-        'hysteresis': f'{model.hysteresis.thresholds.size} thresholds, p1, p2',
+        'hysteresis': _law(result),
+        'error holds': _stands_for(result),
         'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
         'effects': ', '.join(effect.name for effect in model.effects),
     }
@@ -91,6 +94,25 @@ def facts(result: Identification) -> list[tuple[str, str]]:
         for what, text in texts.items()
         if text
     ]
+
+
+def _law(result: Identification) -> str:
+    h, words = result.model.hysteresis, LAW_WORDS.get(result.hysteresis.law)
+    if words is None:
+        return f'{h.thresholds.size} thresholds, p1, p2'
+    return f'not a sum of plays: {h.thresholds.size} thresholds and {words}'
+
+
+def _stands_for(result: Identification) -> str:
+    """Return the motions for which the error of the headline stands."""
+    data = result.headline.data
+    rows = [row for row in result.errors if row.data == data and row.driven]
+    labels = dict.fromkeys(row.segment for row in rows if row.segment)
+    if data == 'fitted' or not rows:
+        return ''
+    if not labels:
+        return 'for motion like that of these records: other parts of them were fitted'
+    return f'for motion of these kinds: {listed(labels)}'
 
 
 def error_table(result: Identification) -> Table:

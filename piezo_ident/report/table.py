@@ -14,6 +14,7 @@ __all__ = [
     'FAULTS',
     'Table',
     'length',
+    'listed',
     'number',
     'origin_tables',
     'plain_text',
@@ -25,6 +26,8 @@ __all__ = [
 WIDTH = 99
 #: columns of a table of faults in the data
 FAULTS = ('fault', 'count', 'where', 'action')
+#: names on a line, at most
+LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,18 @@ def table(
 ) -> list[Table]:
     """Return a table, or nothing without rows."""
     return [Table(title, head, rows, note)] if rows else []
+
+
+def listed(names: Iterable[str]) -> str:
+    """
+    Return names on one line, the first of many and how many more there are.
+
+    >>> listed('abcdefghijk')
+    'a, b, c, d, e, f, g, h and 3 more'
+    """
+    all_names = list(names)
+    more = len(all_names) - LISTED
+    return ', '.join(all_names[:LISTED]) + (f' and {more} more' if more > 0 else '')
 
 
 def plain_text(parts: Iterable[Table | str]) -> str:

@@ -14,6 +14,7 @@ from piezo_ident.report import headline, identification_text, steps_to_json, tab
 from piezo_ident.report.identification import (
     dynamics_tables,
     error_table,
+    facts,
     hysteresis_tables,
     sine_tables,
 )
@@ -123,6 +124,17 @@ def test_summary_for_a_terminal(identified):
     # names in files must not steer a terminal
     assert '\x1b' not in text
     assert max(map(len, text.splitlines())) < 150
+
+
+def test_facts_tell_the_law_and_the_motions_that_the_error_stands_for(identified, unlabelled):
+    about = dict(facts(identified))
+    assert about['hysteresis'] == '9 thresholds, p1, p2'
+    assert about['error holds'].startswith('for motion of these kinds: ')
+    assert 'sine:100Hz' in about['error holds']
+    wide = replace(identified, hysteresis=replace(identified.hysteresis, law='preisach'))
+    assert dict(facts(wide))['hysteresis'].startswith('not a sum of plays: ')
+    assert 'like that of these records' in dict(facts(unlabelled))['error holds']
+    assert 'error holds' not in dict(facts(replace(identified, errors=())))
 
 
 def test_table_of_sines():
