@@ -52,7 +52,6 @@ def effects_command(args: argparse.Namespace, console: Console) -> None:
         console.say(f'    {_about(effect)}')
         if effect.needs:
             console.say(f'    shows in: {effect.needs}')
-        console.say(f'    parameters: {", ".join(p.name for p in effect.parameters)}')
     console.say('\npiezo_ident effects NAME says more about one of them')
     console.result([_data(effect) for effect in effects])
 

@@ -153,8 +153,12 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
             f' {", ".join(timed)}: of the longest record; such an effect follows time, so the '
             'refined model carries what can be expected of it in another one.'
         )
-    head = ('effect', 'parameter', 'value', 'unit', '')
-    return table('Parameters', head, parameter_rows(result), note)
+    head = ('effect', 'parameter', 'unit', '', 'value')
+    # lists are long, and the last column is the one that wraps
+    rows = [
+        (effect, name, unit, about, x) for effect, name, x, unit, about in parameter_rows(result)
+    ]
+    return table('Parameters', head, rows, note)
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
@@ -213,9 +217,12 @@ def _law(result: Diagnosis) -> list[str]:
     compared = ', '.join(
         f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
     )
+    told = 'a sum of plays'
+    if words is not None:
+        # an effect on the path may have asked for the wider law
+        told = f'fitted with {words}' if result.effects else f'not a sum of plays: H has {words}'
     return [
-        ('a sum of plays' if words is None else f'not a sum of plays: H has {words}')
-        + f'; refitted with nothing added, laws of H predict what was held out to {compared}'
+        told + f'; refitted with nothing added, laws of H predict what was held out to {compared}'
     ]
 
 

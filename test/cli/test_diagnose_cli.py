@@ -237,6 +237,7 @@ def test_catalogue(capsys):
     for effect in data:
         assert f'{effect["name"]}  (slot: {effect["slot"]})\n' in text
         assert effect['about'] in text
+        assert f'shows in: {effect["needs"]}\n' in text
     # one effect at length comes with another call
     assert len(text.splitlines()) < 4 * len(data)
 
