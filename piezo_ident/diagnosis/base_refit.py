@@ -15,16 +15,21 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import base_thresholds, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.search import Round, score_trials
 from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
-__all__ = ['effects_beside', 'hidden_by', 'refits']
+__all__ = ['effects_beside', 'refits', 'with_refit']
+
+#: laws that are tried in the place of the widest, the narrowest first
+_NARROWER: tuple[LawName, ...] = ('plays', 'preisach')
 
 
 def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
@@ -43,8 +48,12 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
 
 
 def _is_better(wide: Fitted, narrow: Fitted) -> bool:
-    """Return whether a wider law predicts held-out kinds of excitation clearly better."""
-    return bool(wide.transfer.sum() < criteria.WIDER**2 * narrow.transfer.sum())
+    """Return whether a wider law predicts clearly better, both held-out blocks and whole kinds."""
+
+    def square(fitted: Fitted) -> float:
+        return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
+
+    return square(wide) < criteria.WIDER**2 * square(narrow)
 
 
 def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:
@@ -59,6 +68,17 @@ def effects_beside(
     simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
     """Return the effects found, fitted with the narrowest law that serves, and their base."""
+    base, selected = _selected(simulator, search, plays, wide)
+    fitted = selected.fitted
+    if simulator.holds_retuning(fitted.state):
+        return base, selected
+    state = replace(fitted.state, retuning=())
+    return base, replace(selected, fitted=fit_jointly(simulator, state, fitted.base))
+
+
+def _selected(
+    simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
+) -> tuple[Fitted, Selected]:
     base, alone = wide if _is_better(wide, plays) else plays, plays
     found = search.run(base)
     if found.taken:
@@ -68,16 +88,34 @@ def effects_beside(
     if len(both.taken) > len(found.taken):
         return alone, both
     fitted = both.fitted
+    if not found.taken:
+        # no effect is needed for G to be a little off
+        again = search.retuned(base)
+        fitted = again if _is_better(again, base) else base
     if base is not plays:
-        for narrower in ('plays', 'preisach'):
-            other = plays if narrower == 'plays' else _refit(simulator, fitted.state, 'preisach')
+        for narrower in _NARROWER:
+            other = _refit(simulator, fitted.state, narrower)
             if not _is_better(fitted, other):
                 fitted = other
                 break
     return base, replace(both, fitted=fitted)
 
 
-def hidden_by(
+def with_refit(
+    simulator: Simulator, given: State, findings: Findings, selected: Selected, noise: float
+) -> Findings:
+    """Return the finding that a refit of H alone brought what there was to gain, where it did."""
+    rows, refit = simulator.rows, selected.fitted
+    e = rows.x - simulator.run(given)
+    gain = float(np.mean(e * e)) - refit.mean_square
+    if rows.percent(gain) < criteria.REFIT_FINDING or gain < refit.mean_square - noise:
+        return findings
+    if not refit_holds(rows, e, refit.transfer):
+        return findings
+    return findings.refitted(_hidden(simulator, given, refit, selected.imitated))
+
+
+def _hidden(
     simulator: Simulator, given: State, refit: Fitted, imitated: Round | None
 ) -> tuple[str, ...]:
     """

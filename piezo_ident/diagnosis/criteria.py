@@ -36,6 +36,8 @@ FORM_RATIO = 4.0
 ON_AMPLITUDE = (0.2, 3.0)
 #: expected size of a weight of H, normalised: the prior that keeps collinear plays small
 WEIGHT_SPREAD = 0.1
+#: the same of the other coefficients of H
+WIDE_SPREAD = 1.0
 #: share of the model's voltage range that data must cover for a refitted H to hold in all of it
 COVERED = 0.95
 #: share of the voltage range below which the command is at rest but for noise
@@ -55,7 +57,7 @@ STANDARD_ERRORS = 2.0
 #: its amplitude is then known a hundred times less well
 SWALLOWED = 1e-4
 #: factor of an effect where it alone acts, as fitted to all data: 1 is exact
-SHOWS = (0.5, 2.0)
+SHOWS = (0.4, 3.0)
 #: share of the variance beyond which the displacement does not follow the voltage
 UNRELATED = 0.99
 #: share of samples with a fault up to which they are left out; beyond it little else is there
@@ -65,13 +67,17 @@ FAULTY = 0.02
 
 #: share that an effect, or several, must explain to be named, and to be added at all
 NAMED, ADDED = 0.92, 0.5
+#: share that effects must explain together, but for those that show where they alone act: a
+#: hysteresis that does not fit leaves a residual of which any effect explains a part
+TOGETHER = 0.8
 #: share of what earlier effects left that a further one must explain
 FURTHER = 0.6
 #: least gain of an effect, share
 LEAST_GAIN = 0.10
 #: a wider law of H must leave less than this of the rms on held-out kinds of excitation
 WIDER = 0.9
-#: share of the gain of an effect that it may cost at kinds of excitation where the error grows
+#: share of its gain that an effect, or a refit of H, may cost at kinds of excitation where the
+#: error grows
 HARM = 0.1
 #: a rival that leaves less than this times what the best leaves is not separated from it
 AHEAD = 1.6
@@ -81,6 +87,8 @@ RICHER_AHEAD = 0.95
 SIMPLER = 1.3
 #: most names of a class
 CLASS_SIZE = 3
+#: a change of the dynamics exceeds what the model missed at its identification so many times
+NEWS = 2.0
 #: share from which a linear change is a finding of its own, not a side effect on G
 LINEAR = 0.5
 #: share of what a linear change leaves that a bent G and another effect must not exceed
@@ -96,7 +104,5 @@ POLISHING, POLISH = 6, 0.02
 TUNED = 0.05
 #: mean error of a record, in units of the rms of the rest, from which a sensor's zero has moved
 MOVED_ZERO = 3.0
-#: factor by which a refit of H may raise the rms of a kind of excitation that was held out
-REFIT_HARM = 1.05
 #: gain in rms from which a refit of H alone is kept
 WORTH_REFIT = 0.05

@@ -18,7 +18,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import INDISTINCT, REFIT_HARM, STANDARD_ERRORS
+from piezo_ident.diagnosis.criteria import HARM, STANDARD_ERRORS
 from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
@@ -183,8 +183,5 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     before = np.bincount(rows.block, squares, minlength=rows.group.size)
     if standard_errors(before - transfer) < STANDARD_ERRORS:
         return False
-    size = np.bincount(rows.group[rows.block], minlength=len(rows.labels))
-    one = np.bincount(rows.group, before, len(rows.labels))
-    other = np.bincount(rows.group, transfer, len(rows.labels))
-    indistinct = size * (INDISTINCT * rows.stroke / 100.0) ** 2
-    return bool(np.all(other <= REFIT_HARM**2 * one + indistinct))
+    change = np.bincount(rows.group, transfer - before, len(rows.labels))
+    return bool(change[change > 0.0].sum() <= -HARM * change.sum())

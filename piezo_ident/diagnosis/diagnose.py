@@ -21,11 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.base_refit import effects_beside, hidden_by, refits
-from piezo_ident.diagnosis.cross_validation import refit_holds
+from piezo_ident.diagnosis.base_refit import effects_beside, refits, with_refit
 from piezo_ident.diagnosis.forward_selection import (
     ForwardSelection,
-    Selected,
     smallest_detectable,
 )
 from piezo_ident.diagnosis.found_effects import found_effects
@@ -42,7 +40,6 @@ from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
     errors_of_laws,
-    Findings,
     judge,
     set_aside,
     untestable_of,
@@ -223,7 +220,7 @@ def _diagnosed(
     progress('verdict', 0.0)
     findings = judge(rows, base, selected, noise)
     if not findings.effects:
-        findings = _with_refit(simulator, given, findings, selected, noise)
+        findings = with_refit(simulator, given, findings, selected, noise)
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
@@ -234,7 +231,7 @@ def _diagnosed(
             selected.fitted.held_out_residual(rows, rows.group),
         )
     )
-    refined = refine(simulator, given, base, selected.fitted, findings, before, refit)
+    refined = refine(simulator, given, selected.fitted, findings)
     if refined.is_given:
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)
@@ -288,20 +285,6 @@ def _missed(model: StageModel) -> float:
 def _means(rows: Rows, e: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of each record."""
     return np.bincount(rows.of_record, e) / np.bincount(rows.of_record)
-
-
-def _with_refit(
-    simulator: Simulator, given: State, findings: Findings, selected: Selected, noise: float
-) -> Findings:
-    """Return the finding that a refit of H alone brought what there was to gain, where it did."""
-    rows, refit = simulator.rows, selected.fitted
-    e = rows.x - simulator.run(given)
-    gain = float(np.mean(e * e)) - refit.mean_square
-    if rows.percent(gain) < criteria.REFIT_FINDING or gain < refit.mean_square - noise:
-        return findings
-    if not refit_holds(rows, e, refit.transfer):
-        return findings
-    return findings.refitted(hidden_by(simulator, given, refit, selected.imitated))
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:

@@ -22,7 +22,7 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round, score_trials, search_round, started
-from piezo_ident.diagnosis.signature import shows
+from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import RETUNING, Simulator
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
@@ -107,10 +107,10 @@ class ForwardSelection:
             for effect in self._candidates
             if not effect.rate_independent
             and effect.name not in TESTED
-            and not (effect.in_dynamics and size < self._missed)
+            and not (effect.in_dynamics and size < criteria.NEWS * self._missed)
         ]
         shown = list[Round]()
-        self._base, retuned = base, self._retuned(base)
+        self._base, retuned = base, self.retuned(base)
         for name in self._certain:
             this = self._round(retuned, [e for e in self._candidates if e.name == name])
             if this.contenders:
@@ -120,18 +120,20 @@ class ForwardSelection:
             state = replace(retuned.state, retuning=())
             base = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
-        gain = base.mean_square - retuned.mean_square
-        if gain < criteria.LINEAR * explainable or size < self._missed:
+        news = [effect for effect in self._allowed if effect.in_dynamics]
+        if not news or base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
             return self._from(retuned, self._round(retuned), shown)
         # a linear change is the larger part: is it the whole of it?
-        linear, bent = self._round(base), None
-        if self._left(linear) > self._least:
+        linear, bent = self._round(base, news), None
+        is_linear = self._takes(linear, self._beyond_noise(base), first=True)
+        if not is_linear or self._left(linear) > self._least:
             bent = self._round(retuned)
-        if bent is not None and self._takes(bent, self._beyond_noise(bent.before), first=True):
-            if self._left(bent) < criteria.BENT * self._left(linear):
-                return self._from(retuned, bent, shown)
-            return self._from(base, linear, shown, bent)
-        return self._from(base, linear, shown)
+        if bent is None:
+            return self._from(base, linear, shown)
+        is_bent = self._takes(bent, self._beyond_noise(bent.before), first=True)
+        if not is_linear or (is_bent and self._left(bent) < criteria.BENT * self._left(linear)):
+            return self._from(retuned, bent, shown)
+        return self._from(base, linear, shown, bent if is_bent else None)
 
     def beside(self, plays: Fitted, wide: Fitted, found: Selected) -> Selected:
         """
@@ -142,21 +144,24 @@ class ForwardSelection:
         """
         self._allowed = [effect for effect in self._candidates if effect.rate_independent]
         # G was identified with the effect, and may be bent by it
-        plays, wide = (self._retuned(fitted) for fitted in (plays, wide))
+        plays, wide = (self.retuned(fitted) for fitted in (plays, wide))
         left = self._beyond_noise(plays)
         if left < self._least or len(found.taken) == self._most:
             return found
         this = self._round(plays)
         found = replace(found, rounds=(*found.rounds, this), imitated=this)
+        if not self._takes(this, left, first=True):
+            return found
         floor = (criteria.INDISTINCT * self._simulator.rows.stroke / 100.0) ** 2
-        allowed = min(
-            criteria.AHEAD * self._beyond_noise(wide) + floor, (1.0 - criteria.NAMED) * left
-        )
-        if not self._takes(this, left, first=True) or self._left(this) > allowed:
+        least = self._beyond_noise(wide) + floor
+        if this.contenders[0].name == 'noncongruent_minor_loops':
+            # weights that change with the bias are but another wide law
+            least /= criteria.AHEAD
+        if self._left(this) > min(least, (1.0 - criteria.NAMED) * left):
             return found
         return replace(found, taken=(*found.taken, this), fitted=this.contenders[0])
 
-    def _retuned(self, fitted: Fitted) -> Fitted:
+    def retuned(self, fitted: Fitted) -> Fitted:
         """Return a fit with G retuned, too."""
         if fitted.state.retuning:
             return fitted
@@ -222,6 +227,11 @@ class ForwardSelection:
             fitted = _polished(
                 self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
             )
+        left = self._beyond_noise(fitted)
+        if left > (1.0 - criteria.TOGETHER) * explainable and not all(
+            has_place(this.contenders[0].name) for this in taken[len(shown) :]
+        ):
+            taken = [*shown]
         self._progress('candidates', 1.0)
         tried = self._have | {effect.name for effect in self._candidates}
         left_out = frozenset(catalogue()) - tried

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
-from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD
+from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD, WIDE_SPREAD
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     held_out_residual,
@@ -40,6 +40,9 @@ __all__ = [
 Array = NDArray[np.float64]
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
+#: first damping, a share of the energy of each column: little, since lags and curves are nearly
+#: collinear
+DAMPING = 1e-7
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
 
@@ -161,16 +164,15 @@ def fit_jointly(
     """
     rows = simulator.rows
     parameters = free_parameters(state, len(rows.names))
-    m = state.coefficients.size
     p = base.columns.shape[1] + len(parameters)
-    damping = 1e-4
+    damping = DAMPING
     prediction = simulator.remember(state)
     e = rows.x - prediction
     moving = _derivatives(simulator, state, parameters, prediction, tick)
     for _ in range(iterations):
         before = float(e @ e)
         lower, upper = _room(state, parameters, p)
-        step = _Step(base, moving, e, _prior(rows, e, p, m))
+        step = _Step(base, moving, e, _prior(rows, e, p, state))
         better = None
         for _ in range(ATTEMPTS):
             tick()
@@ -188,7 +190,7 @@ def fit_jointly(
             damping *= 10.0
         if better is None:
             break
-        damping = max(damping / 10.0, 1e-8)
+        damping = max(damping / 10.0, 1e-9)
         state = better
         prediction = simulator.remember(state)
         e = rows.x - prediction
@@ -199,7 +201,7 @@ def fit_jointly(
     J = np.hstack([base.columns, moving])
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
-    prior = _prior(rows, e, p, m)
+    prior = _prior(rows, e, p, state)
     equations = normal_equations(rows, J[:, free], e[:, None])
     return Fitted(
         state=state,
@@ -247,11 +249,14 @@ def _offset_columns(rows: Rows) -> Array:
     return np.asarray(of, dtype=np.float64)
 
 
-def _prior(rows: Rows, e: Array, p: int, m: int) -> Array:
+def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
-    prior[:m] = float(e @ e) / count / WEIGHT_SPREAD**2
+    # curves and lags are nearly collinear: only large steps of theirs do anything
+    plays = 0 if state.law is None else state.law.thresholds.size
+    spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
+    prior[: spread.size] = float(e @ e) / count / spread**2
     return prior
 
 

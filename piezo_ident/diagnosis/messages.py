@@ -56,11 +56,11 @@ def warnings_of(
     found = []
     if not floor.known:
         found.append(f'{floor.source}: every share counts the noise as unexplained')
-    if stays and np.any(np.abs(state.retuning) > TUNED):
+    if not refined.is_given and np.any(np.abs(state.retuning) > TUNED):
         found.append(
-            f'the dynamics were retuned along with the effect, and {100.0 * max(bent, 0.0):.0f} % '
-            'of what the model missed goes with that alone: the effect bent them at the '
-            'identification, or they have changed since'
+            'the dynamics were retuned in the band that the data drive, and '
+            f'{100.0 * max(bent, 0.0):.0f} % of what the model missed goes with that alone: an '
+            'effect bent them at the identification, or they have changed since'
         )
     found += [_of_time_driven(a, bool(stays)) for a in state.effects if a.effect.time_driven]
     for shift in refined.shifts[refined.shifts != 0.0]:

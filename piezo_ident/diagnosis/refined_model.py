@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.results import Errors
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
@@ -46,26 +45,14 @@ def lasting(effects: tuple[str, ...]) -> list[str]:
     return [name for name in effects if not find_effect(name).time_driven]
 
 
-def refine(
-    simulator: Simulator,
-    given: State,
-    base: Fitted,
-    fitted: Fitted,
-    findings: Findings,
-    before: Errors,
-    refit: Errors,
-) -> Refined:
-    """
-    Return the model that the user gets, from the base refitted without and with what was found.
-
-    `before` and `refit` are the errors of the model as given and of the base refitted.
-    """
+def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Findings) -> Refined:
+    """Return the model that the user gets, from a refit with what was found."""
     rows, model = simulator.rows, simulator.model
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
     metres = shifts * model.scaling.Y
     if not findings.effects and (
-        refit.overall > (1.0 - criteria.WORTH_REFIT) * before.overall
+        fitted.mean_square > (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
         or not refit_holds(rows, e, fitted.transfer)
     ):
         return Refined(model, given, metres, is_given=True)

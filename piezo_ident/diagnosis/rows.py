@@ -27,7 +27,7 @@ from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Rows', 'centred', 'make_rows']
+__all__ = ['Rows', 'centred', 'highest_frequency', 'make_rows']
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,7 +39,7 @@ ROW_RATE, MOST_ROWS = 5000.0, 200_000
 BLOCKS, FOLDS = 80, 5
 #: whole stretches of one kind that are held out in turn, at most
 GROUPS = 8
-#: name of the kinds that are too small, and of a part of what has one kind alone
+#: name of the kinds that are too small, and of a fifth of what has one kind alone
 REST, PART = 'the rest', ', part '
 
 Memory = Callable[[Array], Array]
@@ -275,9 +275,9 @@ def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
     """Return label, first row and end of the segments of a run; everything belongs to one."""
     n = run.piece.n // m
     if not run.piece.segments:
-        # without labels, fifths of the time stand for kinds
-        edges = np.linspace(0, n, 6).astype(int)
-        names = [f'{run.record}{PART}{i + 1}' for i in range(5)]
+        # without labels, parts of the time stand for kinds
+        edges = np.linspace(0, n, GROUPS + 1).astype(int)
+        names = [f'{run.record}{PART}{i + 1}' for i in range(GROUPS)]
         return [
             (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
         ]
@@ -309,8 +309,8 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
     if np.any(group == rest):
         names = [*names, REST]
     if len(names) == 1:
-        # of one kind nothing would be left to predict it from: fifths of it stand for kinds
-        group = np.arange(group.size) * 5 // group.size
+        # of one kind nothing would be left to predict it from: parts of it stand for kinds
+        group = np.arange(group.size) * GROUPS // group.size
         names = [f'{names[0]}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
     return group, tuple(names)
 
@@ -323,3 +323,21 @@ def _memory(model: StageModel, run: Run) -> Memory:
     value = np.concatenate([[u0], fit_memory(model, run.piece)[: at.size - 1]])
     # a play output falls by at most its threshold; between known ones it is interpolated
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)
+
+
+def highest_frequency(u: Array, rate: float) -> float:
+    """Return the frequency below which all but a millionth of the moving power lies."""
+    du = np.diff(u)
+    if du.size == 0:
+        return 0.0
+    size = min(du.size, 1 << 17)
+    power = np.zeros(size // 2 + 1)
+    for start in range(0, du.size - size + 1, size):
+        power += np.abs(np.fft.rfft(du[start : start + size])) ** 2
+    # power of u, not of its derivative
+    frequency = np.fft.rfftfreq(size, 1.0 / rate)
+    power[1:] /= frequency[1:] ** 2
+    total = np.cumsum(power)
+    if total[-1] == 0.0:
+        return rate / 2.0
+    return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])

@@ -36,7 +36,7 @@ from piezo_ident.diagnosis.cross_validation import (
     with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import highest_frequency, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
@@ -307,7 +307,7 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     for run in rows.runs:
         # over a row, so that converter steps do not count as speed
         speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
-        top = max(top, _highest_frequency(run.u, model.sample_rate))
+        top = max(top, highest_frequency(run.u, model.sample_rate))
         for name, x in run.piece.channels.items():
             channels.setdefault(name, []).append(x)
     speed = np.concatenate(speeds)
@@ -327,21 +327,3 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         max_frequency=top,
         thresholds=model.hysteresis.thresholds,
     )
-
-
-def _highest_frequency(u: Array, rate: float) -> float:
-    """Return the frequency below which all but a millionth of the moving power lies."""
-    du = np.diff(u)
-    if du.size == 0:
-        return 0.0
-    size = min(du.size, 1 << 17)
-    power = np.zeros(size // 2 + 1)
-    for start in range(0, du.size - size + 1, size):
-        power += np.abs(np.fft.rfft(du[start : start + size])) ** 2
-    # power of u, not of its derivative
-    frequency = np.fft.rfftfreq(size, 1.0 / rate)
-    power[1:] /= frequency[1:] ** 2
-    total = np.cumsum(power)
-    if total[-1] == 0.0:
-        return rate / 2.0
-    return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])

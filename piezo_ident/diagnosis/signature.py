@@ -29,7 +29,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.residual.stretches import block_means, rests
 from scipy.ndimage import uniform_filter1d
 
-__all__ = ['shows']
+__all__ = ['has_place', 'shows']
 
 Array = NDArray[np.float64]
 
@@ -42,6 +42,11 @@ LOCAL = 0.25
 
 #: rows, shape (k,), and columns of what may differ there, shape (k, p)
 Place = tuple[NDArray[np.int64], Array]
+
+
+def has_place(name: str) -> bool:
+    """Return whether an effect has a place where it alone acts: a rest, for creep and drift."""
+    return _PLACES.get(name) is _at_rest
 
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:

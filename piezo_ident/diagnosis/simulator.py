@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import highest_frequency, Rows
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import number_of, with_number
 from piezo_ident.model.stage_model import EffectSetting, StageModel
@@ -43,6 +43,10 @@ Array = NDArray[np.float64]
 RELAXATIONS = (15.0, 100.0)
 #: how far G may be retuned: about samples of delay, their squares, and two relaxations
 RETUNING = (20.0, 800.0, 1.0, 1.0)
+#: a retuned G follows its law up to so many times the highest frequency that is driven
+BEYOND = 4.0
+#: what the product of G and its factor may lose by rounding
+ROUNDING = 1e-4
 #: finite difference of the logarithm of a parameter
 LOG_STEP = 1e-2
 
@@ -198,6 +202,8 @@ class Simulator:
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model
         self.rows = rows
+        #: what a retuned G does not grow beyond [Hz]
+        self._band = BEYOND * max(highest_frequency(run.u, model.sample_rate) for run in rows.runs)
         self._state: State | None = None
         #: for each run the block before every link of the chain, and the one behind the last
         self._kept: list[list[Block]] = []
@@ -208,9 +214,16 @@ class Simulator:
         return replace(
             self.model,
             hysteresis=state.hysteresis,
-            dynamics=retuned(self.model.dynamics, state.retuning, self.model.sample_rate),
+            dynamics=retuned(
+                self.model.dynamics, state.retuning, self.model.sample_rate, self._band
+            ),
             effects=(*self.model.effects, *settings),
         )
+
+    def holds_retuning(self, state: State) -> bool:
+        """Return whether one filter can stand for G and its factor."""
+        G, rate = self.model.dynamics, self.model.sample_rate
+        return not any(state.retuning) or retuned(G, state.retuning, rate, self._band) is not G
 
     def base_columns(self, law: HysteresisLaw) -> Array:
         """
@@ -283,9 +296,15 @@ class Simulator:
 
     def _operators(self, state: State, run_index: int) -> tuple[Operator, ...]:
         """Return the links of the chain of a run, reset to rest at its first command."""
-        model = self.model_of(state, int(self.rows.record[run_index]))
+        alone = replace(state, retuning=())
+        model = self.model_of(alone, int(self.rows.record[run_index]))
         memory = self.rows.memories[run_index](state.hysteresis.thresholds)
         operators = model.chain(memory).operators
+        if state.retuning:
+            # a link of its own: one filter of so high an order would lose its digits
+            factor = retuning_factor(state.retuning, model.sample_rate, self._band)
+            after = 1 + _place(None, operators)
+            operators = (*operators[:after], DynamicsOperator(factor), *operators[after:])
         x0 = u0 = float(self.rows.runs[run_index].u[0])
         for operator in operators:
             x0 = operator.reset(u0, x0)
@@ -302,31 +321,52 @@ class Simulator:
         return blocks
 
 
-def retuned(dynamics: Dynamics, retuning: Sequence[float], sample_rate: float) -> Dynamics:
+def retuning_factor(
+    retuning: Sequence[float], sample_rate: float, band: float = np.inf
+) -> Dynamics:
     """
-    Return G multiplied by a factor near one.
+    Return a factor of G near one.
 
-    ``1 + c_1 D + c_2 D^2 + sum_j c_j D / (1 - p_j z^-1)`` with ``D = 1 - z^-1`` and p_j the poles
-    of `RELAXATIONS`: a delay, a roll-off, and relaxations.  G(1) stays 1, and c_1 acts like minus
-    a delay in samples at low frequencies.
+    ``1 + c_1 D + c_2 D^2 + sum_j c_j (1 - z^-1) / (1 - p_j z^-1)`` with p_j the poles of
+    `RELAXATIONS`: a delay, a roll-off, and relaxations.  D is ``1 - z^-1`` up to the band [Hz]
+    that the data drive, and does not grow beyond it, where they say nothing.  It is 1 at rest, and
+    c_1 acts like minus a delay in samples at low frequencies.
     """
-    if not any(retuning):
-        return dynamics
     c1, c2, c3, c4 = retuning
     # polynomials in z^-1
     D = np.array([1.0, -1.0])
+    p = float(np.exp(-2.0 * np.pi * band / sample_rate))
+    limited, B = (1.0 - p) * D, np.array([1.0, -p])
     P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
-    common = np.convolve(P, Q)
+    BB, PQ = np.convolve(B, B), np.convolve(P, Q)
     terms = (
-        common,
-        c1 * np.convolve(common, D),
-        c2 * np.convolve(common, np.convolve(D, D)),
-        c3 * np.convolve(Q, D),
-        c4 * np.convolve(P, D),
+        np.convolve(BB, PQ),
+        c1 * np.convolve(np.convolve(limited, B), PQ),
+        c2 * np.convolve(np.convolve(limited, limited), PQ),
+        c3 * np.convolve(np.convolve(Q, D), BB),
+        c4 * np.convolve(np.convolve(P, D), BB),
     )
     factor = np.sum([np.pad(term, (0, 5 - term.size)) for term in terms], axis=0)
-    a = np.convolve([1.0, *dynamics.a], common)[1:]
-    return Dynamics(a=a, b=np.convolve(dynamics.b, factor))
+    return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
+
+
+def retuned(
+    dynamics: Dynamics, retuning: Sequence[float], sample_rate: float, band: float = np.inf
+) -> Dynamics:
+    """
+    Return G times its factor; G alone where the product of both would lose its digits.
+
+    A high order at a high sampling rate leaves few digits for four more poles near 1.
+    """
+    if not any(retuning):
+        return dynamics
+    factor = retuning_factor(retuning, sample_rate, band)
+    a = np.convolve([1.0, *dynamics.a], [1.0, *factor.a])[1:]
+    product = Dynamics(a=a, b=np.convolve(dynamics.b, factor.b))
+    f = np.geomspace(1e-5, 0.4, 60) * sample_rate
+    exact = dynamics.response(f, sample_rate) * factor.response(f, sample_rate)
+    lost = np.abs(product.response(f, sample_rate) - exact).max() / np.abs(exact).max()
+    return product if lost < ROUNDING and product.is_stable else dynamics
 
 
 def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:

@@ -386,14 +386,14 @@ def test_time_begins_with_the_record_whatever_its_clock_says(truths):
     assert make_rows(model, [two]).duration == pytest.approx(piece.duration)
 
 
-def test_of_one_kind_of_excitation_fifths_are_held_out(truths):
+def test_of_one_kind_of_excitation_eighths_are_held_out(truths):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     rows = make_rows(model, [Record((replace(piece, segments=()),), 'unlabelled')])
     named = replace(piece, segments=(Segment('triangle', 0, piece.n),))
     one = make_rows(model, [Record((named,), 'one kind')])
-    assert len(rows.labels) == len(one.labels) == 5
-    assert len(set(one.group)) == 5
+    assert len(rows.labels) == len(one.labels) == 8
+    assert len(set(one.group)) == 8
 
 
 def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):

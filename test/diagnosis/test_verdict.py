@@ -164,14 +164,15 @@ def choose(rows):
         search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
         search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
-        search._candidates, search._certain = [], ()
+        search._certain = ()
+        search._candidates = [find_effect(n) for n in ('amplifier_lag', 'changed_dynamics')]
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
         starts = {
             key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
             for key, this in rounds.items()
         }
-        search._retuned = lambda fitted: starts['retuned']
-        search._round = lambda start: rounds[next(k for k, v in starts.items() if v is start)]
+        search.retuned = lambda fitted: starts['retuned']
+        search._round = lambda start, *_: rounds[next(k for k, v in starts.items() if v is start)]
         search._from = lambda start, first, shown, bent=None: (
             next(k for k, v in starts.items() if v is start),
             bent,
@@ -191,10 +192,10 @@ def test_one_that_explains_about_as_much_stays_a_rival(choose):
     assert start == 'as it is' and bent.contenders[0].name == 'backlash'
 
 
-def test_a_bent_g_beside_which_nothing_is_an_effect_does_not_hide_the_linear_one(choose):
+def test_what_the_retuning_makes_and_no_effect_is_no_linear_effect(choose):
     # much less is left, but by the four numbers of the retuning, not by the effect
     start, bent = choose(contender('amplifier_lag', 0.9), contender('amplifier_lag', 0.045))
-    assert start == 'as it is' and bent is None
+    assert start == 'retuned' and bent is None
 
 
 # -- a refit of H ------------------------------------------------------------------------------
@@ -209,7 +210,7 @@ def residual(rows, shift=0.0):
 def test_a_refit_holds_where_it_helps_all_kinds_by_more_than_a_shift_or_one_block_do(rows):
     half = np.full(BLOCKS, 0.5e-6 * SIZE)
     assert refit_holds(rows, residual(rows), half)
-    one_kind_worse = np.where(rows.group == 3, 1.3e-6 * SIZE, half)
+    one_kind_worse = np.where(rows.group == 3, 1.8e-6 * SIZE, half)
     assert not refit_holds(rows, residual(rows), one_kind_worse)
     # a shift of the record is no merit of a refit
     shifted = residual(rows, shift=0.01)
