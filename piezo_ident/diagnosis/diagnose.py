@@ -117,7 +117,7 @@ def diagnose(
     >>> result = pi.diagnose(model, record, few)
     >>> result.verdict, round(result.effects[0].parameters['high'].value, 2)
     ('named', 0.8)
-    >>> result.after.overall < 0.01 * result.before.overall
+    >>> result.after.overall < 0.1 * result.before.overall
     True
     """
     settings = DiagnosisSettings() if settings is None else settings

@@ -40,9 +40,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
-#: first damping, a share of the energy of each column: little, since lags and curves are nearly
-#: collinear
-DAMPING = 1e-7
+#: first damping, a share of the energy of each column
+DAMPING = 1e-4
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
 

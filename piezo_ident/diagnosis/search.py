@@ -130,8 +130,11 @@ def search_round(
     `rng` draws the shifts of the surrogates.
     """
     n = simulator.rows.n
-    shifts = rng.integers(n // 20, n - n // 20, SURROGATES)
-    surrogates = np.stack([np.roll(before.e, int(k)) for k in shifts], axis=1)
+    shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
+    shifted = [np.roll(before.e, int(k)) for k in shifts]
+    # of a residual that repeats, a shift by a period is no surrogate
+    shifted.sort(key=lambda e: abs(float(e @ before.e)))
+    surrogates = np.stack(shifted[:SURROGATES], axis=1)
     trials: dict[str, list[Scored]] = {}
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
