@@ -243,8 +243,8 @@ def set_aside(
             continue
         if effect.in_dynamics and size < missed:
             found[name] = (
-                f'{size:.2g} % of stroke are left for it, less than the {missed:.2g} % that the '
-                'model missed when it was identified'
+                f'only {size:.2g} % of stroke are left for it; the model missed {missed:.2g} % '
+                'when it was identified'
             )
         elif effect.rate_independent and selected.imitated is None:
             found[name] = 'a sum of plays leaves nothing for it'
