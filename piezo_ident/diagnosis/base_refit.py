@@ -112,7 +112,8 @@ def with_refit(
         return findings
     if not refit_holds(rows, e, refit.transfer):
         return findings
-    return findings.refitted(_hidden(simulator, given, refit, selected.imitated))
+    left = rows.percent(refit.mean_square - noise)
+    return findings.refitted(_hidden(simulator, given, refit, selected.imitated), left)
 
 
 def _hidden(

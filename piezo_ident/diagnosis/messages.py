@@ -59,8 +59,8 @@ def warnings_of(
     if not refined.is_given and np.any(np.abs(state.retuning) > TUNED):
         found.append(
             'the dynamics were retuned in the band that the data drive, and '
-            f'{100.0 * max(bent, 0.0):.0f} % of what the model missed goes with that alone: an '
-            'effect bent them at the identification, or they have changed since'
+            f'{100.0 * max(bent, 0.0):.0f} % of what a refit of the hysteresis leaves goes with '
+            'that alone: an effect bent them at the identification, or they have changed since'
         )
     found += [_of_time_driven(a, bool(stays)) for a in state.effects if a.effect.time_driven]
     for shift in refined.shifts[refined.shifts != 0.0]:

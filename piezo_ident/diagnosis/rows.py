@@ -39,7 +39,7 @@ ROW_RATE, MOST_ROWS = 5000.0, 200_000
 BLOCKS, FOLDS = 80, 5
 #: whole stretches of one kind that are held out in turn, at most
 GROUPS = 8
-#: name of the kinds that are too small, and of a fifth of what has one kind alone
+#: name of the kinds that are too small, and of a part of what has one kind alone
 REST, PART = 'the rest', ', part '
 
 Memory = Callable[[Array], Array]

@@ -70,12 +70,12 @@ class Findings:
     group: Class | None
     left: float
 
-    def refitted(self, hidden: tuple[str, ...]) -> Findings:
+    def refitted(self, hidden: tuple[str, ...], left: float) -> Findings:
         """Return that a refit of H alone brought what there was to gain; what it may hide."""
         group = None
         if len(hidden) > 1:
             group = Class(hidden, f'record {separating_experiment(hidden)}')
-        return replace(self, verdict='refitted', group=group)
+        return replace(self, verdict='refitted', group=group, left=left)
 
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""
@@ -241,7 +241,7 @@ def set_aside(
         effect = find_effect(name)
         if name in tried or name in tested:
             continue
-        if effect.in_dynamics and size < missed:
+        if effect.in_dynamics and size < criteria.NEWS * missed:
             found[name] = (
                 f'only {size:.2g} % of stroke are left for it; the model missed {missed:.2g} % '
                 'when it was identified'
