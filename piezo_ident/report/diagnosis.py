@@ -198,14 +198,9 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
 def _stands_for(result: Diagnosis) -> str:
     """Return the motions for which the error of the refined model stands."""
     if not result.kinds:
-        return (
-            'for motion like that of these data alone: parts of them were predicted in turn from '
-            'the rest'
-        )
-    return (
-        'for motion of the kinds in these data, each predicted from the others: '
-        f'{listed(result.kinds)}'
-    )
+        return 'for motion like that of these data alone: parts were predicted from the rest'
+    kinds = listed(result.kinds)
+    return f'for motion of the kinds in these data, each predicted from the others: {kinds}'
 
 
 def _law(result: Diagnosis) -> list[str]:
@@ -217,13 +212,10 @@ def _law(result: Diagnosis) -> list[str]:
     compared = ', '.join(
         f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
     )
-    told = 'a sum of plays'
-    if words is not None:
-        # an effect on the path may have asked for the wider law
-        told = f'fitted with {words}' if result.effects else f'not a sum of plays: H has {words}'
-    return [
-        told + f'; refitted with nothing added, laws of H predict what was held out to {compared}'
-    ]
+    # with an effect beside it, the wider law need not be that of H
+    told = 'fitted with' if result.effects else 'not a sum of plays: H has'
+    about = 'a sum of plays' if words is None else f'{told} {words}'
+    return [f'{about}; with nothing added, laws of H predict what was held out to {compared}']
 
 
 def _left(share: float, rms_percent: float) -> str:

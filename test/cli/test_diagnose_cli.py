@@ -75,7 +75,8 @@ def test_it_finds_creep_and_the_refined_model_is_better(capsys, made):
     assert [e.name for e in model.effects] == ['creep']
     assert (report / 'model.yaml').read_bytes() == refined.read_bytes()
     record = measured()
-    assert free_run(model, record).errors.percent < 0.01
+    # H and G are refitted together with creep
+    assert free_run(model, record).errors.percent < 0.015
     assert free_run(slow_model(), record).errors.percent > 0.5
     (row,) = [line for line in text.splitlines() if line.startswith('unseen.npz  ')]
     before, after = map(float, row.split()[1:3])

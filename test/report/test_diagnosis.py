@@ -50,7 +50,7 @@ def test_a_refit_tells_of_its_law_of_what_may_hide_and_of_the_motions_it_stands_
         assert 'each predicted from the others: sine:5Hz, staircase, sine:50Hz' in words
     assert error_table(result).head == ('', 'as given', 'refined', 'times smaller')
     words = ' '.join(diagnosis_text(example('named')).split())
-    assert 'parts of them were predicted' in words and 'hysteresis a sum of plays' in words
+    assert 'parts were predicted' in words and 'hysteresis a sum of plays' in words
 
 
 def test_unknown_numbers_are_dashes_or_left_out():
