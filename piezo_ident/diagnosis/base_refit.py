@@ -79,26 +79,24 @@ def effects_beside(
 def _selected(
     simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
-    base, alone = wide if _is_better(wide, plays) else plays, plays
-    found = search.run(base)
+    found = search.run(wide)
+    beside, widest = plays, wide
     if found.taken:
-        plays = _refit(simulator, found.fitted.state, 'plays')
-        wide = found.fitted if base is wide else _refit(simulator, found.fitted.state, LAWS[-1])
-    both = search.beside(plays, wide, found)
+        beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
+    both = search.beside(beside, widest, found)
     if len(both.taken) > len(found.taken):
-        return alone, both
+        return plays, both
     fitted = both.fitted
     if not found.taken:
         # no effect is needed for G to be a little off
-        again = search.retuned(base)
-        fitted = again if _is_better(again, base) else base
-    if base is not plays:
-        for narrower in _NARROWER:
-            other = _refit(simulator, fitted.state, narrower)
-            if not _is_better(fitted, other):
-                fitted = other
-                break
-    return base, replace(both, fitted=fitted)
+        again = search.retuned(wide)
+        fitted = again if _is_better(again, wide) else wide
+    for narrower in _NARROWER:
+        other = _refit(simulator, fitted.state, narrower)
+        if not _is_better(fitted, other):
+            fitted = other
+            break
+    return wide, replace(both, fitted=fitted)
 
 
 def with_refit(

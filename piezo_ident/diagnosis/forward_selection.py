@@ -227,6 +227,12 @@ class ForwardSelection:
             fitted = _polished(
                 self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
             )
+            # an effect that was not fitted to the end leaves something for another one to explain
+            fitted, dropped = _without_needless(
+                self._simulator, fitted, self._least, len(shown), last=0
+            )
+            for i in dropped:
+                del taken[i]
         left = self._beyond_noise(fitted)
         if left > (1.0 - criteria.TOGETHER) * explainable and not all(
             has_place(this.contenders[0].name) for this in taken[len(shown) :]
@@ -301,15 +307,15 @@ def smallest_detectable(
 
 
 def _without_needless(
-    simulator: Simulator, fitted: Fitted, least: float, stay: int
+    simulator: Simulator, fitted: Fitted, least: float, stay: int, last: int = 1
 ) -> tuple[Fitted, tuple[int, ...]]:
     """
-    Take out effects that the last one, which stays like the first few, has made needless.
+    Take out effects that others have made needless; the first `stay` and the `last` ones stay.
 
     Each must be worth a mean square of `least`.  Places of those that went come along, falling.
     """
     dropped: list[int] = []
-    for i in range(len(fitted.state.effects) - 2, stay - 1, -1):
+    for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
         without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
         if without.mean_square - fitted.mean_square < least:

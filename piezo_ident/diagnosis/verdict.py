@@ -97,7 +97,7 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
     if not taken:
-        size = rows.percent(explainable)
+        size = rows.percent(left)
         small = size < criteria.SMALLEST_EFFECT
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))

@@ -39,6 +39,8 @@ from piezo_ident.operators.play import initial_memory, weighted_plays
 
 __all__ = ['Hysteresis', 'HysteresisOperator']
 
+Array = NDArray[np.float64]
+
 #: powers t^2 .. t^4 that a curve of a play may have
 POWERS = 3
 #: how far a density may fall below zero, as a share of the largest, by rounding
@@ -190,15 +192,7 @@ class Hysteresis:
     @functools.cached_property
     def for_kernel(
         self,
-    ) -> tuple[
-        NDArray[np.float64],
-        NDArray[np.float64],
-        float,
-        float,
-        float,
-        float,
-        NDArray[np.float64],
-    ]:
+    ) -> tuple[Array, Array, float, float, float, float, Array]:
         """``r, q, p1, p2, p0, low, c`` as `piezo_ident.operators.kernels` take them."""
         # a frozen array would be another type to the compiler
         r, q = np.array(self.thresholds), np.array(self.weights)
@@ -233,9 +227,8 @@ class Hysteresis:
         if self.relaxations is not None:
             levels = np.linspace(low, high, 9)
             ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
-            places = np.concatenate(
-                [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise([low, *ends]) if a != b]
-            )
+            legs = [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise(ends) if a != b]
+            places = np.concatenate(legs)
             return float(np.min(np.diff(self(places)) / np.diff(places)))
         v = np.linspace(low, high, 129)
         slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
