@@ -170,9 +170,12 @@ class ForwardSelection:
 
     def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
         rows = self._simulator.rows
-        return rows.passes >= criteria.PASSES and takes(
-            rows, this, self._noise, explainable, self._smallest, first=first
-        )
+        if rows.passes < criteria.PASSES or not this.contenders:
+            return False
+        # what shows where it alone acts is no misfit of H
+        own = has_place(this.contenders[0].name)
+        smallest = criteria.SMALLEST_EFFECT if own else self._smallest
+        return takes(rows, this, self._noise, explainable, smallest, first=first)
 
     @property
     def _least(self) -> float:
@@ -272,7 +275,8 @@ def takes(
         return False
     if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
         return False
-    return not _harms(rows, this.before, best)
+    # what shows where it alone acts has no need of a proof by all kinds of excitation
+    return has_place(best.name) or not _harms(rows, this.before, best)
 
 
 def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:

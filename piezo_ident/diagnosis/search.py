@@ -23,6 +23,7 @@ from piezo_ident.diagnosis.criteria import (
     FIRST,
     JOINT_FITS,
     ON_AMPLITUDE,
+    POLISHING,
     SIMPLER,
     STARTS,
     SURROGATES,
@@ -200,15 +201,22 @@ def _contenders(
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
-        state = contender.state
         try:
-            better = fit_jointly(simulator, state, base_at(simulator, state), tick=alive)
+            contenders[i] = _to_the_end(simulator, contender, alive)
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
-        else:
-            contenders[i] = better
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
+
+
+def _to_the_end(simulator: Simulator, fitted: Fitted, tick: Callable[[], None]) -> Fitted:
+    """Return a fit with fresh columns of H, as long as that makes a difference."""
+    for _ in range(POLISHING):
+        state, before = fitted.state, fitted.mean_square
+        fitted = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
+        if fitted.mean_square > (1.0 - WORTH_FIT) * before:
+            break
+    return fitted
 
 
 def _simplest_first(contenders: list[Fitted], noise: float) -> list[Fitted]:

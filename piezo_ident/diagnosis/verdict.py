@@ -100,7 +100,7 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
         size = rows.percent(left)
         small = size < criteria.SMALLEST_EFFECT
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
-    share = float(np.clip(1.0 - left / explainable, 0.0, 1.0))
+    share = float(np.clip(1.0 - left / max(explainable, 1e-300), 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
     rest = rows.percent(left)
     if share < criteria.NAMED:

@@ -101,13 +101,13 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
 
 
 def test_of_a_long_record_a_stated_part_is_searched_and_fitted(truths):
-    model, record, unseen = measured('creep', 0.3, 1)
+    model, record, unseen = measured('creep', 1.0, 1)
     most = record.n * 2 // 3
     few = ('creep', 'thermal_drift', 'saturation')
     result = diagnose(model, record, DiagnosisSettings(effects=few, most_samples=most))
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     before, after = unseen_errors(result, unseen)
-    assert after < before / 10
+    assert after < before / 5
     (warning,) = [w for w in result.warnings if 'samples were searched' in w]
     assert warning.startswith(f'{most:,} of {record.n:,} samples')
     # it is as if the rest were not there

@@ -149,7 +149,7 @@ def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
 
 def test_an_effect_that_costs_a_kind_is_not(rows):
     worse = np.where(rows.group == 2, 1.0, 0.05)
-    best = contender('creep', 0.3, shape=worse)
+    best = contender('slew_limit', 0.3, shape=worse)
     assert not takes(rows, a_round(best), 0.0, WHOLE, 0.05, first=True)
 
 
