@@ -17,7 +17,13 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
-from piezo_ident.diagnosis.joint_fit import base_thresholds, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import (
+    base_thresholds,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    offset_columns,
+)
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.search import Round, score_trials
@@ -137,7 +143,7 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     """Return the effects, best first, that do half of what a refit does."""
     rows = simulator.rows
     e = centred(rows.x - simulator.run(given), rows.of_record)
-    of = np.equal.outer(rows.of_record, np.arange(len(rows.names))).astype(np.float64)
+    of = offset_columns(rows)
     start = replace(
         refit, state=given, e=e, J=of, free=np.ones(of.shape[1], bool), prior=np.zeros(of.shape[1])
     )

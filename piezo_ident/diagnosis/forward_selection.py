@@ -87,6 +87,8 @@ class ForwardSelection:
         self._smallest = smallest
         self._missed = missed
         self._certain = certain
+        #: fits, and the same with G retuned
+        self._retunings: list[tuple[Fitted, Fitted]] = []
         self._most = settings.most_effects
         self._progress = progress
         self._rng = np.random.default_rng(settings.seed)
@@ -165,8 +167,12 @@ class ForwardSelection:
         """Return a fit with G retuned, too."""
         if fitted.state.retuning:
             return fitted
+        for one, again in self._retunings:
+            if one is fitted:
+                return again
         state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
-        return fit_jointly(self._simulator, state, fitted.base)
+        self._retunings.append((fitted, fit_jointly(self._simulator, state, fitted.base)))
+        return self._retunings[-1][1]
 
     def _takes(self, this: Round, explainable: float, *, first: bool) -> bool:
         rows = self._simulator.rows

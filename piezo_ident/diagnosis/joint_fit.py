@@ -34,6 +34,7 @@ __all__ = [
     'base_thresholds',
     'fit_base',
     'fit_jointly',
+    'offset_columns',
     'standard_deviations',
 ]
 
@@ -119,7 +120,7 @@ def base_thresholds(swing: float) -> Array:
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Return H refitted as one of a family, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, law.size
-    columns = np.hstack([simulator.base_columns(law), _offset_columns(rows)])
+    columns = np.hstack([simulator.base_columns(law), offset_columns(rows)])
     base = BaseColumns(columns, columns.T @ columns)
     effects = simulator.run(state) - state.offsets[rows.of_record] - simulator.bare(state)
     lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
@@ -137,7 +138,7 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
         (simulator.run(_moved(state, (), step)) - prediction) / WEIGHT_STEP
         for step in WEIGHT_STEP * np.eye(m, m + state.offsets.size)
     ]
-    whole = np.hstack([np.stack(columns, axis=1), _offset_columns(simulator.rows)])
+    whole = np.hstack([np.stack(columns, axis=1), offset_columns(simulator.rows)])
     return BaseColumns(whole, whole.T @ whole)
 
 
@@ -243,7 +244,8 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     return known
 
 
-def _offset_columns(rows: Rows) -> Array:
+def offset_columns(rows: Rows) -> Array:
+    """Return a column for the offset of each record; shape (n, records)."""
     of = rows.of_record[:, None] == np.arange(len(rows.names))
     return np.asarray(of, dtype=np.float64)
 

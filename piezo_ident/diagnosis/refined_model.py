@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import means, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
@@ -84,7 +84,7 @@ def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
     A model that errs has a mean error, too.  A zero that has moved is one of many times the rest;
     e is the residual of the model as given without the mean, shape (n,).
     """
-    rms = np.sqrt(np.bincount(rows.of_record, e * e) / np.bincount(rows.of_record))
+    rms = np.sqrt(means(e * e, rows.of_record))
     return np.where(np.abs(given.offsets) > criteria.MOVED_ZERO * rms, given.offsets, 0.0)
 
 

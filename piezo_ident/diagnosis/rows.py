@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Rows', 'centred', 'highest_frequency', 'make_rows']
+__all__ = ['Rows', 'centred', 'make_rows', 'means']
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -112,6 +113,11 @@ class Rows:
         parts = all(x == REST or PART in x for x in self.labels)
         return () if parts else self.labels
 
+    @functools.cached_property
+    def highest_frequency(self) -> float:
+        """The frequency below which all but a millionth of the moving power of any run lies."""
+        return max(_highest_frequency(run.u, run.piece.sample_rate) for run in self.runs)
+
     @property
     def passes(self) -> float:
         """How often the command passed over its range, there or back."""
@@ -172,8 +178,12 @@ class Rows:
 
 def centred(x: Array, of_record: Integers) -> Array:
     """Return rows without the mean of the record that each belongs to."""
-    mean = np.bincount(of_record, x) / np.bincount(of_record)
-    return np.asarray(x - mean[of_record])
+    return np.asarray(x - means(x, of_record)[of_record])
+
+
+def means(x: Array, of_record: Integers) -> Array:
+    """Return the mean of the rows of each record; shape (records,)."""
+    return np.asarray(np.bincount(of_record, x) / np.bincount(of_record))
 
 
 def make_rows(
@@ -325,7 +335,7 @@ def _memory(model: StageModel, run: Run) -> Memory:
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)
 
 
-def highest_frequency(u: Array, rate: float) -> float:
+def _highest_frequency(u: Array, rate: float) -> float:
     """Return the frequency below which all but a millionth of the moving power lies."""
     du = np.diff(u)
     if du.size == 0:

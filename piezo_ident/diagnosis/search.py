@@ -37,7 +37,7 @@ from piezo_ident.diagnosis.cross_validation import (
     with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.rows import highest_frequency, Rows
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
@@ -313,12 +313,11 @@ def started(rows: Rows, scored: Scored) -> Added:
 
 def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     rows, model = simulator.rows, simulator.model
-    speeds, top = [], 0.0
+    speeds = []
     channels: dict[str, list[Array]] = {}
     for run in rows.runs:
         # over a row, so that converter steps do not count as speed
         speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
-        top = max(top, highest_frequency(run.u, model.sample_rate))
         for name, x in run.piece.channels.items():
             channels.setdefault(name, []).append(x)
     speed = np.concatenate(speeds)
@@ -335,6 +334,6 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
         lines=tuple(lines),
         modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
-        max_frequency=top,
+        max_frequency=rows.highest_frequency,
         thresholds=model.hysteresis.thresholds,
     )

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.diagnosis.rows import highest_frequency, Rows
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import number_of, with_number
 from piezo_ident.model.stage_model import EffectSetting, StageModel
@@ -202,8 +202,6 @@ class Simulator:
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model
         self.rows = rows
-        #: what a retuned G does not grow beyond [Hz]
-        self._band = BEYOND * max(highest_frequency(run.u, model.sample_rate) for run in rows.runs)
         self._state: State | None = None
         #: for each run the block before every link of the chain, and the one behind the last
         self._kept: list[list[Block]] = []
@@ -219,6 +217,11 @@ class Simulator:
             ),
             effects=(*self.model.effects, *settings),
         )
+
+    @property
+    def _band(self) -> float:
+        """What a retuned G does not grow beyond [Hz]."""
+        return BEYOND * self.rows.highest_frequency
 
     def holds_retuning(self, state: State) -> bool:
         """Return whether one filter can stand for G and its factor."""

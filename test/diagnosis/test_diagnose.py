@@ -94,7 +94,7 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
     assert effect in {e.name for e in result.effects} | set(
         result.group.names if result.group else ()
     )
-    assert result.refit.overall > 0.1
+    assert result.refit.overall > 0.2
     assert result.after.overall < result.refit.overall / 3
     before, after = unseen_errors(result, unseen)
     assert after < before / 3
@@ -107,7 +107,7 @@ def test_of_a_long_record_a_stated_part_is_searched_and_fitted(truths):
     result = diagnose(model, record, DiagnosisSettings(effects=few, most_samples=most))
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     before, after = unseen_errors(result, unseen)
-    assert after < before / 5
+    assert after < before / 10
     (warning,) = [w for w in result.warnings if 'samples were searched' in w]
     assert warning.startswith(f'{most:,} of {record.n:,} samples')
     # it is as if the rest were not there
@@ -418,7 +418,7 @@ def test_columns_near_the_optimum_are_derivatives(truths):
         HysteresisLaw('duhem', base_thresholds(1.0)),
     )
     # without effects the quick columns are the exact ones
-    np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-8)
+    np.testing.assert_allclose(base_at(simulator, state).columns, base.columns, atol=1e-9)
     fitted = fit_jointly(simulator, state, base)
     assert fitted.mean_square < 1e-6
 
