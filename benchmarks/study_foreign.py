@@ -349,7 +349,7 @@ def outcome(row: Row) -> str:
     Return what a row says.
 
     'false' where a false name is given; else 'named', 'class' or 'part' for all of what counts,
-    all of it in classes, or some of it; 'refitted class' where the refit's class holds it;
+    all of it in classes, or some of it; 'in H' where it is among what may hide in H;
     'abstained'.  Where nothing counts: 'none', or 'small' for a true name of a small effect.
     """
     if row.verdict == 'failed':
@@ -359,7 +359,7 @@ def outcome(row: Row) -> str:
     if row.fault:
         return 'named' if set(NAMES[row.fault]) & set(row.faults) else 'abstained'
     truth = set(counted(row))
-    group = set() if row.verdict == 'refitted' else set(row.group)
+    group = set(row.group) if row.effects else set()
     named = {n for n in truth if n in row.effects and n not in group}
     classed = {n for n in truth if n in group} | {n for n in truth if n in row.effects}
     if not truth:
@@ -370,12 +370,12 @@ def outcome(row: Row) -> str:
         return 'class'
     if classed:
         return 'part'
-    if row.verdict == 'refitted' and truth & set(row.group):
-        return 'refitted class'
+    if truth & set(row.group):
+        return 'in H'
     return 'abstained'
 
 
-OUTCOMES = ('named', 'class', 'part', 'refitted class', 'abstained', 'false', 'failed')
+OUTCOMES = ('named', 'class', 'part', 'in H', 'abstained', 'false', 'failed')
 NOTE = (
     'No stage here is a sum of plays. Its hysteresis is of another family, behind two or three '
     'lightly damped modes and a delay of any fraction of a sample, at 10, 20 or 50 kHz, over '
@@ -433,11 +433,12 @@ def summary(rows: Sequence[Row]) -> str:
 
     lines = [
         ['nothing hidden: an effect named', some(r.effects for r in nothing)],
+        ['- no name, and two or three that may hide in H', some(r.group for r in nothing)],
         ['an effect that counts: its name or class', share('named', 'class')],
         ['- a false name instead or beside', share('false')],
         ['- one of two', share('part')],
-        ['- abstained', share('abstained', 'refitted class')],
-        ['- of these refitted, and the class holds it', share('refitted class')],
+        ['- abstained', share('abstained')],
+        ['- no name, and it is among what may hide in H', share('in H')],
         [
             '- where a refit of forty plays leaves the misfit at least: its name or class',
             some(outcome(r) in ('named', 'class') for r in large if lasting(r)),

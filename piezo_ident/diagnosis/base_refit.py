@@ -106,33 +106,47 @@ def _selected(
 
 
 def with_refit(
-    simulator: Simulator, given: State, findings: Findings, selected: Selected, noise: float
+    simulator: Simulator,
+    given: State,
+    findings: Findings,
+    selected: Selected,
+    noise: float,
+    misfit: float,
 ) -> Findings:
-    """Return the finding that a refit of H alone brought what there was to gain, where it did."""
+    """
+    Return what H alone accounts for, where no effect was found.
+
+    That a refit of it brought what there was to gain is a finding; and what a wider H takes, the
+    rms `misfit` [% of stroke], or a refit may hide effects.
+    """
     rows, refit = simulator.rows, selected.fitted
     e = rows.x - simulator.run(given)
     gain = float(np.mean(e * e)) - refit.mean_square
-    if rows.percent(gain) < criteria.REFIT_FINDING or gain < refit.mean_square - noise:
+    if (
+        rows.percent(gain) >= criteria.REFIT_FINDING
+        and gain >= refit.mean_square - noise
+        and refit_holds(rows, e, refit.transfer)
+    ):
+        findings = findings.refitted(rows.percent(refit.mean_square - noise))
+    elif misfit < criteria.REFIT_FINDING:
         return findings
-    if not refit_holds(rows, e, refit.transfer):
-        return findings
-    left = rows.percent(refit.mean_square - noise)
-    return findings.refitted(_hidden(simulator, given, refit, selected.imitated), left)
+    return findings.hiding(_hidden(simulator, given, refit, selected.imitated))
 
 
 def _hidden(
     simulator: Simulator, given: State, refit: Fitted, imitated: Round | None
 ) -> tuple[str, ...]:
     """
-    Return the effects that may hide in a refit of H: none, or two and more.
+    Return the effects that H may hide, the likeliest first: none, or two and more.
 
-    Those go a long way beside plays, or, added to the model as it was given, take half of what the
+    Those gain something beside plays, or, added to the model as it was given, take half of what a
     refit takes.
     """
     names: list[str] = []
     if imitated is not None:
-        least = (1.0 - criteria.ADDED) * imitated.before.mean_square
-        names = [c.name for c in imitated.contenders if c.mean_square < least]
+        before = imitated.before.mean_square
+        most = sorted(imitated.contenders, key=lambda c: c.mean_square)
+        names = [c.name for c in most if before - c.mean_square > criteria.LEAST_GAIN * before]
     names = list(dict.fromkeys([*names, *_instead(simulator, given, refit)]))
     if len(names) == 1:
         names += [n for n in look_alikes(names[0]) if find_effect(n).rate_independent][:1]

@@ -123,9 +123,7 @@ def sentence(
         text = f'{names} explains {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
         text += f'{fall}.'
     elif findings.verdict == 'refitted':
-        text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}'
-        hidden = _or(findings.group)
-        text += f'; {hidden} may hide in that, and these data do not tell.' if hidden else '.'
+        text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}.'
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'
         if smallest is None:
@@ -136,6 +134,9 @@ def sentence(
     else:
         text = 'No effect is missing that these data could show; the smallest would be '
         text += f'{smallest:.2g} % of stroke{tail}.'
+    if findings.group and not findings.effects:
+        hidden = _or(findings.group).capitalize()
+        text += f' {hidden} may hide in the hysteresis, and these data do not tell.'
     return text[0].upper() + text[1:]
 
 

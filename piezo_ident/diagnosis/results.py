@@ -216,7 +216,8 @@ class Diagnosis(Showable):
     effects : tuple of FoundEffect
         In the order in which they were found.
     group : Class or None
-        Effects that these data cannot tell apart; those that may hide in a refit of H alone.
+        Effects that these data cannot tell apart; where none was found, those that
+        may hide in H.
     unexplained : Unexplained
     candidates : tuple of Candidate
         Best first.

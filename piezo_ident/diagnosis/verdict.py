@@ -70,12 +70,15 @@ class Findings:
     group: Class | None
     left: float
 
-    def refitted(self, hidden: tuple[str, ...], left: float) -> Findings:
-        """Return that a refit of H alone brought what there was to gain; what it may hide."""
-        group = None
-        if len(hidden) > 1:
-            group = Class(hidden, f'record {separating_experiment(hidden)}')
-        return replace(self, verdict='refitted', group=group, left=left)
+    def refitted(self, left: float) -> Findings:
+        """Return that a refit of H alone brought what there was to gain."""
+        return replace(self, verdict='refitted', left=left)
+
+    def hiding(self, names: tuple[str, ...]) -> Findings:
+        """Return that H may hide one of several effects."""
+        if not names:
+            return self
+        return replace(self, group=Class(names, f'record {separating_experiment(names)}'))
 
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""
@@ -255,7 +258,7 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
         if not findings.effects:
-            return 'may hide in the refit of the hysteresis'
+            return 'may hide in the hysteresis'
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
     if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'

@@ -287,8 +287,8 @@ def _alike(result: Diagnosis) -> list[str]:
     if result.group is None:
         return []
     names, what = ', '.join(result.group.names), 'what would'
-    if result.verdict == 'refitted':
-        names, what = f'{names}, which may hide in the refit', 'what would tell'
+    if not result.effects:
+        names, what = f'{names}, which may hide in the hysteresis', 'what would tell'
     return [names, f'{what}: {result.group.separating_experiment}']
 
 

@@ -197,6 +197,17 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
     assert not [w for w in whole.warnings if 'was refitted' in w]
 
 
+def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
+    model, record, unseen = measured('noncongruent_minor_loops', 0.3, 1)
+    few = DiagnosisSettings(effects=('creep', 'noncongruent_minor_loops', 'sensor_nonlinearity'))
+    result = diagnose(model, record, few)
+    assert (result.verdict, result.effects) == ('none', ()), result.sentence
+    assert result.group.names[0] == 'noncongruent_minor_loops'
+    assert 'may hide in the hysteresis' in result.sentence
+    assert result.errors_of_laws[result.law] < 0.5 * result.errors_of_laws['plays']
+    assert max(unseen_errors(result, unseen)) < 0.1
+
+
 def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
