@@ -27,8 +27,6 @@ from piezo_ident.identification.errors import (
 )
 from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
     FitOutcome,
     Identification,
     Progress,
@@ -168,9 +166,6 @@ def _labelled(
     delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
     dynamics, G = steps.dynamics or second_step(runs, delay, settings, progress)
-    if delay_result.agree is False and steps.delay is None and steps.dynamics is None:
-        delay_result, dynamics, G = _either(runs, delay_result, dynamics, G, settings, progress)
-        delay = Delay(delay_result.samples)
     # the same with what is known of the lag by now
     runs = with_starts(unstarted, lag_of(G, delay))
     fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
@@ -228,24 +223,6 @@ def _worth_its_dynamics(model: StageModel, runs: Sequence[Run]) -> bool:
                 e = (run.piece.y - m.predict_piece(run.piece, memory))[kept]
                 errors[i] += float(np.sum((e - e.mean()) ** 2))
     return bool(errors[0] <= errors[1])
-
-
-def _either(
-    runs: Sequence[Run],
-    delay: DelayResult,
-    dynamics: DynamicsResult,
-    G: Dynamics,
-    settings: Settings,
-    progress: Progress,
-) -> tuple[DelayResult, DynamicsResult, Dynamics]:
-    """Return delay and G with the delay of the steps or of the scan, whichever errs less."""
-    # the loss was scanned in whole samples
-    other = replace(delay, samples=delay.scan or 0, std=0.5, source='scan')
-    result, other_G = second_step(runs, Delay(other.samples), settings, progress)
-    # slow noise is averaged out of few steps badly; a free run does not care who was right
-    if min(result.methods.values()) < min(dynamics.methods.values()):
-        return other, result, other_G
-    return delay, dynamics, G
 
 
 def first_steps(

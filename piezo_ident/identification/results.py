@@ -131,7 +131,7 @@ class DelayResult:
     samples : int
     std : float
         [samples]; infinite when the data do not tell.
-    source : {'steps', 'scan', 'given', 'none'}
+    source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
         One-step ARX loss for d = 0, 1, ...

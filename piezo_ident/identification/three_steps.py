@@ -20,6 +20,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.delay_check import upheld
 from piezo_ident.identification.linear_part import fast_part
 from piezo_ident.identification.prepare import END_HELD, Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
@@ -63,6 +64,8 @@ __all__ = [
 MAX_DELAY, SCAN_ORDER = 30, 8
 #: orders within this share of the best held-out error count as equal; smaller ones go first
 SLACK = 0.05
+#: share by which instrumental variables must err less than least squares to choose the orders
+BENT = 0.2
 #: share by which a larger order must lower the held-out error
 GAIN = 0.005
 #: samples of simulation ahead of the first that counts
@@ -118,6 +121,8 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     """
     Find the delay from the steps, or else from the scan of the ARX loss over the noise.
 
+    Where both differ, or one is missing, a free run over the noise decides.
+
     Raises
     ------
     IdentificationError
@@ -135,7 +140,13 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     scan = None if loss is None else delay_from_loss(loss)
     progress('delay', 1.0)
     if step is not None and step.samples is not None:
-        return DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+        found = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+        has_noise = any(run.piece.find('noise') for run in runs)
+        if found.agree or not has_noise:
+            return found
+        run, start, stop = _longest_noise(runs)
+        noise = _noise(run, run.u, start, stop)
+        return upheld(found, noise.fitted, noise.held)
     if scan is None:
         what = 'too short to scan' if loss is None else 'that hides it below 30 samples'
         raise IdentificationError(
@@ -207,7 +218,22 @@ def _orders(
     def held_error(model: Dynamics) -> float:
         return float(100.0 * free_run_error(model, delay, *noise.held) / noise.held[1].std())
 
-    orders = [settings.order] if settings.order else table.ranked(SLACK)[:candidates]
+    orders = [settings.order] if settings.order else table.ranked(SLACK)
+    if not settings.order:
+        # noise bends the least squares of a mode that rings for thousands of samples
+        sizes = range(2, min(table.loss.shape) + 1, 2)
+        by_instruments = {
+            (n, n): free_run_error(
+                instrumental_variables(u, y, factor.dynamics(n, n, delay), delay),
+                delay,
+                *noise.held,
+            )
+            for n in sizes
+        }
+        least = min(by_instruments.values(), default=np.inf)
+        if least < (1.0 - BENT) * table.held_out.min():
+            orders = [o for o, error in by_instruments.items() if error <= (1.0 + SLACK) * least]
+    orders = orders[:candidates]
     if not orders:
         raise IdentificationError(
             'dynamics: no order up to '

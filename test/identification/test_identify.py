@@ -17,6 +17,7 @@ from piezo_ident.identification import three_steps
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.refusals import refuse_undriven
 from piezo_ident.identification.results import Settings
+from piezo_ident.identification.step1_delay import delay_from_steps
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
@@ -93,11 +94,10 @@ def test_paper_stage_is_found(paper):
 
 
 def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
-    def first_step(*arguments):
-        found = three_steps.first_step(*arguments)
-        return replace(found, samples=7, step=replace(found.step, samples=7))
+    def late(pieces):
+        return replace(delay_from_steps(pieces), samples=7)
 
-    monkeypatch.setattr('piezo_ident.identification.identify.first_step', first_step)
+    monkeypatch.setattr(three_steps, 'delay_from_steps', late)
     result = identify(short(noise=2e-5), QUICK)
     assert (result.delay.step.samples, result.delay.scan) == (7, 3)
     assert (result.delay.samples, result.delay.source) == (3, 'scan')

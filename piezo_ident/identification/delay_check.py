@@ -1,0 +1,75 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Whether a delay holds in a free run over noise.
+
+An answer that starts slowly, or noise that is not white, makes steps and the ARX loss tell too
+large a delay.  G makes up for a delay that is too small, and never for one that is too large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.identification.results import DelayResult
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    delayed,
+    instrumental_variables,
+)
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+
+__all__ = ['upheld']
+
+Signals = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+#: orders (n, n), and delays below those that are asked about [samples], that are tried
+ORDERS = (4, 8, 12)
+DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
+#: share of the least error within which another one is no larger
+SLACK = 0.05
+
+
+def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
+    """
+    Return the delay of steps or of the scan that a free run upholds, else one that it allows.
+
+    Of two that hold the smaller goes; where none does, half of the largest that does.
+
+    Parameters
+    ----------
+    found : DelayResult
+    fitted, held : (ndarray, ndarray)
+        Input and output of noise, to fit and right behind that to judge by.
+    """
+    whole = tuple(np.concatenate(pair) for pair in zip(fitted, held, strict=True))
+
+    def error(model: Dynamics, d: int) -> float:
+        if not model.is_stable:
+            return float('inf')
+        # what rings for long has died away where it is judged
+        e = whole[1] - filter_arx(model.a, model.b, delayed(whole[0], d), at_rest=False)
+        return float(e[-held[1].size :].std())
+
+    asked = [d for d in (found.samples, found.scan) if d is not None]
+    tried = sorted({*asked, *(d for d in DELAYS if d < max(asked))})
+    u, y = fitted
+    factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
+    errors = []
+    for d in tried:
+        models = [factor.dynamics(n, n, d) for n in ORDERS]
+        models += [instrumental_variables(u, y, model, d) for model in models]
+        errors.append(min(error(model, d) for model in models))
+    least = min(errors)
+    hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
+    samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
+    if samples == found.samples:
+        return found
+    if samples == found.scan:
+        # the loss was scanned in whole samples
+        return replace(found, samples=samples, std=0.5, source='scan')
+    std = hold[-1] / np.sqrt(12.0)
+    return replace(found, samples=samples, std=std, source='free run')

@@ -1,0 +1,39 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A delay that steps or the loss tell, and what a free run over noise says of it."""
+
+import numpy as np
+from piezo_ident.identification.delay_check import upheld
+from piezo_ident.identification.results import DelayResult
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+import pytest
+
+#: a mode of 335 Hz at 50 kHz that rings for thousands of samples
+POLE = np.exp(2j * np.pi * 335.0 / 50_000.0 - 2e-4)
+RINGING = Dynamics(np.array([-2.0 * POLE.real, abs(POLE) ** 2]), np.array([1e-3, 1e-3]))
+
+
+def noise(d, rms=1e-3):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(40_000)
+    late = np.concatenate([np.zeros(d), u[: u.size - d]])
+    y = filter_arx(RINGING.a, RINGING.b, late)
+    y += rms * y.std() * rng.standard_normal(u.size)
+    return (u[:30_000], y[:30_000]), (u[30_000:], y[30_000:])
+
+
+@pytest.mark.parametrize(
+    ('steps', 'scan', 'samples', 'source'),
+    [(5, 12, 5, 'steps'), (12, 4, 4, 'scan'), (6, 4, 4, 'scan'), (6, 5, 5, 'scan')],
+)
+def test_the_smaller_delay_that_holds_is_kept(steps, scan, samples, source):
+    found = upheld(DelayResult(steps, 0.3, 'steps', scan=scan), *noise(6))
+    assert (found.samples, found.source) == (samples, source)
+
+
+def test_a_delay_that_no_free_run_allows_is_replaced_by_a_smaller_one():
+    found = upheld(DelayResult(40, 9.0, 'steps'), *noise(6))
+    assert found.source == 'free run'
+    assert 1 <= found.samples <= 6
+    assert found.std > 1.0
