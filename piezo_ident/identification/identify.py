@@ -128,7 +128,8 @@ def _identify(
     else:
         fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
     model, stroke = fit.model, abs(scaling.Y)
-    predictions = predictions_of(model, runs, fit.memories, fit.offsets)
+    judged, memories = fit.judged or (model, fit.memories)
+    predictions = predictions_of(judged, runs, memories, fit.offsets)
     floor = noise_floor_of(predictions)
     result = Identification(
         model=model,

@@ -284,6 +284,8 @@ class FitOutcome:
         As in `Identification`.
     offsets : mapping
         How far the zero of displacement of a run lies from that of the model [m], as `memories`.
+    judged : (StageModel, Memories) or None
+        What the errors are those of, where H was fitted to all data in the end.
     """
 
     model: StageModel
@@ -295,6 +297,7 @@ class FitOutcome:
     not_identified: Sequence[tuple[str, str]] = ()
     memories: Memories = field(default_factory=dict)
     offsets: Mapping[tuple[str, float], float] = field(default_factory=dict)
+    judged: tuple[StageModel, Memories] | None = None
 
 
 def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:

@@ -41,6 +41,7 @@ __all__ = [
     'factorise',
     'filtered_rows',
     'fine_thresholds',
+    'fit_again',
     'fit_hysteresis',
 ]
 
@@ -329,3 +330,14 @@ def fit_hysteresis(
         coefficients=x,
         law=law.name,
     )
+
+
+def fit_again(
+    fit: HysteresisFit, excerpts: Sequence[Excerpt], dynamics: Dynamics, delay: Delay
+) -> HysteresisFit:
+    """Return the same law on the same thresholds, its weights fitted to other data."""
+    h = fit.hysteresis
+    law = HysteresisLaw(fit.law, h.thresholds, h.span)
+    R = factorise(excerpts, law, dynamics, delay)
+    n, rows = int(sum(e.use.sum() for e in excerpts)), sum(e.rows for e in excerpts)
+    return replace(fit_hysteresis(R, law, n, rows=rows), errors_of_laws=fit.errors_of_laws)

@@ -32,6 +32,7 @@ from piezo_ident.identification.results import (
     FitOutcome,
     Progress,
     Settings,
+    silent,
 )
 from piezo_ident.identification.spectra import excited_band
 from piezo_ident.identification.starts import fit_starts, lag_of
@@ -40,7 +41,9 @@ from piezo_ident.identification.step3_choice import third_step
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     factorise,
+    fit_again,
     fit_hysteresis,
+    HysteresisFit,
 )
 from piezo_ident.identification.three_steps import model_of, within
 from piezo_ident.identification.warnings import warn_of_range, warn_of_zeros
@@ -263,7 +266,7 @@ def fit_unlabelled(
     runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings, progress: Progress
 ) -> FitOutcome:
     """
-    Fit all runs but for the end of each.
+    Fit all runs but for the end of each, and in the end H to all of them.
 
     Raises
     ------
@@ -272,37 +275,39 @@ def fit_unlabelled(
     """
     chosen, parts = fitted_parts(runs, settings)
     joint = joint_fit(chosen, parts, settings, progress)
-    # what chooses the thresholds is a part of what is fitted in the end, never the held-out end
     whole = list(joint.excerpts)
-    early, late = [], []
-    for e in whole:
-        chooses = np.zeros(e.use.size, dtype=bool)
-        chooses[np.flatnonzero(e.use)[int((1.0 - LATE) * e.use.sum()) :]] = True
-        early.append(replace(e, use=e.use & ~chooses))
-        late.append(replace(e, use=e.use & chooses))
+    early, late = _early_and_late(whole)
     joint = _simplest(joint, early, late)
     delay = Delay(joint.delay.samples, joint.delay.fraction)
-    hysteresis = third_step(early, late, joint.G, delay, settings, progress, whole)
-    model = model_of(rate, scaling, hysteresis, joint.G, delay)
-    spans = [run.u[mask] for run, mask in zip(chosen, parts, strict=True)]
-    model = within(model, min(map(np.min, spans)), max(map(np.max, spans)))
-    memories, offsets = {}, {}
-    masks: list[tuple[Mask, Mask]] = []
-    for run in runs:
-        fitted = np.zeros(run.piece.n, dtype=bool)
-        place = next((i for i, other in enumerate(chosen) if other is run), None)
-        if place is not None:
-            fitted = parts[place]
-            # where two have one name nobody could tell whose start it is
-            if sum(key_of(other) == key_of(run) for other in runs) == 1:
-                memories[key_of(run)] = whole[place].start(model.hysteresis.thresholds)
-                moved = float(hysteresis.offsets[place] - hysteresis.offsets[0])
-                offsets[key_of(run)] = scaling.Y * moved
-        masks.append((fitted, np.zeros(run.piece.n, dtype=bool)))
+    # what chooses the thresholds is a part of what is fitted, never the held-out end
+    judged = hysteresis = third_step(early, late, joint.G, delay, settings, progress, whole)
+    if judged.solver == 'least_squares':
+        # a short record has no motion to waste on its own test
+        everything = [
+            replace(e, use=run.use & (e.use | ~mask))
+            for run, e, mask in zip(chosen, whole, parts, strict=True)
+        ]
+        hysteresis = _again(judged, everything, joint.G, delay, settings)
+    model, tested = (model_of(rate, scaling, h, joint.G, delay) for h in (hysteresis, judged))
+    low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
+    model = within(model, low, high)
+    # where two have one name nobody could tell whose start it is
+    keys = [key_of(run) for run in runs]
+    own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
+    memories, at_test = (
+        {key: whole[i].start(m.hysteresis.thresholds) for key, i in own.items()}
+        for m in (model, tested)
+    )
+    offsets = {
+        key: scaling.Y * float(judged.offsets[i] - judged.offsets[0]) for key, i in own.items()
+    }
+    fitted = {id(run): mask for run, mask in zip(chosen, parts, strict=True)}
+    nothing = [np.zeros(run.piece.n, dtype=bool) for run in runs]
+    masks = [(fitted.get(id(run), none), none) for run, none in zip(runs, nothing, strict=True)]
     names = ', '.join(_named(run, mask) for run, mask in zip(chosen, parts, strict=True))
     warnings = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
-        f'together on {names}',
+        f'together on {names}, as the errors say; the weights of H were then fitted to all of it',
         *warn_of_range(chosen, parts, scaling),
         *warn_of_zeros(offsets, scaling),
     ]
@@ -317,7 +322,35 @@ def fit_unlabelled(
         not_identified=joint.not_identified,
         memories=memories,
         offsets=offsets,
+        judged=(tested, at_test),
     )
+
+
+def _early_and_late(excerpts: Sequence[Excerpt]) -> tuple[list[Excerpt], list[Excerpt]]:
+    """Return the samples used but for those at the end, and those at the end."""
+    early, late = [], []
+    for e in excerpts:
+        chooses = np.zeros(e.use.size, dtype=bool)
+        chooses[np.flatnonzero(e.use)[int((1.0 - LATE) * e.use.sum()) :]] = True
+        early.append(replace(e, use=e.use & ~chooses))
+        late.append(replace(e, use=e.use & chooses))
+    return early, late
+
+
+def _again(
+    fit: HysteresisFit,
+    excerpts: Sequence[Excerpt],
+    G: Dynamics,
+    delay: Delay,
+    settings: Settings,
+) -> HysteresisFit:
+    """Return the same law fitted to more data, which may carry more plays."""
+    if fit.law != 'plays':
+        return fit_again(fit, excerpts, G, delay)
+    found = third_step(
+        *_early_and_late(excerpts), G, delay, settings, silent, excerpts, laws=('plays',)
+    )
+    return replace(found, errors_of_laws=fit.errors_of_laws)
 
 
 def _named(run: Run, fitted: Mask) -> str:

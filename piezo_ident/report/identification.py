@@ -41,7 +41,7 @@ KINDS = ('validation', 'held out', 'selection', 'fitted')
 #: how a headline begins, by the kind of data that it is about
 ABOUT = {
     'validation': 'On {records}, recorded for validation',
-    'held out': 'On data it did not fit',
+    'held out': 'On data held out of the fit',
     'selection': 'On the parts of steps, noise and triangle that were held out from the fit (no '
     'other motion was there to test it)',
     'fitted': 'Nothing was held out; on the data it was fitted to',
