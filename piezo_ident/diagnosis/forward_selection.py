@@ -20,10 +20,11 @@ from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.results import DiagnosisSettings
+from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round, score_trials, search_round, started
 from piezo_ident.diagnosis.signature import has_place, shows
-from piezo_ident.diagnosis.simulator import RETUNING, Simulator
+from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 

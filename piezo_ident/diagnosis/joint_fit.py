@@ -5,7 +5,7 @@
 The joint fit: weights of H, offsets and effects together, by free-run error.
 
 Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay keep their values
-but for a factor near one (`simulator.retuned`): a change of them is a candidate of its own.
+but for a factor near one (`retuning.retuned`): a change of them is a candidate of its own.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def base_thresholds(swing: float) -> Array:
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Return H refitted as one of a family, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, law.size
-    columns = np.hstack([simulator.base_columns(law), offset_columns(rows)])
+    columns = np.concatenate([simulator.base_columns(law), offset_columns(rows).T]).T
     base = BaseColumns(columns, columns.T @ columns)
     effects = simulator.run(state) - state.offsets[rows.of_record] - simulator.bare(state)
     lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
@@ -133,12 +133,11 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
     """Return the columns of a refit of H in a state, its effects and a retuned G included."""
-    prediction, m = simulator.run(state), state.coefficients.size
-    columns = [
-        (simulator.run(_moved(state, (), step)) - prediction) / WEIGHT_STEP
-        for step in WEIGHT_STEP * np.eye(m, m + state.offsets.size)
-    ]
-    whole = np.hstack([np.stack(columns, axis=1), offset_columns(simulator.rows)])
+    if state.law is None:
+        raise ValueError('an H of no law has no columns')
+    simulator.remember(state)
+    of_law = simulator.columns(state, state.law, WEIGHT_STEP)
+    whole = np.concatenate([of_law, offset_columns(simulator.rows).T]).T
     return BaseColumns(whole, whole.T @ whole)
 
 
@@ -166,9 +165,8 @@ def fit_jointly(
     parameters = free_parameters(state, len(rows.names))
     p = base.columns.shape[1] + len(parameters)
     damping = DAMPING
-    prediction = simulator.remember(state)
-    e = rows.x - prediction
-    moving = _derivatives(simulator, state, parameters, prediction, tick)
+    e = rows.x - simulator.remember(state)
+    moving = _derivatives(simulator, state, parameters, tick)
     for _ in range(iterations):
         before = float(e @ e)
         lower, upper = _room(state, parameters, p)
@@ -179,7 +177,7 @@ def fit_jointly(
             delta = step.solve(lower, upper, damping)
             try:
                 trial = _moved(state, parameters, delta)
-                left = rows.x - simulator.run(trial)
+                left = rows.x - simulator.remember(trial)
             except ModelError:
                 damping *= 10.0
                 continue
@@ -191,10 +189,8 @@ def fit_jointly(
         if better is None:
             break
         damping = max(damping / 10.0, 1e-9)
-        state = better
-        prediction = simulator.remember(state)
-        e = rows.x - prediction
-        moving = _derivatives(simulator, state, parameters, prediction, tick)
+        state, e = better, left
+        moving = _derivatives(simulator, state, parameters, tick)
         if after > (1.0 - TOLERANCE) * before:
             break
     lower, upper = _room(state, parameters, p)
@@ -265,10 +261,9 @@ def _derivatives(
     simulator: Simulator,
     state: State,
     parameters: tuple[FreeParameter, ...],
-    prediction: Array,
     tick: Callable[[], None],
 ) -> Array:
-    columns = np.zeros((prediction.size, len(parameters)))
+    columns = np.zeros((len(parameters), simulator.rows.n))
     for j, parameter in enumerate(parameters):
         tick()
         value, step = parameter.get(state), parameter.step
@@ -279,11 +274,11 @@ def _derivatives(
             moved = parameter.moved(state, step)
             place = parameter.effect
             effect = None if place is None else state.effects[place].effect
-            columns[:, j] = (simulator.varied(moved, effect) - prediction) / step
+            columns[j] = simulator.varied(moved, effect) / step
         except ModelError:
             # a bound that depends on other parameters: this one stays
             continue
-    return columns
+    return columns.T
 
 
 def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[Array, Array]:

@@ -242,7 +242,7 @@ def score_trials(
 ) -> Iterator[Scored]:
     """Score every trial of every effect on the residual of a fit; surrogates, shape (n, k)."""
     rows = simulator.rows
-    now = simulator.remember(fitted.state)
+    simulator.remember(fitted.state)
     M, prior = fitted.J[:, fitted.free], fitted.prior[fitted.free]
     E = np.column_stack([fitted.e, surrogates])
     equations = normal_equations(rows, M, E)
@@ -252,7 +252,7 @@ def score_trials(
     for done, (effect, trial) in enumerate(trials):
         tick(done / len(trials))
         try:
-            C = _columns(simulator, effect, trial, now)
+            C = _columns(simulator, effect, trial)
         except ModelError:
             continue
         if not np.all(np.isfinite(C)) or not np.any(C):
@@ -269,7 +269,7 @@ def score_trials(
         yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
 
 
-def _columns(simulator: Simulator, effect: type[Effect], trial: Trial, now: Array) -> Array:
+def _columns(simulator: Simulator, effect: type[Effect], trial: Trial) -> Array:
     """
     Return what an effect would add to the rows for a step of each of its amplitudes.
 
@@ -279,12 +279,12 @@ def _columns(simulator: Simulator, effect: type[Effect], trial: Trial, now: Arra
     count = len(rows.names)
     columns = []
     for setting in trial.settings():
-        column = simulator.added(Added(effect.name, (setting,) * count)) - now
+        column = simulator.added(Added(effect.name, (setting,) * count))
         if effect.time_driven:
             columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
         else:
             columns.append(column)
-    return np.stack(columns, axis=1)
+    return np.array(columns).T
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:

@@ -10,43 +10,41 @@ other effects.  What lies before the change in the chain is kept from the run be
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.diagnosis.changes import Behind
+from piezo_ident.diagnosis.retuning import BEYOND, retuned, RETUNING, retuning_factor
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.run_chain import (
+    asked_once,
+    effects_around,
+    place_of,
+    place_of_core,
+    RunChain,
+)
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import number_of, with_number
 from piezo_ident.model.stage_model import EffectSetting, StageModel
-from piezo_ident.operators.chain import Block, Operator
-from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator, filter_arx
-from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filter_arx
+from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.residual.stretches import block_means
 
 __all__ = [
-    'RETUNING',
     'Added',
     'FreeParameter',
     'Simulator',
     'State',
     'free_parameters',
-    'retuned',
 ]
 
 Array = NDArray[np.float64]
 
-#: corner frequencies of the relaxations that a retuned G may show [Hz]
-RELAXATIONS = (15.0, 100.0)
-#: how far G may be retuned: about samples of delay, their squares, and two relaxations
-RETUNING = (20.0, 800.0, 1.0, 1.0)
-#: a retuned G follows its law up to so many times the highest frequency that is driven
-BEYOND = 4.0
-#: what the product of G and its factor may lose by rounding
-ROUNDING = 1e-4
 #: finite difference of the logarithm of a parameter
 LOG_STEP = 1e-2
 
@@ -202,9 +200,13 @@ class Simulator:
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model
         self.rows = rows
-        self._state: State | None = None
-        #: for each run the block before every link of the chain, and the one behind the last
-        self._kept: list[list[Block]] = []
+        self._sources = [
+            Block(t=rows.time(i), v=run.u, x=run.u, channels=run.piece.channels)
+            for i, run in enumerate(rows.runs)
+        ]
+        #: for each run what H made last, and of what
+        self._answers: list[list[Any]] = [[] for _ in rows.runs]
+        self._kept: _Kept | None = None
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -230,23 +232,42 @@ class Simulator:
 
     def base_columns(self, law: HysteresisLaw) -> Array:
         """
-        Return what G makes of the columns of a law, as rows; shape (n, size).
+        Return what G makes of the columns of a law, as rows; shape (size, n).
 
         Effects are left out of these columns: they change them by a few percent, and only the
         path to the optimum depends on that.
         """
-        G, delay = self.model.dynamics, self.model.delay
-        out = np.empty((self.rows.n, law.size))
-        start = 0
-        for run, memory, keep in zip(
-            self.rows.runs, self.rows.memories, self.rows.keep, strict=True
-        ):
-            stop = start + int(keep.sum())
-            for j, raw in enumerate(law.columns(run.u, memory(law.thresholds))):
-                passed = filter_arx(G.a, G.b, delay.apply(raw))
-                out[start:stop, j] = block_means(passed, self.rows.m)[keep]
-            start = stop
-        return out
+        links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
+        parts = []
+        for source, memory in zip(self._sources, self.rows.memories, strict=True):
+            behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
+            raw = law.columns(source.x, memory(law.thresholds))
+            parts.append(np.stack([behind.rows(x, float(x[0])) for x in raw]))
+        return self._joined(parts)
+
+    def columns(self, state: State, law: HysteresisLaw, step: float) -> Array:
+        """
+        Return what the whole chain makes of a step of each coefficient of H; shape (size, n).
+
+        Of a state that is remembered, divided by the step.
+        """
+        parts = []
+        for i, chain in enumerate(self._known(state).chains):
+            core = place_of_core(chain.operators)
+            behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
+            memory = self.rows.memories[i](law.thresholds)
+            changes: Iterator[Array]
+            if all(effect.beside_hysteresis for effect in effects_around(chain.operators[core])):
+                changes = (step * raw for raw in law.columns(before.x, memory))
+            else:
+                moved = (
+                    state.with_coefficients(law, state.coefficients + delta)
+                    for delta in step * np.eye(law.size)
+                )
+                cores = (self._chain(s, i).operators[core] for s in moved)
+                changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
+            parts.append(np.stack([behind.rows(x, float(x[0])) for x in changes]) / step)
+        return self._joined(parts)
 
     def bare(self, state: State) -> Array:
         """Return the rows of H, G and the delay alone; shape (n,)."""
@@ -259,136 +280,78 @@ class Simulator:
 
     def run(self, state: State) -> Array:
         """Return the predicted rows; shape (n,)."""
-        outputs = [self._blocks(state, i)[-1].x for i in range(len(self.rows.runs))]
-        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
+        if self._kept is not None and self._kept.state is state:
+            return self._kept.prediction
+        return self._predicted(state, [chain.output() for chain in self._chains(state)])
 
     def full(self, state: State) -> list[Array]:
         """Return the prediction of each run at the full rate, normalised."""
-        return [
-            self._blocks(state, i)[-1].x + state.offsets[k] for i, k in enumerate(self.rows.record)
-        ]
+        chains = zip(self._chains(state), self.rows.record, strict=True)
+        return [chain.output() + state.offsets[k] for chain, k in chains]
 
     def remember(self, state: State) -> Array:
-        """Return the predicted rows, and keep what runs between the links for `added`."""
-        self._state = state
-        self._kept = [self._blocks(state, i, keep=True) for i in range(len(self.rows.runs))]
-        outputs = [blocks[-1].x for blocks in self._kept]
-        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
+        """Return the predicted rows, and keep what runs between the links."""
+        if self._kept is None or self._kept.state is not state:
+            # gives the room back first
+            self._kept = None
+            chains = list(self._chains(state))
+            outputs = [chain.output(keep=True) for chain in chains]
+            self._kept = _Kept(state, tuple(chains), self._predicted(state, outputs))
+        return self._kept.prediction
 
     def added(self, effect: Added) -> Array:
-        """Return the predicted rows of the remembered state with one more effect in its slot."""
-        if self._state is None:
-            raise ValueError('remember a state first')
-        return self.varied(self._state.with_effect(effect), effect.effect)
+        """Return by how much rows of the remembered state change with one more effect."""
+        return self.varied(self._known().state.with_effect(effect), effect.effect)
 
     def varied(self, state: State, effect: type[Effect] | None) -> Array:
         """
-        Return the predicted rows of a state that differs from the remembered one in one place.
+        Return by how much the rows of a state differ from those of the remembered one.
 
-        That is an effect, or (None) G; the chain is only run from there.
+        The states differ in one place, an effect or (None) the factor of G; the chain is only run
+        from there.
         """
-        signals = []
-        for i, k in enumerate(self.rows.record):
-            operators = self._operators(state, i)
-            start = _place(effect, operators)
-            block = self._kept[i][start]
-            for operator in operators[start:]:
-                block = operator.process(block)
-            signals.append(block.x + state.offsets[k])
-        return self.rows.of(signals)
+        changes = [
+            after.difference(before, place_of(effect, after.operators), self.rows.m)
+            for before, after in zip(self._known().chains, self._chains(state), strict=True)
+        ]
+        return self._joined(changes)
 
-    def _operators(self, state: State, run_index: int) -> tuple[Operator, ...]:
-        """Return the links of the chain of a run, reset to rest at its first command."""
+    def _known(self, state: State | None = None) -> _Kept:
+        if self._kept is None or state not in (None, self._kept.state):
+            raise ValueError('remember the state first')
+        return self._kept
+
+    def _predicted(self, state: State, outputs: Sequence[Array]) -> Array:
+        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
+
+    def _joined(self, parts: Sequence[Array]) -> Array:
+        """Return the rows that count of all rows of each run, shape (n // m,) or (k, n // m)."""
+        kept = [part[..., keep] for part, keep in zip(parts, self.rows.keep, strict=True)]
+        return np.concatenate(kept, axis=-1)
+
+    def _chains(self, state: State) -> Iterator[RunChain]:
+        """Give the chain of each run."""
+        return (self._chain(state, i) for i in range(len(self._sources)))
+
+    def _chain(self, state: State, i: int) -> RunChain:
         alone = replace(state, retuning=())
-        model = self.model_of(alone, int(self.rows.record[run_index]))
-        memory = self.rows.memories[run_index](state.hysteresis.thresholds)
-        operators = model.chain(memory).operators
+        model = self.model_of(alone, int(self.rows.record[i]))
+        memory = self.rows.memories[i](state.hysteresis.thresholds)
+        operators = [
+            asked_once(operator, self._answers[i]) for operator in model.chain(memory).operators
+        ]
         if state.retuning:
             # a link of its own: one filter of so high an order would lose its digits
             factor = retuning_factor(state.retuning, model.sample_rate, self._band)
-            after = 1 + _place(None, operators)
-            operators = (*operators[:after], DynamicsOperator(factor), *operators[after:])
-        x0 = u0 = float(self.rows.runs[run_index].u[0])
-        for operator in operators:
-            x0 = operator.reset(u0, x0)
-        return operators
-
-    def _blocks(self, state: State, run_index: int, *, keep: bool = False) -> list[Block]:
-        """Return the block behind the chain of a run, or all between its links."""
-        run = self.rows.runs[run_index]
-        t = self.rows.time(run_index)
-        blocks = [Block(t=t, v=run.u, x=run.u, channels=run.piece.channels)]
-        for operator in self._operators(state, run_index):
-            block = operator.process(blocks[-1])
-            blocks = [*blocks, block] if keep else [block]
-        return blocks
+            after = 1 + place_of(None, operators)
+            operators.insert(after, DynamicsOperator(factor))
+        return RunChain(operators, self._sources[i])
 
 
-def retuning_factor(
-    retuning: Sequence[float], sample_rate: float, band: float = np.inf
-) -> Dynamics:
-    """
-    Return a factor of G near one.
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """A state that was run, its chains and rows."""
 
-    ``1 + c_1 D + c_2 D^2 + sum_j c_j (1 - z^-1) / (1 - p_j z^-1)`` with p_j the poles of
-    `RELAXATIONS`: a delay, a roll-off, and relaxations.  D is ``1 - z^-1`` up to the band [Hz]
-    that the data drive, and does not grow beyond it, where they say nothing.  It is 1 at rest, and
-    c_1 acts like minus a delay in samples at low frequencies.
-    """
-    c1, c2, c3, c4 = retuning
-    # polynomials in z^-1
-    D = np.array([1.0, -1.0])
-    p = float(np.exp(-2.0 * np.pi * band / sample_rate))
-    limited, B = (1.0 - p) * D, np.array([1.0, -p])
-    P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
-    BB, PQ = np.convolve(B, B), np.convolve(P, Q)
-    terms = (
-        np.convolve(BB, PQ),
-        c1 * np.convolve(np.convolve(limited, B), PQ),
-        c2 * np.convolve(np.convolve(limited, limited), PQ),
-        c3 * np.convolve(np.convolve(Q, D), BB),
-        c4 * np.convolve(np.convolve(P, D), BB),
-    )
-    factor = np.sum([np.pad(term, (0, 5 - term.size)) for term in terms], axis=0)
-    return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
-
-
-def retuned(
-    dynamics: Dynamics, retuning: Sequence[float], sample_rate: float, band: float = np.inf
-) -> Dynamics:
-    """
-    Return G times its factor; G alone where the product of both would lose its digits.
-
-    A high order at a high sampling rate leaves few digits for four more poles near 1.
-    """
-    if not any(retuning):
-        return dynamics
-    factor = retuning_factor(retuning, sample_rate, band)
-    a = np.convolve([1.0, *dynamics.a], [1.0, *factor.a])[1:]
-    product = Dynamics(a=a, b=np.convolve(dynamics.b, factor.b))
-    f = np.geomspace(1e-5, 0.4, 60) * sample_rate
-    exact = dynamics.response(f, sample_rate) * factor.response(f, sample_rate)
-    lost = np.abs(product.response(f, sample_rate) - exact).max() / np.abs(exact).max()
-    return product if lost < ROUNDING and product.is_stable else dynamics
-
-
-def _place(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
-    """Return the first link whose output depends on an effect, or on G."""
-    if effect is None:
-        return next(i for i, op in enumerate(operators) if isinstance(op, DynamicsOperator))
-    if effect.slot == 'hysteresis':
-        return next(i for i, operator in enumerate(operators) if _is_core(operator))
-    for i in range(len(operators) - 1, -1, -1):
-        if type(operators[i]) is effect:
-            return i
-    # no link of its own: it is part of the delay
-    return next(i for i, operator in enumerate(operators) if isinstance(operator, DelayOperator))
-
-
-def _is_core(operator: Operator) -> bool:
-    inner = operator
-    while isinstance(inner, Effect):
-        if inner.slot != 'hysteresis':
-            return False
-        inner = inner.inner
-    return isinstance(inner, HysteresisOperator)
+    state: State
+    chains: tuple[RunChain, ...]
+    prediction: Array

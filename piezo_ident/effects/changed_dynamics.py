@@ -36,6 +36,7 @@ class ChangedDynamics(Effect):
 
     name = 'changed_dynamics'
     slot = 'output'
+    change = 'linear'
     in_dynamics = True
     description = (
         'a resonance added or moved since G was identified, as by a load; linear, the static gain '

@@ -55,6 +55,7 @@ class Creep(Effect):
 
     name = 'creep'
     slot = 'hidden'
+    change = 'linear'
     description = (
         'slow motion after each change of the voltage; 1 .. 2 % a decade of time, 1 .. 5 % in all'
     )

@@ -31,6 +31,7 @@ class CrossCoupling(Effect):
 
     name = 'cross_coupling'
     slot = 'output'
+    change = 'passed'
     description = "motion that follows another axis's voltage; 0.5 .. 3 % of that axis's stroke"
     needs = "the other axis's voltage as a further channel, while that axis moves by itself"
     parameters = (

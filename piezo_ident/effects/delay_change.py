@@ -34,6 +34,7 @@ class DelayChange(Effect):
 
     name = 'delay_change'
     slot = 'acquisition'
+    change = 'passed'
     in_dynamics = True
     description = (
         'a delay other than the one identified; a sample at 20 kHz is 1.3 % of stroke at 120 Hz'

@@ -137,6 +137,12 @@ class Effect:
         imitates it.
     in_dynamics : bool
         Whether it is linear: had it been there at the identification, G would hold it.
+    change : str
+        What it makes of a small change of its signal: ``passed`` as it is, where the effect only
+        adds something of its own; ``linear``, the same whatever the signal; or ``bent``.
+    beside_hysteresis : bool
+        Whether what it adds to H does not depend on the coefficients of H, in the slot
+        ``hysteresis``.
     in_delay_line : bool
         Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
@@ -166,6 +172,8 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
+    change: ClassVar[Literal['passed', 'linear', 'bent']] = 'bent'
+    beside_hysteresis: ClassVar[bool] = False
     in_delay_line: ClassVar[bool] = False
 
     def __init__(

@@ -34,6 +34,7 @@ class GainDrift(Effect):
 
     name = 'gain_drift'
     slot = 'output'
+    change = 'linear'
     description = 'a gain that wanders during the record with temperature or age'
     needs = 'the same motion at the start and at the end of a long record'
     time_driven = True

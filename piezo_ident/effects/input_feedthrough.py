@@ -28,6 +28,7 @@ class InputFeedthrough(Effect):
 
     name = 'input_feedthrough'
     slot = 'acquisition'
+    change = 'passed'
     in_dynamics = True
     description = 'the drive leaks into the reading, ahead of the motion; up to 0.5 % of stroke'
     needs = 'steps or wide-band noise, sampled faster than the delay'

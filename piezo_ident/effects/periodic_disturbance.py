@@ -28,6 +28,7 @@ class PeriodicDisturbance(Effect):
 
     name = 'periodic_disturbance'
     slot = 'output'
+    change = 'passed'
     description = 'lines in the displacement, from the mains or a machine; 0.01 .. 0.2 % of stroke'
     needs = 'a rest of 2 s, or motion at frequencies other than its lines'
     time_driven = True

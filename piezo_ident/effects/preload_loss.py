@@ -29,6 +29,7 @@ class PreloadLoss(Effect):
 
     name = 'preload_loss'
     slot = 'hidden'
+    change = 'passed'
     rate_independent = True
     description = (
         'another slope below the voltage at which the preload runs out; 0.1 .. 2 % of stroke'

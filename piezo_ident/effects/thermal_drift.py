@@ -30,6 +30,7 @@ class ThermalDrift(Effect):
 
     name = 'thermal_drift'
     slot = 'output'
+    change = 'passed'
     description = 'displacement that grows with time whatever the voltage does; 1 .. 100 nm/min'
     needs = 'rests at one voltage at the start and at the end'
     time_driven = True

@@ -274,7 +274,11 @@ class DynamicsOperator:
     ----------
     b, a : ndarray, shape (nb,) and (na,)
         Coefficients from the oldest sample to the newest.
+    change : str
+        As of `piezo_ident.effects.effect.Effect`.
     """
+
+    change = 'linear'
 
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics = dynamics
@@ -341,6 +345,8 @@ class Delay:
 
 class DelayOperator:
     """z^-d as an operator."""
+
+    change = 'linear'
 
     def __init__(self, delay: Delay) -> None:
         self.delay = delay

@@ -20,8 +20,10 @@ from piezo_ident.diagnosis import diagnose, DiagnosisSettings, search
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
 from piezo_ident.diagnosis.joint_fit import base_at, base_thresholds, fit_base, fit_jointly
+from piezo_ident.diagnosis.retuning import retuned
 from piezo_ident.diagnosis.rows import make_rows
-from piezo_ident.diagnosis.simulator import Added, retuned, Simulator, State
+from piezo_ident.diagnosis.simulator import Added, free_parameters, Simulator, State
+from piezo_ident.effects import find_effect
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
@@ -447,7 +449,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing(truths):
     model, record, _ = measured(None, 0.0, 1)
     simulator = Simulator(model, make_rows(model, [record]))
     state = State(model.hysteresis, np.zeros(1), retuning=(0.1, 0.2, 0.01, 0.02))
-    simulator.remember(state)
+    now = simulator.remember(state)
     for name, values in (
         ('creep', {'gain': [0.01], 'time_constant': [0.3]}),
         ('even_nonlinearity', {'square': 0.01}),
@@ -459,7 +461,48 @@ def test_what_is_kept_from_the_run_before_changes_nothing(truths):
         added = Added(name, (values,))
         added = Added(name, (added.effect.check(values),))
         np.testing.assert_allclose(
-            simulator.added(added), simulator.run(state.with_effect(added)), atol=1e-12
+            now + simulator.added(added), simulator.run(state.with_effect(added)), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    'effects',
+    [
+        ('creep', 'sensor_nonlinearity'),
+        ('rate_dependent_hysteresis', 'gain_drift', 'backlash'),
+        ('even_nonlinearity', 'amplifier_lag', 'changed_dynamics'),
+    ],
+)
+def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
+    model, record, _ = measured(None, 0.0, 1)
+    rows = make_rows(model, [record])
+    simulator = Simulator(model, rows)
+    law = HysteresisLaw('preisach', base_thresholds(1.0)[::6])
+    values = {
+        'creep': {'gain': [0.01, 0.02], 'time_constant': [0.3, 0.02]},
+        'sensor_nonlinearity': {'square': 0.05},
+        'rate_dependent_hysteresis': {'gain': 1e-3, 'exponent': 0.7, 'cutoff': 900.0},
+        'gain_drift': {'time': [0.0, 3.0], 'gain': [0.01, 0.03]},
+        'backlash': {'width': 0.01, 'gain': 0.2},
+        'even_nonlinearity': {'fourth': 0.02},
+        'amplifier_lag': {'time_constant': 1e-4},
+        'changed_dynamics': {'frequency': [300.0], 'damping': [0.1], 'gain': [0.01]},
+    }
+    chosen = tuple(Added(name, (find_effect(name).check(values[name]),)) for name in effects)
+    state = State(model.hysteresis, np.zeros(1), chosen, (0.1, 0.2, 0.01, 0.02))
+    state = state.with_coefficients(law, np.full(law.size, 0.1))
+    now = simulator.remember(state)
+    whole = Simulator(model, rows)
+    columns = base_at(simulator, state).columns
+    for j in (0, 2, law.size - 2):
+        more = state.with_coefficients(law, state.coefficients + 1e-3 * np.eye(law.size)[j])
+        np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=1e-7)
+    for parameter in free_parameters(state, 1):
+        moved = parameter.moved(state, parameter.step)
+        effect = None if parameter.effect is None else chosen[parameter.effect].effect
+        # a difference of whole runs holds the rounding of both
+        np.testing.assert_allclose(
+            simulator.varied(moved, effect), whole.run(moved) - now, atol=1e-10
         )
 
 

@@ -1,0 +1,127 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The links of the chain of one run, and the signals between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.diagnosis.changes import Behind
+from piezo_ident.effects import Effect
+from piezo_ident.operators.chain import Block, Operator
+from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
+from piezo_ident.operators.hysteresis import HysteresisOperator
+
+__all__ = ['RunChain', 'asked_once', 'effects_around', 'place_of', 'place_of_core']
+
+Array = NDArray[np.float64]
+
+
+class RunChain:
+    """
+    The links of one run, at rest under its first command.
+
+    `rests` are the signals at rest before each link and behind the last, and `blocks` those of the
+    run as far as they are kept.
+    """
+
+    def __init__(self, operators: Sequence[Operator], source: Block) -> None:
+        self.operators = tuple(operators)
+        self.blocks = [source]
+        self._u0 = float(source.v[0])
+        self.rests = [self._u0]
+        for operator in self.operators:
+            self.rests.append(operator.reset(self._u0, self.rests[-1]))
+
+    def output(self, *, keep: bool = False) -> Array:
+        """Return the signal behind the last link, and keep those before it if wanted."""
+        block = self.blocks[0]
+        for operator in self.operators:
+            block = operator.process(block)
+            if keep:
+                self.blocks.append(block)
+        return block.x
+
+    def behind(self, start: int, m: int) -> Behind:
+        """Return the links from a place on, once all blocks are kept."""
+        return Behind(self.operators[start:], self.rests[start:], self.blocks[start:], m)
+
+    def difference(self, before: RunChain, place: int, m: int) -> Array:
+        """Return by how much all rows differ from a kept chain's, alike but for a link here."""
+        rests, blocks = before.rests[place:], before.blocks[place:]
+        if len(self.operators) > len(before.operators):
+            # what was no link let the signal pass
+            rests, blocks = [rests[0], *rests], [blocks[0], *blocks]
+        core, block = place_of_core(self.operators), blocks[0]
+        if place > core:
+            return Behind(self.operators[place:], rests, blocks, m, new=True).rows()
+        # what is in front of H, or in it, runs on until it is behind H
+        for operator in self.operators[place : core + 1]:
+            block = operator.process(block)
+        k = core + 1 - place
+        behind = Behind(self.operators[core + 1 :], rests[k:], blocks[k:], m)
+        return behind.rows(block.x - blocks[k].x, self.rests[core + 1] - rests[k])
+
+
+class _Once(HysteresisOperator):
+    """H, whose last answer is kept: effects around it ask again and again."""
+
+    def __init__(self, operator: HysteresisOperator, answer: list[Any]) -> None:
+        self.__dict__.update(operator.__dict__)
+        self._answer = answer
+
+    def process(self, block: Block) -> Block:
+        """Return the block with H applied to its signal."""
+        known = self._answer
+        if not known or known[0] is not self.hysteresis or known[1] is not block.x:
+            known[:] = self.hysteresis, block.x, super().process(block).x
+        return block.with_signal(known[2])
+
+
+def asked_once(operator: Operator, answer: list[Any]) -> Operator:
+    """Return a link in which H, where the link holds it, keeps its last answer in a list."""
+    core = _core(operator)
+    if not isinstance(core, HysteresisOperator):
+        return operator
+    around, once = effects_around(operator), _Once(core, answer)
+    if not around:
+        return once
+    around[-1].inner = once
+    return operator
+
+
+def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
+    """Return the first link whose output depends on an effect, or on the factor of G."""
+    if effect is None:
+        return max(i for i, op in enumerate(operators) if isinstance(op, DynamicsOperator))
+    if effect.slot == 'hysteresis':
+        return place_of_core(operators)
+    for i in range(len(operators) - 1, -1, -1):
+        if type(operators[i]) is effect:
+            return i
+    # no link of its own: it is part of the delay
+    return next(i for i, operator in enumerate(operators) if isinstance(operator, DelayOperator))
+
+
+def place_of_core(operators: Sequence[Operator]) -> int:
+    """Return the place of H, and of what is around it."""
+    return next(i for i, op in enumerate(operators) if isinstance(_core(op), HysteresisOperator))
+
+
+def effects_around(operator: Operator) -> list[Effect]:
+    """Return the effects around H, the outermost first."""
+    found = []
+    while isinstance(operator, Effect) and operator.slot == 'hysteresis':
+        found.append(operator)
+        operator = operator.inner
+    return found
+
+
+def _core(operator: Operator) -> Operator:
+    """Return what effects around H hold, and any other link as it is."""
+    around = effects_around(operator)
+    return around[-1].inner if around else operator
