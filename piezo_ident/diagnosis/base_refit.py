@@ -127,10 +127,22 @@ def with_refit(
         and gain >= refit.mean_square - noise
         and refit_holds(rows, e, refit.transfer)
     ):
+        if _is_gain(simulator, given, refit):
+            # of another record a gain that wanders says nothing
+            names = ('gain_drift', *look_alikes('gain_drift')[:1])
+            return findings.unsettled(rows.percent(float(np.mean(e * e)) - noise)).hiding(names)
         findings = findings.refitted(rows.percent(refit.mean_square - noise))
     elif misfit < criteria.REFIT_FINDING:
         return findings
     return findings.hiding(_hidden(simulator, given, refit, selected.imitated))
+
+
+def _is_gain(simulator: Simulator, given: State, refit: Fitted) -> bool:
+    """Return whether a plain gain takes most of what a refit takes: no other loop is one."""
+    rows, x = simulator.rows, simulator.run(given)
+    e, h = centred(rows.x - x, rows.of_record), centred(x, rows.of_record)
+    taken, whole = float((h @ e) ** 2 / (h @ h)), float(e @ e)
+    return taken > criteria.ADDED * (whole - float(refit.errors.sum()))
 
 
 def _hidden(

@@ -126,7 +126,9 @@ def sentence(
         text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}.'
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'
-        if smallest is None:
+        if findings.keeps_given:
+            why = ', most of it by a gain that is not that of its identification'
+        elif smallest is None:
             why = f', unexplained: {rest.description}'
         text = f'The model misses {rest.rms_percent:.2g} % of stroke{why}{tail}.'
     elif smallest is None:

@@ -51,10 +51,7 @@ def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Finding
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
     metres = shifts * model.scaling.Y
-    if not findings.effects and (
-        fitted.mean_square > (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
-        or not refit_holds(rows, e, fitted.transfer)
-    ):
+    if findings.keeps_given or (not findings.effects and not _is_worth(rows, fitted, e)):
         return Refined(model, given, metres, is_given=True)
     if fitted.transfer.sum() > e @ e:
         # of a kind of excitation that was not fitted the given model knows more
@@ -75,6 +72,12 @@ def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Finding
     return Refined(
         _model(simulator, fitted.state, findings, _range(simulator)), fitted.state, metres
     )
+
+
+def _is_worth(rows: Rows, refit: Fitted, e: Array) -> bool:
+    """Return whether a refit of H alone errs clearly less than the given model, which leaves e."""
+    least = (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
+    return refit.mean_square <= least and refit_holds(rows, e, refit.transfer)
 
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:

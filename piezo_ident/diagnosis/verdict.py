@@ -62,6 +62,8 @@ class Findings:
     group : Class or None
     left : float
         Beyond the noise, rms in % of stroke.
+    keeps_given : bool
+        Whether the model stays as it was given, whatever a refit would bring.
     """
 
     verdict: str
@@ -69,6 +71,11 @@ class Findings:
     effects: tuple[str, ...]
     group: Class | None
     left: float
+    keeps_given: bool = False
+
+    def unsettled(self, left: float) -> Findings:
+        """Return that what a refit of H would take need not last."""
+        return replace(self, verdict='unexplained', left=left, keeps_given=True)
 
     def refitted(self, left: float) -> Findings:
         """Return that a refit of H alone brought what there was to gain."""

@@ -210,6 +210,18 @@ def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
     assert max(unseen_errors(result, unseen)) < 0.1
 
 
+def test_another_gain_is_no_other_hysteresis(truths):
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+    larger = Record((replace(piece, y=1.02 * piece.y),), 'larger')
+    result = diagnose(model, larger, FEW)
+    assert (result.verdict, result.effects) == ('unexplained', ()), result.sentence
+    assert result.group.names == ('gain_drift', 'creep')
+    assert 'a gain that is not that of its identification' in result.sentence
+    # a gain that wanders is another one in the next record
+    assert result.model is model and result.after.overall == result.before.overall > 0.3
+
+
 def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
