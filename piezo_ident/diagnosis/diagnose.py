@@ -201,8 +201,9 @@ def _diagnosed(
     progress('residual', 1.0)
     # 4. effects, one after another
     frequencies = [line.frequency for line in lines.lines]
-    shown = [HUM] * bool(frequencies)
-    shown += ['cross_coupling'] * any(test.significant for test in channels)
+    # another axis makes lines, too: what its model leaves is hum
+    shown = ['cross_coupling'] * any(test.significant for test in channels)
+    shown += [HUM] * bool(frequencies)
     missed, misfit = _missed(model), rows.percent(plays.mean_square - wide.mean_square)
     search = ForwardSelection(
         simulator,

@@ -116,7 +116,8 @@ class ForwardSelection:
         self._base, retuned = base, self.retuned(base)
         for name in self._certain:
             this = self._round(retuned, [e for e in self._candidates if e.name == name])
-            if this.contenders:
+            # what one leaves by its form is no line of its own
+            if this.contenders and (not shown or self._gain(this) > self._indistinct):
                 shown.append(this)
                 retuned = this.contenders[0]
         if shown:
@@ -155,8 +156,7 @@ class ForwardSelection:
         found = replace(found, rounds=(*found.rounds, this), imitated=this)
         if not self._takes(this, left, first=True):
             return found
-        floor = (criteria.INDISTINCT * self._simulator.rows.stroke / 100.0) ** 2
-        least = self._beyond_noise(wide) + floor
+        least = self._beyond_noise(wide) + self._indistinct
         if this.contenders[0].name == 'noncongruent_minor_loops':
             # weights that change with the bias are but another wide law
             least /= criteria.AHEAD
@@ -188,6 +188,15 @@ class ForwardSelection:
     def _least(self) -> float:
         """Mean square of the smallest effect."""
         return (self._smallest * self._simulator.rows.stroke / 100.0) ** 2
+
+    @property
+    def _indistinct(self) -> float:
+        """Mean square of a difference that means nothing."""
+        return (criteria.INDISTINCT * self._simulator.rows.stroke / 100.0) ** 2
+
+    @staticmethod
+    def _gain(this: Round) -> float:
+        return this.before.mean_square - this.contenders[0].mean_square
 
     def _beyond_noise(self, fitted: Fitted) -> float:
         return max(fitted.mean_square - self._noise, 0.0)

@@ -63,16 +63,24 @@ def measured(effect, size, seed):
     """Return model, a record to diagnose and one that nothing saw."""
     import truths as found
 
+    def other(t, number):
+        if effect != 'cross_coupling':
+            return None
+        return {'other': found.other_axis(t, np.random.default_rng(number))}
+
     stage = found.make_stage(effect, size, seed)
     sequence = parse_program(IDENTIFICATION).build()
     t = np.arange(sequence.n) / RATE
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    y = stage.respond(t, sequence.v, changed=False)
+    y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
     model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
     records = []
     for kind in ('diagnosis', 'unseen'):
         t, v, labels = found.program(kind, seed)
-        records.append(record_of(v, stage.respond(t, v), labels, kind))
+        channels = other(t, len(kind))
+        record = record_of(v, stage.respond(t, v, channels=channels), labels, kind)
+        (piece,) = record.pieces
+        records.append(Record((replace(piece, channels=channels or {}),), kind))
     return model.model, *records
 
 
@@ -197,6 +205,15 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
     whole = diagnose(model, record, few)
     assert whole.model.scaling.range == model.scaling.range
     assert not [w for w in whole.warnings if 'was refitted' in w]
+
+
+def test_lines_that_another_axis_makes_are_no_hum(truths):
+    model, record, unseen = measured('cross_coupling', 0.3, 1)
+    few = DiagnosisSettings(effects=('creep', 'periodic_disturbance', 'cross_coupling'))
+    result = diagnose(model, record, few)
+    assert [e.name for e in result.effects] == ['cross_coupling'], result.sentence
+    before, after = unseen_errors(result, unseen)
+    assert after < before / 5
 
 
 def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
