@@ -198,6 +198,11 @@ def _diagnosed(
     # 3. lines and noise of what it leaves
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = _noise(floor, faults.quantum, rows.m, abs(model.scaling.Y))
+    left = float(np.mean((rows.x - simulator.run(given)) ** 2))
+    # periods in which a memory settles repeat by less than the noise: no model errs less than that
+    excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
+    noise -= excess
+    single = None if single is None else single - excess
     progress('residual', 1.0)
     # 4. effects, one after another
     frequencies = [line.frequency for line in lines.lines]
@@ -205,6 +210,8 @@ def _diagnosed(
     shown = ['cross_coupling'] * any(test.significant for test in channels)
     shown += [HUM] * bool(frequencies)
     missed, misfit = _missed(model), rows.percent(plays.mean_square - wide.mean_square)
+    # what a wider law adds, and what a refit takes or loses: H fits no better than that
+    doubt = max(misfit, rows.percent(abs(left - plays.mean_square)))
     search = ForwardSelection(
         simulator,
         frequencies,
@@ -212,8 +219,9 @@ def _diagnosed(
         settings,
         progress,
         certain=shown,
-        smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * misfit),
+        smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * doubt),
         missed=missed,
+        given=left,
     )
     base, selected = effects_beside(simulator, search, plays, wide)
     # 5. the verdict, and what holds
@@ -300,9 +308,9 @@ def _beside_the_drive(
     # another axis that moves in sines leaves lines, too
     parts = without_channels(parts, channels)
     found = find_lines(parts, all_stretches(parts))
-    # hum is no noise: it can be explained
+    # hum and another axis are no noise: they can be explained
     resting = _parts(simulator, state, whole=True)
-    quiet = [without_lines(part, found.lines) for part in resting]
+    quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
     return channels, found, residual_noise_floor(quiet, all_stretches(resting))
 
 

@@ -12,17 +12,17 @@ what that explains.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
+from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round, score_trials, search_round, started
+from piezo_ident.diagnosis.search import Round, score_trials, search_round
 from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, Effect, find_effect
@@ -51,6 +51,9 @@ class Selected:
         Effects that were not tried.
     imitated : Round or None
         Effects that follow the path of the command alone, beside plays.
+    linear : tuple of str
+        Changes of the dynamics, best first, that do half of what a retuned G does, where nothing
+        was taken and that does the larger part.
     """
 
     rounds: tuple[Round, ...]
@@ -59,6 +62,7 @@ class Selected:
     bent: Round | None
     left_out: frozenset[str]
     imitated: Round | None = None
+    linear: tuple[str, ...] = ()
 
 
 class ForwardSelection:
@@ -68,6 +72,8 @@ class ForwardSelection:
     `certain` are effects that a test of their own has shown, whatever they explain of the rest;
     `smallest` is the rms of the smallest other effect that is taken, and `missed` what the model
     missed when it was identified, % of stroke: no change of the dynamics since is smaller.
+    `given` is the mean square that the model leaves as it was given: where a refit of H leaves
+    more, an effect has to gain against that.
     """
 
     def __init__(
@@ -81,12 +87,14 @@ class ForwardSelection:
         certain: Sequence[str] = (),
         smallest: float = criteria.SMALLEST_EFFECT,
         missed: float = 0.0,
+        given: float = np.inf,
     ) -> None:
         self._simulator = simulator
         self._lines = lines
         self._noise = noise
         self._smallest = smallest
         self._missed = missed
+        self._given = given
         self._certain = certain
         #: fits, and the same with G retuned
         self._retunings: list[tuple[Fitted, Fitted]] = []
@@ -104,7 +112,7 @@ class ForwardSelection:
 
         What follows the path of the command alone is left to `beside`.
         """
-        size = self._simulator.rows.percent(self._beyond_noise(base))
+        size = self._simulator.rows.percent(self._explainable(base))
         self._allowed = [
             effect
             for effect in self._candidates
@@ -125,19 +133,45 @@ class ForwardSelection:
             base = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
         news = [effect for effect in self._allowed if effect.in_dynamics]
-        if not news or base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
+        if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
+            return self._from(retuned, self._round(retuned), shown)
+        found = self._beside_a_linear_change(base, retuned, news, shown)
+        size = self._simulator.rows.percent(base.mean_square - retuned.mean_square)
+        if len(found.taken) > len(shown) or size < self._smallest:
+            return found
+        return replace(found, linear=self._instead(base, retuned))
+
+    def _beside_a_linear_change(
+        self,
+        base: Fitted,
+        retuned: Fitted,
+        news: Sequence[type[Effect]],
+        shown: Sequence[Round],
+    ) -> Selected:
+        if not news:
             return self._from(retuned, self._round(retuned), shown)
         # a linear change is the larger part: is it the whole of it?
         linear, bent = self._round(base, news), None
-        is_linear = self._takes(linear, self._beyond_noise(base), first=True)
+        is_linear = self._takes(linear, self._explainable(base), first=True)
         if not is_linear or self._left(linear) > self._least:
             bent = self._round(retuned)
         if bent is None:
             return self._from(base, linear, shown)
-        is_bent = self._takes(bent, self._beyond_noise(bent.before), first=True)
+        is_bent = self._takes(bent, self._explainable(bent.before), first=True)
         if not is_linear or (is_bent and self._left(bent) < criteria.BENT * self._left(linear)):
             return self._from(retuned, bent, shown)
         return self._from(base, linear, shown, bent if is_bent else None)
+
+    def _instead(self, base: Fitted, retuned: Fitted) -> tuple[str, ...]:
+        """Return changes of the dynamics, best first, that do half of what a retuned G does."""
+        effects = [effect for effect in self._candidates if effect.in_dynamics]
+        none = np.zeros((self._simulator.rows.n, 0))
+        left: dict[str, float] = {}
+        for scored in score_trials(self._simulator, base, effects, self._lines, none):
+            if scored.is_possible:
+                left[scored.effect.name] = min(left.get(scored.effect.name, np.inf), scored.error)
+        most = 0.5 * float(base.errors.sum() + retuned.errors.sum())
+        return tuple(sorted((name for name in left if left[name] < most), key=left.__getitem__))
 
     def beside(self, plays: Fitted, wide: Fitted, found: Selected) -> Selected:
         """
@@ -149,11 +183,11 @@ class ForwardSelection:
         self._allowed = [effect for effect in self._candidates if effect.rate_independent]
         # G was identified with the effect, and may be bent by it
         plays, wide = (self.retuned(fitted) for fitted in (plays, wide))
-        left = self._beyond_noise(plays)
-        if left < self._least or len(found.taken) == self._most:
+        if self._beyond_noise(plays) < self._least or len(found.taken) == self._most:
             return found
         this = self._round(plays)
         found = replace(found, rounds=(*found.rounds, this), imitated=this)
+        left = self._explainable(plays)
         if not self._takes(this, left, first=True):
             return found
         least = self._beyond_noise(wide) + self._indistinct
@@ -182,7 +216,8 @@ class ForwardSelection:
         # what shows where it alone acts is no misfit of H
         own = has_place(this.contenders[0].name)
         smallest = criteria.SMALLEST_EFFECT if own else self._smallest
-        return takes(rows, this, self._noise, explainable, smallest, first=first)
+        known = min(this.before.mean_square, self._given)
+        return takes(rows, this, known, self._noise, explainable, smallest, first=first)
 
     @property
     def _least(self) -> float:
@@ -200,6 +235,9 @@ class ForwardSelection:
 
     def _beyond_noise(self, fitted: Fitted) -> float:
         return max(fitted.mean_square - self._noise, 0.0)
+
+    def _explainable(self, fitted: Fitted) -> float:
+        return max(min(fitted.mean_square, self._given) - self._noise, 0.0)
 
     def _left(self, this: Round) -> float:
         return self._beyond_noise(this.contenders[0] if this.contenders else this.before)
@@ -230,10 +268,10 @@ class ForwardSelection:
     ) -> Selected:
         fitted, this = start, first
         rounds, taken = [*shown, first], [*shown]
-        explainable = self._beyond_noise(start)
+        explainable = self._explainable(start)
         while self._takes(this, explainable, first=len(taken) == len(shown)):
             taken.append(this)
-            fitted, dropped = _without_needless(
+            fitted, dropped = without_needless(
                 self._simulator, this.contenders[0], self._least, len(shown)
             )
             for i in dropped:
@@ -243,11 +281,11 @@ class ForwardSelection:
             this = self._round(fitted)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
-            fitted = _polished(
+            fitted = polished(
                 self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
             )
             # an effect that was not fitted to the end leaves something for another one to explain
-            fitted, dropped = _without_needless(
+            fitted, dropped = without_needless(
                 self._simulator, fitted, self._least, len(shown), last=0
             )
             for i in dropped:
@@ -269,19 +307,26 @@ class ForwardSelection:
 
 
 def takes(
-    rows: Rows, this: Round, noise: float, explainable: float, smallest: float, *, first: bool
+    rows: Rows,
+    this: Round,
+    before: float,
+    noise: float,
+    explainable: float,
+    smallest: float,
+    *,
+    first: bool,
 ) -> bool:
     """
     Return whether the best contender of a round is an effect, the `first` one or a further one.
 
-    `noise` is the mean square of the noise of a row, `explainable` what there was to be explained
-    before anything was added, `smallest` the least size [% of stroke].
+    `before` is the mean square that is left without it and `noise` that of the noise of a row,
+    `explainable` what there was to be explained before anything was added, `smallest` the least
+    size [% of stroke].
     """
     if not this.contenders:
         return False
     best = this.contenders[0]
-    before, after = this.before.mean_square, best.mean_square
-    gain, left = before - after, max(before - noise, 1e-300)
+    gain, left = before - best.mean_square, max(before - noise, 1e-300)
     if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
         return False
     # what follows time alone fits a shifted residual as well; its lines and trends have tests
@@ -321,69 +366,3 @@ def smallest_detectable(
         share * (selected.fitted.mean_square - noise),
     )
     return max(criteria.SMALLEST_EFFECT, rows.percent(least))
-
-
-# -- effects that are there already --------------------------------------------------------------
-
-
-def _without_needless(
-    simulator: Simulator, fitted: Fitted, least: float, stay: int, last: int = 1
-) -> tuple[Fitted, tuple[int, ...]]:
-    """
-    Take out effects that others have made needless; the first `stay` and the `last` ones stay.
-
-    Each must be worth a mean square of `least`.  Places of those that went come along, falling.
-    """
-    dropped: list[int] = []
-    for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
-        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
-        if without.mean_square - fitted.mean_square < least:
-            fitted = without
-            dropped.append(i)
-    return fitted, tuple(dropped)
-
-
-def _polished(
-    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
-) -> Fitted:
-    """
-    Fit several effects again, each from fresh starts now that the others are known.
-
-    An effect that was found before others were in the model took a law that made up for them.
-    """
-    for i in range(len(fitted.state.effects)):
-        for fresh in _afresh(simulator, fitted, i, lines, tick):
-            if fresh.mean_square < fitted.mean_square:
-                fitted = fresh
-    for _ in range(criteria.POLISHING):
-        state = fitted.state
-        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-        if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
-            break
-        fitted = fresh
-    return fitted
-
-
-def _afresh(
-    simulator: Simulator,
-    fitted: Fitted,
-    i: int,
-    lines: Sequence[float],
-    tick: Callable[[], None],
-) -> Iterator[Fitted]:
-    """Yield fits in which effect i starts again from its best trials."""
-    rows, own = simulator.rows, fitted.state.effects[i]
-    others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-    state = replace(fitted.state, effects=others)
-    rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
-    scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
-    trials = sorted((s for s in scored if s.is_possible), key=lambda s: s.error)
-    for start in trials[: criteria.STARTS]:
-        effects = (*others[:i], started(rows, start), *others[i:])
-        state = replace(rest.state, effects=effects)
-        try:
-            yield fit_jointly(simulator, state, fitted.base, tick=tick)
-        except (ModelError, IdentificationError):
-            # the fit that is there already stays
-            continue

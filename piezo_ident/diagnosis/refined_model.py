@@ -51,7 +51,10 @@ def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Finding
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
     metres = shifts * model.scaling.Y
-    if findings.keeps_given or (not findings.effects and not _is_worth(rows, fitted, e)):
+    if findings.keeps_given or (
+        not findings.effects
+        and (not _is_worth(rows, fitted, e) or _harms_the_start(simulator, given, fitted.state))
+    ):
         return Refined(model, given, metres, is_given=True)
     if fitted.transfer.sum() > e @ e:
         # of a kind of excitation that was not fitted the given model knows more
@@ -78,6 +81,21 @@ def _is_worth(rows: Rows, refit: Fitted, e: Array) -> bool:
     """Return whether a refit of H alone errs clearly less than the given model, which leaves e."""
     least = (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
     return refit.mean_square <= least and refit_holds(rows, e, refit.transfer)
+
+
+def _harms_the_start(simulator: Simulator, given: State, fitted: State) -> bool:
+    """
+    Return whether a refit errs more than the given model where the memory is not yet known.
+
+    Nothing was fitted there, and of a record that starts anywhere it can be the larger part.
+    """
+    squares = np.zeros(2)
+    for i, state in enumerate((given, fitted)):
+        for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True):
+            part = run.use & ~run.known
+            if part.any():
+                squares[i] += float(part.sum()) * float(np.var((run.x - x)[part]))
+    return bool(squares[1] > squares[0])
 
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:

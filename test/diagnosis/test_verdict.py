@@ -147,10 +147,18 @@ def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
     assert found.group.names == ('changed_dynamics', 'backlash')
 
 
+def test_an_effect_has_to_gain_against_the_model_as_it_was_given(rows):
+    best = contender('slew_limit', 0.3)
+    assert takes(rows, a_round(best), WHOLE, 0.0, WHOLE, 0.05, first=True)
+    # the refit of H lost twice as much as the effect brings
+    given = 0.35 * WHOLE
+    assert not takes(rows, a_round(best), given, 0.0, given, 0.05, first=True)
+
+
 def test_an_effect_that_costs_a_kind_is_not(rows):
     worse = np.where(rows.group == 2, 1.0, 0.05)
     best = contender('slew_limit', 0.3, shape=worse)
-    assert not takes(rows, a_round(best), 0.0, WHOLE, 0.05, first=True)
+    assert not takes(rows, a_round(best), WHOLE, 0.0, WHOLE, 0.05, first=True)
 
 
 # -- a change of G, or an effect that bent it ---------------------------------------------------
@@ -164,7 +172,7 @@ def choose(rows):
         search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
         search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
-        search._certain = ()
+        search._certain, search._given = (), np.inf
         search._candidates = [find_effect(n) for n in ('amplifier_lag', 'changed_dynamics')]
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
         starts = {
@@ -173,29 +181,37 @@ def choose(rows):
         }
         search.retuned = lambda fitted: starts['retuned']
         search._round = lambda start, *_: rounds[next(k for k, v in starts.items() if v is start)]
-        search._from = lambda start, first, shown, bent=None: (
-            next(k for k, v in starts.items() if v is start),
-            bent,
-        )
-        return search.run(starts['as it is'])
+        search._instead = lambda *_: ('changed_dynamics', 'amplifier_lag')
+
+        def selected(start, first, shown, bent=None):
+            taken = (first,) if search._takes(first, first.before.mean_square, first=True) else ()
+            return forward_selection.Selected((first,), taken, start, bent, frozenset())
+
+        search._from = selected
+        found = search.run(starts['as it is'])
+        start = next(k for k, v in starts.items() if v is found.fitted)
+        return start, found.bent, found.linear
 
     return chosen
 
 
 def test_an_effect_that_explains_much_more_beside_a_bent_g_is_preferred(choose):
-    start, bent = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.005))
-    assert start == 'retuned' and bent is None
+    start, bent, linear = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.005))
+    assert start == 'retuned' and bent is None and linear == ()
 
 
 def test_one_that_explains_about_as_much_stays_a_rival(choose):
-    start, bent = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.02))
+    start, bent, _ = choose(contender('changed_dynamics', 0.04), contender('backlash', 0.02))
     assert start == 'as it is' and bent.contenders[0].name == 'backlash'
 
 
 def test_what_the_retuning_makes_and_no_effect_is_no_linear_effect(choose):
     # much less is left, but by the four numbers of the retuning, not by the effect
-    start, bent = choose(contender('amplifier_lag', 0.9), contender('amplifier_lag', 0.045))
+    one, other = contender('amplifier_lag', 0.9), contender('amplifier_lag', 0.045)
+    start, bent, linear = choose(one, other)
     assert start == 'retuned' and bent is None
+    # but it says which could be meant
+    assert linear == ('changed_dynamics', 'amplifier_lag')
 
 
 # -- a refit of H ------------------------------------------------------------------------------

@@ -1,0 +1,81 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Effects that others made needless, and a fresh fit of those that stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.search import score_trials, started
+from piezo_ident.diagnosis.simulator import Simulator
+
+__all__ = ['polished', 'without_needless']
+
+
+def without_needless(
+    simulator: Simulator, fitted: Fitted, least: float, stay: int, last: int = 1
+) -> tuple[Fitted, tuple[int, ...]]:
+    """
+    Take out effects that others have made needless; the first `stay` and the `last` ones stay.
+
+    Each must be worth a mean square of `least`.  Places of those that went come along, falling.
+    """
+    dropped: list[int] = []
+    for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
+        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
+        if without.mean_square - fitted.mean_square < least:
+            fitted = without
+            dropped.append(i)
+    return fitted, tuple(dropped)
+
+
+def polished(
+    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
+) -> Fitted:
+    """
+    Fit several effects again, each from fresh starts now that the others are known.
+
+    An effect that was found before others were in the model took a law that made up for them.
+    """
+    for i in range(len(fitted.state.effects)):
+        for fresh in _afresh(simulator, fitted, i, lines, tick):
+            if fresh.mean_square < fitted.mean_square:
+                fitted = fresh
+    for _ in range(criteria.POLISHING):
+        state = fitted.state
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
+        if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted
+
+
+def _afresh(
+    simulator: Simulator,
+    fitted: Fitted,
+    i: int,
+    lines: Sequence[float],
+    tick: Callable[[], None],
+) -> Iterator[Fitted]:
+    """Yield fits in which effect i starts again from its best trials."""
+    rows, own = simulator.rows, fitted.state.effects[i]
+    others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
+    state = replace(fitted.state, effects=others)
+    rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
+    scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
+    trials = sorted((s for s in scored if s.is_possible), key=lambda s: s.error)
+    for start in trials[: criteria.STARTS]:
+        effects = (*others[:i], started(rows, start), *others[i:])
+        state = replace(rest.state, effects=effects)
+        try:
+            yield fit_jointly(simulator, state, fitted.base, tick=tick)
+        except (ModelError, IdentificationError):
+            # the fit that is there already stays
+            continue
