@@ -143,4 +143,5 @@ def sentence(
 
 
 def _or(group: Class | None) -> str:
-    return ' or '.join(name.replace('_', ' ') for name in (group.names if group else ()))
+    *most, last = (name.replace('_', ' ') for name in (group.names if group else ('',)))
+    return f'{", ".join(most)} or {last}' if most else last
