@@ -19,6 +19,7 @@ from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import (
     base_thresholds,
+    BaseColumns,
     fit_base,
     fit_jointly,
     Fitted,
@@ -171,7 +172,13 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     e = centred(rows.x - simulator.run(given), rows.of_record)
     of = offset_columns(rows)
     start = replace(
-        refit, state=given, e=e, J=of, free=np.ones(of.shape[1], bool), prior=np.zeros(of.shape[1])
+        refit,
+        state=given,
+        base=BaseColumns.of(rows, of),
+        e=e,
+        moving=np.empty((rows.n, 0)),
+        free=np.ones(of.shape[1], bool),
+        prior=np.zeros(of.shape[1]),
     )
     effects = [effect for effect in catalogue().values() if effect.rate_independent]
     left: dict[str, float] = {}

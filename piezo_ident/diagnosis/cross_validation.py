@@ -23,10 +23,12 @@ from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
     'NormalEquations',
+    'block_products',
     'held_out_errors',
     'held_out_residual',
     'normal_equations',
     'refit_holds',
+    'right_sides',
     'solve',
     'standard_errors',
     'with_columns',
@@ -54,24 +56,32 @@ class NormalEquations:
     b: Array
     s: Array
 
+    def only(self, chosen: NDArray[np.bool_]) -> NormalEquations:
+        """Return those of some columns; shape (p,)."""
+        return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
 
-def _block_products(rows: Rows, M: Array, N: Array) -> Array:
+
+def block_products(rows: Rows, M: Array, N: Array) -> Array:
     """Return ``M_k' N_k`` of every block; shape (blocks, p, q)."""
     return np.stack([M[a:b].T @ N[a:b] for a, b in itertools.pairwise(rows.edges)])
 
 
 def normal_equations(rows: Rows, M: Array, E: Array) -> NormalEquations:
     """Return the normal equations of columns M, shape (n, p), and residuals E, shape (n, k)."""
-    squares = np.add.reduceat(E**2, rows.edges[:-1])
-    return NormalEquations(_block_products(rows, M, M), _block_products(rows, M, E), squares)
+    return NormalEquations(block_products(rows, M, M), *right_sides(rows, M, E))
+
+
+def right_sides(rows: Rows, M: Array, E: Array) -> tuple[Array, Array]:
+    """Return b and s of normal equations, of columns M and residuals E."""
+    return block_products(rows, M, E), np.add.reduceat(E**2, rows.edges[:-1])
 
 
 def with_columns(
     rows: Rows, equations: NormalEquations, M: Array, C: Array, E: Array
 ) -> NormalEquations:
     """Return the normal equations of ``[M C]`` from those of M."""
-    right = _block_products(rows, M, C)
-    lower = _block_products(rows, C, np.column_stack([C, E]))
+    right = block_products(rows, M, C)
+    lower = block_products(rows, C, np.column_stack([C, E]))
     c = C.shape[1]
     A = np.concatenate(
         [
@@ -147,7 +157,7 @@ def held_out_residual(
             continue
         theta = solve(A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior)
         here = out[rows.block]
-        left[here] -= M[here] @ theta[:, 0]
+        left[here] -= (M @ theta[:, 0])[here]
     return left
 
 

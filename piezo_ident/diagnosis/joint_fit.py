@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD, WIDE_SPREAD
 from piezo_ident.diagnosis.cross_validation import (
+    block_products,
     held_out_errors,
     held_out_residual,
     normal_equations,
+    NormalEquations,
+    right_sides,
+    with_columns,
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import free_parameters, FreeParameter, Simulator, State
@@ -52,11 +56,19 @@ class BaseColumns:
     """
     Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
 
-    They are those of the law of H behind G, and the offset of each record.
+    They are those of the law of H behind G, and the offset of each record; the products are those
+    of each block, shape (blocks, p, p), and of all.
     """
 
     columns: Array
+    products: Array
     total: Array
+
+    @classmethod
+    def of(cls, rows: Rows, columns: Array) -> BaseColumns:
+        """Return columns with their products."""
+        products = block_products(rows, columns, columns)
+        return cls(columns, products, products.sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +83,8 @@ class Fitted:
         Used for H.
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
-    J : ndarray, shape (n, p)
-        Derivatives of the prediction: coefficients of H, offsets, then the free parameters.
+    moving : ndarray, shape (n, q)
+        Derivatives of the prediction by the free parameters.
     free : ndarray of bool, shape (p,)
         Columns that are not on a bound.
     parameters : tuple of FreeParameter
@@ -84,12 +96,19 @@ class Fitted:
     state: State
     base: BaseColumns
     e: Array
-    J: Array
+    moving: Array
     free: NDArray[np.bool_]
     parameters: tuple[FreeParameter, ...]
     prior: Array
     errors: Array
     transfer: Array
+
+    @property
+    def J(self) -> Array:
+        """Derivatives by all that is free: coefficients of H, offsets, parameters."""
+        known = self.base.columns.shape[1]
+        parts = (self.base.columns.T[self.free[:known]], self.moving.T[self.free[known:]])
+        return np.concatenate(parts).T
 
     @property
     def name(self) -> str:
@@ -108,7 +127,7 @@ class Fitted:
         Blocks of one number in `sets` are held out together; spread over all data when absent.
         """
         sets = rows.fold if sets is None else sets
-        return held_out_residual(rows, self.J[:, self.free], self.e, self.prior[self.free], sets)
+        return held_out_residual(rows, self.J, self.e, self.prior[self.free], sets)
 
 
 def base_thresholds(swing: float) -> Array:
@@ -120,12 +139,12 @@ def base_thresholds(swing: float) -> Array:
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Return H refitted as one of a family, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, law.size
-    columns = np.concatenate([simulator.base_columns(law), offset_columns(rows).T]).T
-    base = BaseColumns(columns, columns.T @ columns)
+    columns = simulator.base_columns(law)
+    base = BaseColumns.of(rows, np.concatenate([columns, offset_columns(rows).T]).T)
     effects = simulator.run(state) - state.offsets[rows.of_record] - simulator.bare(state)
-    lower, upper = np.full(columns.shape[1], -np.inf), np.full(columns.shape[1], np.inf)
+    lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
-    prior = np.zeros(columns.shape[1])
+    prior = np.zeros(base.columns.shape[1])
     step = _Step(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return replace(state, offsets=theta[m:]).with_coefficients(law, theta[:m]), base
@@ -136,9 +155,8 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
     if state.law is None:
         raise ValueError('an H of no law has no columns')
     simulator.remember(state)
-    of_law = simulator.columns(state, state.law, WEIGHT_STEP)
-    whole = np.concatenate([of_law, offset_columns(simulator.rows).T]).T
-    return BaseColumns(whole, whole.T @ whole)
+    rows, columns = simulator.rows, simulator.columns(state, state.law, WEIGHT_STEP)
+    return BaseColumns.of(rows, np.concatenate([columns, offset_columns(rows).T]).T)
 
 
 def fit_jointly(
@@ -194,16 +212,17 @@ def fit_jointly(
         if after > (1.0 - TOLERANCE) * before:
             break
     lower, upper = _room(state, parameters, p)
-    J = np.hstack([base.columns, moving])
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
     prior = _prior(rows, e, p, state)
-    equations = normal_equations(rows, J[:, free], e[:, None])
+    E = e[:, None]
+    known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
+    equations = with_columns(rows, known, base.columns, moving, E).only(free)
     return Fitted(
         state=state,
         base=base,
         e=e,
-        J=J,
+        moving=moving,
         free=free,
         parameters=parameters,
         prior=prior,
@@ -219,7 +238,7 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     The sandwich estimator over blocks, each one observation.  Keys are the effect's place, the
     parameter's name, and the place in a vector (0 for a number).
     """
-    M = fitted.J[:, fitted.free]
+    M = fitted.J
     size = np.linalg.norm(M, axis=0)
     equations = normal_equations(rows, M, fitted.e[:, None])
     A = equations.A.sum(axis=0) / np.outer(size, size)
@@ -229,7 +248,7 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     covariance = inverse @ (gradients.T @ gradients) @ inverse
     deviation = np.full(fitted.free.size, np.nan)
     deviation[fitted.free] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
-    first = fitted.J.shape[1] - len(fitted.parameters)
+    first = fitted.free.size - len(fitted.parameters)
     known = {}
     for j, parameter in enumerate(fitted.parameters, start=first):
         if np.isfinite(deviation[j]) and parameter.record in (None, rows.longest):
@@ -304,7 +323,9 @@ class _Step:
     """Normal equations of a step, scaled to columns of length one."""
 
     def __init__(self, base: BaseColumns, moving: Array, e: Array, prior: Array) -> None:
-        mixed = base.columns.T @ moving
+        # one pass over the many columns
+        known = base.columns.T @ np.concatenate([moving.T, e[None]]).T
+        mixed = known[:, :-1]
         A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
         size = np.sqrt(np.diag(A))
         self._size = np.where(size > 0.0, size, 1.0)
@@ -312,7 +333,7 @@ class _Step:
         self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
         # a column of zeros stays where it is
         self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
-        self._b = np.concatenate([base.columns.T @ e, moving.T @ e]) / self._size
+        self._b = np.concatenate([known[:, -1], moving.T @ e]) / self._size
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Return the bounded step; damping is a share of each column's own energy."""

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from piezo_ident.effects import Effect
 from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['RunChain', 'asked_once', 'effects_around', 'place_of', 'place_of_core']
+__all__ = ['RunChain', 'asked_once', 'columns_of', 'effects_around', 'place_of', 'place_of_core']
 
 Array = NDArray[np.float64]
 
@@ -92,6 +93,27 @@ def asked_once(operator: Operator, answer: list[Any]) -> Operator:
         return once
     around[-1].inner = once
     return operator
+
+
+def columns_of(chain: RunChain, core: int, law: HysteresisLaw, memory: Array) -> Iterator[Array]:
+    """
+    Give what H, and what effects around it make of it, adds for each coefficient.
+
+    Of a chain whose blocks are kept, with H in the place `core`; `memory` as of
+    `HysteresisLaw.columns`.
+    """
+    before = chain.blocks[core]
+    around = effects_around(chain.operators[core])
+    around = [effect for effect in around if effect.of_hysteresis != 'not']
+    if not around:
+        yield from law.columns(before.x, memory)
+        return
+    for part, own in law.parts():
+        operator: Operator = HysteresisOperator(part, memory[own])
+        for effect in reversed(around):
+            operator = type(effect)(effect.sample_rate, effect.values, part, operator)
+        operator.reset(float(before.v[0]), chain.rests[core])
+        yield operator.process(before).x
 
 
 def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:

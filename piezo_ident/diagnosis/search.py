@@ -243,7 +243,7 @@ def score_trials(
     """Score every trial of every effect on the residual of a fit; surrogates, shape (n, k)."""
     rows = simulator.rows
     simulator.remember(fitted.state)
-    M, prior = fitted.J[:, fitted.free], fitted.prior[fitted.free]
+    M, prior = fitted.J, fitted.prior[fitted.free]
     E = np.column_stack([fitted.e, surrogates])
     equations = normal_equations(rows, M, E)
     alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)

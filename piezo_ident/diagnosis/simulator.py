@@ -22,6 +22,7 @@ from piezo_ident.diagnosis.retuning import BEYOND, retuned, RETUNING, retuning_f
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.run_chain import (
     asked_once,
+    columns_of,
     effects_around,
     place_of,
     place_of_core,
@@ -256,9 +257,10 @@ class Simulator:
             core = place_of_core(chain.operators)
             behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
             memory = self.rows.memories[i](law.thresholds)
+            kinds = {effect.of_hysteresis for effect in effects_around(chain.operators[core])}
             changes: Iterator[Array]
-            if all(effect.beside_hysteresis for effect in effects_around(chain.operators[core])):
-                changes = (step * raw for raw in law.columns(before.x, memory))
+            if kinds <= {'not', 'linear'}:
+                changes = (step * raw for raw in columns_of(chain, core, law, memory))
             else:
                 moved = (
                     state.with_coefficients(law, state.coefficients + delta)
@@ -326,8 +328,11 @@ class Simulator:
 
     def _joined(self, parts: Sequence[Array]) -> Array:
         """Return the rows that count of all rows of each run, shape (n // m,) or (k, n // m)."""
-        kept = [part[..., keep] for part, keep in zip(parts, self.rows.keep, strict=True)]
-        return np.concatenate(kept, axis=-1)
+        kept = [
+            part if keep.all() else part[..., keep]
+            for part, keep in zip(parts, self.rows.keep, strict=True)
+        ]
+        return kept[0] if len(kept) == 1 else np.concatenate(kept, axis=-1)
 
     def _chains(self, state: State) -> Iterator[RunChain]:
         """Give the chain of each run."""

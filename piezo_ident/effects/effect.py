@@ -140,9 +140,9 @@ class Effect:
     change : str
         What it makes of a small change of its signal: ``passed`` as it is, where the effect only
         adds something of its own; ``linear``, the same whatever the signal; or ``bent``.
-    beside_hysteresis : bool
-        Whether what it adds to H does not depend on the coefficients of H, in the slot
-        ``hysteresis``.
+    of_hysteresis : str
+        How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
+        ``not``, ``linear`` or ``bent``.
     in_delay_line : bool
         Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
@@ -173,7 +173,7 @@ class Effect:
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
     change: ClassVar[Literal['passed', 'linear', 'bent']] = 'bent'
-    beside_hysteresis: ClassVar[bool] = False
+    of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
 
     def __init__(

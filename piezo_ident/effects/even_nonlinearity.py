@@ -31,7 +31,7 @@ class EvenNonlinearity(Effect):
 
     name = 'even_nonlinearity'
     slot = 'hysteresis'
-    beside_hysteresis = True
+    of_hysteresis = 'not'
     rate_independent = True
     description = 'even powers of the voltage in the static curve; 0.1 .. 2 % of stroke'
     needs = 'slow sweeps over the full range, and equal minor loops at several biases'

@@ -66,7 +66,7 @@ class NoncongruentMinorLoops(Effect):
 
     name = 'noncongruent_minor_loops'
     slot = 'hysteresis'
-    beside_hysteresis = True
+    of_hysteresis = 'not'
     rate_independent = True
     description = 'minor loops of one width that differ with the bias; 0.3 .. 2 % of stroke'
     needs = 'equal minor loops at three biases, in two widths'

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.hysteresis import HysteresisOperator
+from piezo_ident.operators.hysteresis import HysteresisOperator, LANES, POWERS
 from piezo_ident.operators.kernels import curve, held
 
 __all__ = ['RateDependentHysteresis']
@@ -49,12 +49,8 @@ def _widened(
             high = x + r[i] * ahead_wide + ahead
             f = held(memory[i], low, low if high < low else high)
             memory[i] = f
-            w += q[i] * (f - g)
-        if c.shape[0]:
-            for i in range(n_r):
-                f, g = memory[i], still[i]
-                w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f - low_v)
-                w -= curve(c, i, g - low_v)
+            w += (q[i] + c[3, i] * (x - low_v)) * (f - g)
+            w += curve(c, i, f - low_v) - curve(c, i, g - low_v)
         out[k] = w
 
 
@@ -98,6 +94,7 @@ class RateDependentHysteresis(Effect):
 
     name = 'rate_dependent_hysteresis'
     slot = 'hysteresis'
+    of_hysteresis = 'linear'
     description = 'loops that widen with speed; 10 .. 30 % a decade of frequency above 10 .. 50 Hz'
     needs = 'two amplitudes at one fast frequency, a slow sweep, and a hold of 2 s'
     parameters = (
@@ -155,6 +152,7 @@ class RateDependentHysteresis(Effect):
             self._memory = plays.memory[: self.hysteresis.thresholds.size].copy()
         else:
             self._memory = self.hysteresis.initial_memory(x0)
+        self._memory = np.append(self._memory, np.zeros(-self._memory.size % LANES))
         self._still = self._memory.copy()
         self._speed = np.array([x0, 0.0])
         return w
@@ -163,6 +161,7 @@ class RateDependentHysteresis(Effect):
         """Return the block with H applied and its plays widened."""
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
+        c = c if c.size else np.zeros((POWERS + 2, r.size))
         speed = _low_pass(v, self._pole, self.sample_rate, self._speed)
         power = np.abs(speed)
         if self.number('levelling') > 0.0:

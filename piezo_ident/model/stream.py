@@ -154,6 +154,9 @@ class _Cascade:
         """Come to rest and return the displacement there [m]."""
         w0 = self._H.reset(u0, u0)
         rest = self._G.reset(u0, w0)
+        m, memory = self._H.hysteresis.thresholds.size, self._H.memory
+        idle = np.zeros(self._hysteresis[0].size - m)
+        self._memory = np.concatenate([memory[:m], idle, memory[m:]])
         self._w[:], self._y[:] = w0, rest
         y0, Y = self._scale[2:]
         return float(y0 + Y * rest)
@@ -167,7 +170,7 @@ class _Cascade:
             v,
             self._scale,
             *self._hysteresis,
-            self._H.memory,
+            self._memory,
             self._G.b,
             self._G.a,
             self._w,

@@ -34,15 +34,17 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.kernels import relaxing, wide_hysteresis
-from piezo_ident.operators.play import initial_memory, weighted_plays
+from piezo_ident.operators.kernels import hysteresis, relaxing, wide_hysteresis
+from piezo_ident.operators.play import initial_memory
 
-__all__ = ['Hysteresis', 'HysteresisOperator']
+__all__ = ['LANES', 'Hysteresis', 'HysteresisOperator']
 
 Array = NDArray[np.float64]
 
 #: powers t^2 .. t^4 that a curve of a play may have
 POWERS = 3
+#: plays that run side by side in vector lanes; idle ones make up a multiple of it
+LANES = 8
 #: how far a density may fall below zero, as a share of the largest, by rounding
 ROUNDING = 1e-9
 
@@ -116,19 +118,12 @@ class Hysteresis:
             r, q = frozen_array(r[1:].copy()), frozen_array(q[1:].copy())
         if not (np.isfinite(self.p1) and np.isfinite(p2) and np.isfinite(self.p0)):
             raise ModelError('hysteresis: p0, p1 and p2 must be finite numbers')
-        object.__setattr__(self, 'thresholds', r)
-        object.__setattr__(self, 'weights', q)
-        for name in ('p0', 'p1'):
-            object.__setattr__(self, name, float(getattr(self, name)))
-        object.__setattr__(self, 'p2', p2)
+        powers = {'p0': float(self.p0), 'p1': float(self.p1), 'p2': p2}
+        for name, value in {'thresholds': r, 'weights': q, **powers}.items():
+            object.__setattr__(self, name, value)
         if self.relaxations is not None:
             x = frozen_array(self.relaxations)
-            if (
-                x.ndim != 2
-                or x.shape[1] != 4
-                or not np.all(np.isfinite(x))
-                or np.any(x[:, 0] <= 0)
-            ):
+            if x.ndim != 2 or x.shape[1] != 4 or not np.isfinite(x).all() or (x[:, 0] <= 0).any():
                 raise ModelError(
                     'hysteresis: relaxations must be rows of a rate > 0 and three coefficients'
                 )
@@ -190,13 +185,13 @@ class Hysteresis:
         return rows
 
     @functools.cached_property
-    def for_kernel(
-        self,
-    ) -> tuple[Array, Array, float, float, float, float, Array]:
-        """``r, q, p1, p2, p0, low, c`` as `piezo_ident.operators.kernels` take them."""
+    def for_kernel(self) -> tuple[Array, Array, float, float, float, float, Array]:
+        """``r, q, p1, p2, p0, low, c`` as kernels take them, with idle plays to fill the lanes."""
+        m = self.thresholds.size
         # a frozen array would be another type to the compiler
-        r, q = np.array(self.thresholds), np.array(self.weights)
-        return r, q, self.p1, self.p2, self.p0, self.span[0], self._wide
+        rows = np.zeros((2 + len(self._wide), m + -m % LANES))
+        rows[:2, :m], rows[2:, :m] = (self.thresholds, self.weights), self._wide
+        return rows[0], rows[1], self.p1, self.p2, self.p0, self.span[0], rows[2:]
 
     def rise(self, outputs: ArrayLike, v: float = 0.0) -> NDArray[np.float64]:
         """
@@ -311,9 +306,7 @@ class Hysteresis:
         relaxing(way, np.array(self.relaxations), lags, np.zeros(way.size))
         return lags
 
-    def follow(
-        self, v: NDArray[np.float64], memory: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def follow(self, v: Array, memory: Array) -> tuple[Array, Array]:
         """
         Return w for the next inputs, shape (n,), and the memory after them.
 
@@ -322,12 +315,13 @@ class Hysteresis:
         without it, shape (m + k,), they begin at the first.
         """
         x, m = np.ascontiguousarray(v), self.thresholds.size
-        plays = memory[:m]
+        out, end = np.empty(x.size), np.zeros(self.for_kernel[0].size)
+        end[:m] = memory[:m]
         if self._is_curved:
-            out, end = np.empty(x.size), plays.copy()
             wide_hysteresis(x, *self.for_kernel, end, out)
         else:
-            out, end = weighted_plays(x, self.thresholds, self.weights, self.p1, self.p2, plays)
+            hysteresis(x, *self.for_kernel[:4], end, out)
+        end = end[:m]
         if self.relaxations is None:
             return out, end
         if not x.size:

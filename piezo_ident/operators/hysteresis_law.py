@@ -188,6 +188,28 @@ class HysteresisLaw:
         variance = np.sum(T * (covariance @ T), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
+    def parts(self) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
+        """Give the H of each coefficient alone, and which thresholds it has; shape (m,)."""
+        r, m = self.thresholds, self.thresholds.size
+        n = (POWERS + 2) * m
+        for row in self._parameters:
+            plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
+            moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
+            rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])
+            chosen = lags.any(axis=1)
+            part = Hysteresis(
+                r[moved],
+                plays[0, moved],
+                float(p1),
+                float(p2),
+                float(p0),
+                curves=plays[1:-1, moved].T if plays[1:-1].any() else None,
+                bias=plays[-1, moved] if plays[-1].any() else None,
+                span=self.span,
+                relaxations=np.column_stack([rates, lags])[chosen] if chosen.any() else None,
+            )
+            yield part, moved
+
     def columns(
         self, v: NDArray[np.float64], memory: ArrayLike | None = None
     ) -> Iterator[NDArray[np.float64]]:
@@ -206,34 +228,12 @@ class HysteresisLaw:
         ------
         ndarray, shape (n,)
         """
-        r, m = self.thresholds, self.thresholds.size
-        n = (POWERS + 2) * m
         start = None if memory is None else np.asarray(memory, dtype=np.float64)
-        for i in range(m):
-            one = slice(i, i + 1)
-            yield play_columns(v, r[one], None if start is None else start[one])[0]
-        for row in self._parameters[m : self.densities]:
-            plays = row[:n].reshape(POWERS + 2, m)
-            moved = plays.any(axis=0)
-            part = Hysteresis(
-                r[moved],
-                plays[0, moved],
-                0.0,
-                0.0,
-                curves=plays[1:-1, moved].T if plays[1:-1].any() else None,
-                bias=plays[-1, moved] if plays[-1].any() else None,
-                span=self.span,
-            )
-            yield part(v, None if start is None else start[moved])
-        for k in range(self.lags):
-            rate = RATES[k // 3] / (self.span[1] - self.span[0])
-            lag = np.append(rate, np.eye(3)[k % 3])[None]
-            none = np.empty(0)
-            yield Hysteresis(none, none, 0.0, 0.0, span=self.span, relaxations=lag)(v)
-        if self.name != 'plays':
-            yield v**2
-        yield v**3
-        yield v
+        for i, (part, moved) in enumerate(self.parts()):
+            own = None if start is None else start[moved]
+            # a single play runs faster by itself
+            single = i < self.thresholds.size
+            yield play_columns(v, part.thresholds, own)[0] if single else part(v, own)
 
     def within(self, wider: HysteresisLaw) -> NDArray[np.int64]:
         """
