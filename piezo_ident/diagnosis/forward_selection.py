@@ -110,13 +110,14 @@ class ForwardSelection:
         """
         Select what no H imitates, from the widest base; without any, the base is the fit.
 
-        What follows the path of the command alone is left to `beside`.
+        What can only follow the path of the command is left to `beside`.
         """
         size = self._simulator.rows.percent(self._explainable(base))
         self._allowed = [
             effect
             for effect in self._candidates
-            if not effect.rate_independent
+            # behind G nothing follows the path of the command alone: no H bends or holds a ring
+            if (not effect.rate_independent or effect.slot == 'output')
             and effect.name not in TESTED
             and not (effect.in_dynamics and size < criteria.NEWS * self._missed)
         ]

@@ -196,7 +196,8 @@ def candidates_of(
         new = {
             name: (one.before.errors.sum() - s.errors.sum()) / rows.n / left
             for name, s in one.best.items()
-            if name not in shares
+            # what follows the path counts beside plays, which come last
+            if name not in shares or find_effect(name).rate_independent
         }
         for c in one.contenders:
             if c.name in new:

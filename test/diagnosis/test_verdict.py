@@ -173,7 +173,8 @@ def choose(rows):
         search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
         search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
         search._certain, search._given = (), np.inf
-        search._candidates = [find_effect(n) for n in ('amplifier_lag', 'changed_dynamics')]
+        names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
+        search._candidates = [find_effect(n) for n in names]
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
         starts = {
             key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
@@ -189,6 +190,8 @@ def choose(rows):
 
         search._from = selected
         found = search.run(starts['as it is'])
+        # what acts behind G competes, what only follows the path does not
+        assert [effect.name for effect in search._allowed] == list(names[:3])
         start = next(k for k, v in starts.items() if v is found.fitted)
         return start, found.bent, found.linear
 
