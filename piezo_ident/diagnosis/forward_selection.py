@@ -214,11 +214,26 @@ class ForwardSelection:
         rows = self._simulator.rows
         if rows.passes < criteria.PASSES or not this.contenders:
             return False
+        if not first and self._makes_up(this):
+            return False
         # what shows where it alone acts is no misfit of H
         own = has_place(this.contenders[0].name)
         smallest = criteria.SMALLEST_EFFECT if own else self._smallest
         known = min(this.before.mean_square, self._given)
         return takes(rows, this, known, self._noise, explainable, smallest, first=first)
+
+    def _makes_up(self, this: Round) -> bool:
+        """
+        Return whether a further effect may only make up for the form of the laws before it.
+
+        No real effect has quite the form of its law.  Where those that are there leave no more
+        than a name may leave, more parameters than theirs fit the rest, whatever it is.
+        """
+        before, best = this.before, this.contenders[0]
+        may_stay = (1.0 - criteria.NAMED) * self._explainable(self._base)
+        own = len(best.parameters) - len(before.parameters)
+        others = len(before.parameters) - len(before.state.retuning)
+        return self._beyond_noise(before) <= may_stay and own > others and not has_place(best.name)
 
     @property
     def _least(self) -> float:

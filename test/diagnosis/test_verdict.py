@@ -161,6 +161,26 @@ def test_an_effect_that_costs_a_kind_is_not(rows):
     assert not takes(rows, a_round(best), WHOLE, 0.0, WHOLE, 0.05, first=True)
 
 
+@pytest.mark.parametrize(('parameters', 'is_taken'), [(10, False), (7, True)])
+def test_many_parameters_may_make_up_for_the_form_of_the_law_before(rows, parameters, is_taken):
+    search = object.__new__(forward_selection.ForwardSelection)
+    search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
+    search._noise, search._smallest, search._given = 0.0, 0.05, np.inf
+    search._base = SimpleNamespace(mean_square=WHOLE)
+    before = SimpleNamespace(
+        mean_square=0.07 * WHOLE,
+        errors=contender('backlash', 0.07).errors,
+        parameters=(None,) * 6,
+        state=SimpleNamespace(retuning=(0.0,) * 4),
+    )
+    best = contender('rate_dependent_hysteresis', 0.01, parameters=parameters)
+    this = SimpleNamespace(before=before, contenders=(best,), chance={})
+    assert search._takes(this, 0.3 * WHOLE, first=False) == is_taken
+    # where a name may not leave as much, more is missing
+    search._base = SimpleNamespace(mean_square=0.3 * WHOLE)
+    assert search._takes(this, 0.3 * WHOLE, first=False)
+
+
 # -- a change of G, or an effect that bent it ---------------------------------------------------
 
 
