@@ -104,7 +104,8 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
     IdentificationError
         When the equations are singular.
     """
-    size = np.sqrt(np.diag(A))
+    # of a column that a set holds alone, rounding leaves less than nothing
+    size = np.sqrt(np.maximum(np.diag(A), 0.0))
     size = np.where(size > 0.0, size, 1.0)
     scaled = A / np.outer(size, size)
     scaled[np.diag_indices_from(scaled)] += RIDGE + prior / size**2

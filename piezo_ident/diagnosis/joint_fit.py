@@ -283,7 +283,12 @@ def _derivatives(
     tick: Callable[[], None],
 ) -> Array:
     columns = np.zeros((len(parameters), simulator.rows.n))
+    tick()
+    quick = simulator.filtered(parameters)
     for j, parameter in enumerate(parameters):
+        if j in quick:
+            columns[j] = quick[j]
+            continue
         tick()
         value, step = parameter.get(state), parameter.step
         top = parameter.upper / value if parameter.logarithmic else parameter.upper - value

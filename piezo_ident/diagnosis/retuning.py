@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import functools
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.operators.dynamics import Dynamics
 
-__all__ = ['BEYOND', 'RETUNING', 'retuned', 'retuning_factor']
+__all__ = ['BEYOND', 'RETUNING', 'retuned', 'retuning_factor', 'retuning_terms']
 
 #: corner frequencies of the relaxations that a retuned G may show [Hz]
 RELAXATIONS = (15.0, 100.0)
@@ -22,8 +24,9 @@ BEYOND = 4.0
 ROUNDING = 1e-4
 
 
+@functools.lru_cache(maxsize=64)
 def retuning_factor(
-    retuning: Sequence[float], sample_rate: float, band: float = np.inf
+    retuning: tuple[float, ...], sample_rate: float, band: float = np.inf
 ) -> Dynamics:
     """
     Return a factor of G near one.
@@ -34,11 +37,9 @@ def retuning_factor(
     c_1 acts like minus a delay in samples at low frequencies.
     """
     c1, c2, c3, c4 = retuning
-    # polynomials in z^-1
     D = np.array([1.0, -1.0])
-    p = float(np.exp(-2.0 * np.pi * band / sample_rate))
+    p, (P, Q) = _limit(sample_rate, band), _poles(sample_rate)
     limited, B = (1.0 - p) * D, np.array([1.0, -p])
-    P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
     BB, PQ = np.convolve(B, B), np.convolve(P, Q)
     terms = (
         np.convolve(BB, PQ),
@@ -51,6 +52,24 @@ def retuning_factor(
     return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
 
 
+def retuning_terms(sample_rate: float, band: float) -> NDArray[np.float64]:
+    """Return what the factor holds of each coefficient: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
+    p = _limit(sample_rate, band)
+    q, qq = 1.0 - p, (1.0 - p) ** 2
+    slow = [(1.0, -1.0, 0.0, a, 0.0) for _, a in _poles(sample_rate)]
+    return np.array([(q, -q, 0.0, -p, 0.0), (qq, -2.0 * qq, qq, -2.0 * p, p * p), *slow])
+
+
+def _limit(sample_rate: float, band: float) -> float:
+    """Return the pole beyond which D does not grow."""
+    return float(np.exp(-2.0 * np.pi * band / sample_rate))
+
+
+def _poles(sample_rate: float) -> list[NDArray[np.float64]]:
+    """Return ``1 - p_j z^-1`` of each relaxation."""
+    return [np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS]
+
+
 def retuned(
     dynamics: Dynamics, retuning: Sequence[float], sample_rate: float, band: float = np.inf
 ) -> Dynamics:
@@ -61,7 +80,7 @@ def retuned(
     """
     if not any(retuning):
         return dynamics
-    factor = retuning_factor(retuning, sample_rate, band)
+    factor = retuning_factor(tuple(retuning), sample_rate, band)
     a = np.convolve([1.0, *dynamics.a], [1.0, *factor.a])[1:]
     product = Dynamics(a=a, b=np.convolve(dynamics.b, factor.b))
     f = np.geomspace(1e-5, 0.4, 60) * sample_rate

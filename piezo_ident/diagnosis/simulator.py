@@ -18,7 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis.changes import Behind
-from piezo_ident.diagnosis.retuning import BEYOND, retuned, RETUNING, retuning_factor
+from piezo_ident.diagnosis.retuning import (
+    BEYOND,
+    retuned,
+    RETUNING,
+    retuning_factor,
+    retuning_terms,
+)
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.run_chain import (
     asked_once,
@@ -317,6 +323,38 @@ class Simulator:
             for before, after in zip(self._known().chains, self._chains(state), strict=True)
         ]
         return self._joined(changes)
+
+    def filtered(self, parameters: Sequence[FreeParameter]) -> dict[int, Array]:
+        """
+        Return derivatives of the rows by those parameters that scale a filter of a signal.
+
+        Of the remembered state, by the place of the parameter.
+        """
+        kept, rate = self._known(), self.model.sample_rate
+        terms = retuning_terms(rate, self._band)
+        found: dict[int | None, dict[int, Array]] = {}
+        for j, parameter in enumerate(parameters):
+            i, k = parameter.effect, parameter.index or 0
+            section: Array | None
+            if i is None:
+                section = terms[k]
+            else:
+                added = kept.state.effects[i]
+                section = added.effect.section(rate, added.values[0], parameter.name, k)
+            if section is not None:
+                found.setdefault(i, {})[j] = section
+        columns: dict[int, Array] = {}
+        for i, sections in found.items():
+            effect = None if i is None else kept.state.effects[i].effect
+            stacked = np.stack(list(sections.values()))
+            parts = [
+                chain.filtered(place_of(effect, chain.operators), stacked, self.rows.m)
+                for chain in kept.chains
+            ]
+            whole = [part for part in parts if part is not None]
+            if len(whole) == len(parts):
+                columns |= dict(zip(sections, self._joined(whole), strict=True))
+        return columns
 
     def _known(self, state: State | None = None) -> _Kept:
         if self._kept is None or state not in (None, self._kept.state):

@@ -5,7 +5,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection
 from piezo_ident.effects.trials import ladder
@@ -36,7 +40,7 @@ class ChangedDynamics(Effect):
 
     name = 'changed_dynamics'
     slot = 'output'
-    change = 'linear'
+    change = 'filtered'
     in_dynamics = True
     description = (
         'a resonance added or moved since G was identified, as by a load; linear, the static gain '
@@ -57,6 +61,17 @@ class ChangedDynamics(Effect):
             SecondOrderSection(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns
         ]
         self._silent = not np.any([self.array('gain'), self.array('rate_gain')])
+
+    @classmethod
+    def section(
+        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
+    ) -> NDArray[np.float64] | None:
+        """Return a mode, which its gains scale."""
+        if name not in ('gain', 'rate_gain'):
+            return None
+        f, zeta = (float(values[of][index]) for of in ('frequency', 'damping'))
+        unit = (1.0, 0.0) if name == 'gain' else (0.0, 1.0)
+        return SecondOrderSection(f, zeta, *unit, sample_rate).section
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

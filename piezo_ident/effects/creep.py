@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
@@ -55,7 +58,7 @@ class Creep(Effect):
 
     name = 'creep'
     slot = 'hidden'
-    change = 'linear'
+    change = 'filtered'
     description = (
         'slow motion after each change of the voltage; 1 .. 2 % a decade of time, 1 .. 5 % in all'
     )
@@ -74,6 +77,16 @@ class Creep(Effect):
         seen = np.flatnonzero(self.array('gain'))
         self._c = self.array('gain')[seen]
         self._share = -np.expm1(-1.0 / (self.sample_rate * self.array('time_constant')[seen]))
+
+    @classmethod
+    def section(
+        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
+    ) -> NDArray[np.float64] | None:
+        """Return an element, which its share scales."""
+        if name != 'gain':
+            return None
+        share = -np.expm1(-1.0 / (sample_rate * float(values['time_constant'][index])))
+        return np.array([share, 0.0, 0.0, share - 1.0, 0.0])
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

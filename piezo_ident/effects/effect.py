@@ -139,7 +139,8 @@ class Effect:
         Whether it is linear: had it been there at the identification, G would hold it.
     change : str
         What it makes of a small change of its signal: ``passed`` as it is, where the effect only
-        adds something of its own; ``linear``, the same whatever the signal; or ``bent``.
+        adds something of its own; ``filtered``, the same whatever the signal and whenever;
+        ``linear``, the same whatever the signal; or ``bent``.
     of_hysteresis : str
         How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
         ``not``, ``linear`` or ``bent``.
@@ -172,7 +173,7 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
-    change: ClassVar[Literal['passed', 'linear', 'bent']] = 'bent'
+    change: ClassVar[Literal['passed', 'filtered', 'linear', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
 
@@ -299,6 +300,17 @@ class Effect:
         own = steps or {}
         far = tuple(float(own.get(name, known[name].step)) for name, _ in moves)
         return Trial(values, moves, far)
+
+    @classmethod
+    def section(
+        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
+    ) -> NDArray[np.float64] | None:
+        """
+        Return the filter of the signal that a number of a list scales and adds.
+
+        That are b_0, b_1, b_2, a_1 and a_2, or None where it is no such number.
+        """
+        return None
 
     def number(self, name: str) -> float:
         """Return a scalar parameter."""

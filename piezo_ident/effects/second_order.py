@@ -88,6 +88,12 @@ class SecondOrderSection:
         self._c /= a0
         self._state = np.zeros(3)
 
+    @property
+    def section(self) -> NDArray[np.float64]:
+        """b_0, b_1, b_2, a_1 and a_2 of the filter."""
+        n0, n1, a1, a2 = self._c
+        return np.array([n0, n1 - n0, -n1, a1, a2])
+
     def reset(self, x0: float) -> None:
         """Come to rest under a constant input; the output is zero then."""
         self._state = np.array([x0, 0.0, 0.0])

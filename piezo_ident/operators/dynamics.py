@@ -278,7 +278,7 @@ class DynamicsOperator:
         As of `piezo_ident.effects.effect.Effect`.
     """
 
-    change = 'linear'
+    change = 'filtered'
 
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics = dynamics
@@ -346,7 +346,7 @@ class Delay:
 class DelayOperator:
     """z^-d as an operator."""
 
-    change = 'linear'
+    change = 'filtered'
 
     def __init__(self, delay: Delay) -> None:
         self.delay = delay

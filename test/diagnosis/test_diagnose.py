@@ -500,6 +500,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing(truths):
         ('creep', 'sensor_nonlinearity'),
         ('rate_dependent_hysteresis', 'gain_drift', 'backlash'),
         ('even_nonlinearity', 'amplifier_lag', 'changed_dynamics'),
+        ('creep', 'changed_dynamics', 'thermal_drift'),
     ],
 )
 def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
@@ -515,6 +516,7 @@ def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
         'backlash': {'width': 0.01, 'gain': 0.2},
         'even_nonlinearity': {'fourth': 0.02},
         'amplifier_lag': {'time_constant': 1e-4},
+        'thermal_drift': {'rate': 0.01},
         'changed_dynamics': {'frequency': [300.0], 'damping': [0.1], 'gain': [0.01]},
     }
     chosen = tuple(Added(name, (find_effect(name).check(values[name]),)) for name in effects)
@@ -526,13 +528,20 @@ def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
     for j in (0, 2, law.size - 2):
         more = state.with_coefficients(law, state.coefficients + 1e-3 * np.eye(law.size)[j])
         np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=1e-7)
-    for parameter in free_parameters(state, 1):
+    parameters = free_parameters(state, 1)
+    filtered = simulator.filtered(parameters)
+    assert bool(filtered) == ('sensor_nonlinearity' not in effects and 'backlash' not in effects)
+    for j, parameter in enumerate(parameters):
         moved = parameter.moved(state, parameter.step)
         effect = None if parameter.effect is None else chosen[parameter.effect].effect
         # a difference of whole runs holds the rounding of both
         np.testing.assert_allclose(
             simulator.varied(moved, effect), whole.run(moved) - now, atol=1e-10
         )
+        if j in filtered:
+            np.testing.assert_allclose(
+                filtered[j] * parameter.step, simulator.varied(moved, effect), atol=1e-9
+            )
 
 
 def test_retuning_is_the_product_with_its_factor():
