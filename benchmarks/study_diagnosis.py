@@ -197,7 +197,7 @@ def outcome(case: Case, row: Row) -> str:
     """
     Return one of `KINDS`, or 'failed'.
 
-    'in H': no name, and the truth is among what may hide in the hysteresis.
+    'hidden': no name, and the truth is among what may hide in the base model.
     """
     truth = set(case.effects)
     if row.verdict == 'named':
@@ -206,18 +206,18 @@ def outcome(case: Case, row: Row) -> str:
         others = truth - set(row.found)
         return 'class' if others <= set(row.group) and truth & set(row.group) else 'wrong'
     if not row.found and truth & set(row.group):
-        return 'in H'
+        return 'hidden'
     return {'partly_explained': 'partly'}.get(row.verdict, row.verdict)
 
 
-KINDS = ('exact', 'class', 'in H', 'partly', 'refitted', 'unexplained', 'none', 'wrong')
+KINDS = ('exact', 'class', 'hidden', 'partly', 'refitted', 'unexplained', 'none', 'wrong')
 NOTE = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
     'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. Its laws are '
     'not those of the candidates (below). An effect counts by its size: the free-run error that '
     'a refit of a sum of plays leaves on kinds of motion held out, in % of stroke; '
-    f'{COUNTS} % and more is counted. In H: no effect is named, and the true one is among two or '
-    'three that may hide in the hysteresis.'
+    f'{COUNTS} % and more is counted. Hidden: no name, but among two or three '
+    'that may hide in the base model.'
 )
 Done = Sequence[tuple[Case, Row]]
 
@@ -249,12 +249,12 @@ def single(done: Done) -> str:
             outcomes.count('exact'),
             outcomes.count('exact') + outcomes.count('class'),
             outcomes.count('wrong'),
-            outcomes.count('in H'),
+            outcomes.count('hidden'),
         )
     )
     text = markdown('One effect', heads, map(line, EFFECTS))
     text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
-    text += f'no name, and among what may hide in H: {hidden}.'
+    text += f'no name, and among what may hide in the base model: {hidden}.'
     ratios = [
         r.unseen_before / r.unseen_after for _, r in counted if r.verdict in ('named', 'class')
     ]

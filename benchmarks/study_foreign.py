@@ -349,8 +349,9 @@ def outcome(row: Row) -> str:
     Return what a row says.
 
     'false' where a false name is given; else 'named', 'class' or 'part' for all of what counts,
-    all of it in classes, or some of it; 'in H' where it is among what may hide in H;
-    'abstained'.  Where nothing counts: 'none', or 'small' for a true name of a small effect.
+    all of it in classes, or some of it; 'hidden' where it is among what may hide in the base
+    model; 'abstained'.  Where nothing counts: 'none', or 'small' for a true name of a small
+    effect.
     """
     if row.verdict == 'failed':
         return 'failed'
@@ -371,11 +372,11 @@ def outcome(row: Row) -> str:
     if classed:
         return 'part'
     if truth & set(row.group):
-        return 'in H'
+        return 'hidden'
     return 'abstained'
 
 
-OUTCOMES = ('named', 'class', 'part', 'in H', 'abstained', 'false', 'failed')
+OUTCOMES = ('named', 'class', 'part', 'hidden', 'abstained', 'false', 'failed')
 NOTE = (
     'No stage here is a sum of plays. Its hysteresis is of another family, behind two or three '
     'lightly damped modes and a delay of any fraction of a sample, at 10, 20 or 50 kHz, over '
@@ -433,12 +434,15 @@ def summary(rows: Sequence[Row]) -> str:
 
     lines = [
         ['nothing hidden: an effect named', some(r.effects for r in nothing)],
-        ['- no name, and two or three that may hide in H', some(r.group for r in nothing)],
+        [
+            '- no name, and two or three that may hide in the base model',
+            some(r.group for r in nothing),
+        ],
         ['an effect that counts: its name or class', share('named', 'class')],
         ['- a false name instead or beside', share('false')],
         ['- one of two', share('part')],
         ['- abstained', share('abstained')],
-        ['- no name, and it is among what may hide in H', share('in H')],
+        ['- no name, and it is among what may hide in the base model', share('hidden')],
         [
             '- where a refit of forty plays leaves the misfit at least: its name or class',
             some(outcome(r) in ('named', 'class') for r in large if lasting(r)),

@@ -150,7 +150,7 @@ def test_blocks_of_cases_hold_every_kind(load):
             {'backlash': 1.0},
             'false',
         ),
-        ({'verdict': 'refitted', 'group': ('backlash',)}, {'backlash': 1.0}, 'in H'),
+        ({'verdict': 'refitted', 'group': ('backlash',)}, {'backlash': 1.0}, 'hidden'),
         ({'verdict': 'refitted'}, {'backlash': 1.0}, 'abstained'),
         ({'verdict': 'unexplained'}, {'backlash': 1.0}, 'abstained'),
         ({'verdict': 'none'}, {'backlash': 0.1}, 'none'),

@@ -27,7 +27,7 @@ from piezo_ident.diagnosis.joint_fit import (
 )
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.rows import centred
-from piezo_ident.diagnosis.search import Round, score_trials
+from piezo_ident.diagnosis.search import score_trials
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
@@ -118,7 +118,7 @@ def with_refit(
     Return what H alone accounts for, where no effect was found.
 
     That a refit of it brought what there was to gain is a finding; and what a wider H takes, the
-    rms `misfit` [% of stroke], or a refit may hide effects.
+    rms `misfit` [% of stroke], a refit or a retuned G may hide effects.
     """
     rows, refit = simulator.rows, selected.fitted
     e = rows.x - simulator.run(given)
@@ -128,14 +128,14 @@ def with_refit(
         and gain >= refit.mean_square - noise
         and refit_holds(rows, e, refit.transfer)
     ):
-        if _is_gain(simulator, given, refit):
+        if _is_gain(simulator, given, refit) and not selected.linear:
             # of another record a gain that wanders says nothing
             names = ('gain_drift', *look_alikes('gain_drift')[:1])
             return findings.unsettled(rows.percent(float(np.mean(e * e)) - noise)).hiding(names)
         findings = findings.refitted(rows.percent(refit.mean_square - noise))
-    elif misfit < criteria.REFIT_FINDING:
+    elif misfit < criteria.REFIT_FINDING and not selected.linear:
         return findings
-    return findings.hiding(_hidden(simulator, given, refit, selected.imitated))
+    return findings.hiding(_hidden(simulator, given, selected))
 
 
 def _is_gain(simulator: Simulator, given: State, refit: Fitted) -> bool:
@@ -146,21 +146,21 @@ def _is_gain(simulator: Simulator, given: State, refit: Fitted) -> bool:
     return taken > criteria.ADDED * (whole - float(refit.errors.sum()))
 
 
-def _hidden(
-    simulator: Simulator, given: State, refit: Fitted, imitated: Round | None
-) -> tuple[str, ...]:
+def _hidden(simulator: Simulator, given: State, selected: Selected) -> tuple[str, ...]:
     """
-    Return the effects that H may hide, the likeliest first: none, or two and more.
+    Return the effects that G or H may hide, the likeliest first: none, or two and more.
 
-    Those gain something beside plays, or, added to the model as it was given, take half of what a
-    refit takes.
+    Those of H gain something beside plays, or, added to the model as it was given, take half of
+    what a refit takes.
     """
-    names: list[str] = []
+    refit, imitated = selected.fitted, selected.imitated
+    names = list[str]()
     if imitated is not None:
         before = imitated.before.mean_square
         most = sorted(imitated.contenders, key=lambda c: c.mean_square)
         names = [c.name for c in most if before - c.mean_square > criteria.LEAST_GAIN * before]
-    names = list(dict.fromkeys([*names, *_instead(simulator, given, refit)]))
+    names = [*selected.linear, *names, *_instead(simulator, given, refit)]
+    names = list(dict.fromkeys(names))
     if len(names) == 1:
         names += [n for n in look_alikes(names[0]) if find_effect(n).rate_independent][:1]
     return tuple(names[: criteria.CLASS_SIZE]) if len(names) > 1 else ()

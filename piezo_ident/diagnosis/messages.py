@@ -138,7 +138,7 @@ def sentence(
         text += f'{smallest:.2g} % of stroke{tail}.'
     if findings.group and not findings.effects:
         hidden = _or(findings.group).capitalize()
-        text += f' {hidden} may hide in the hysteresis, and these data do not tell.'
+        text += f' {hidden} may hide in the base model, and these data do not tell.'
     return text[0].upper() + text[1:]
 
 

@@ -217,7 +217,7 @@ class Diagnosis(Showable):
         In the order in which they were found.
     group : Class or None
         Effects that these data cannot tell apart; where none was found, those that
-        may hide in H.
+        may hide in the base model.
     unexplained : Unexplained
     candidates : tuple of Candidate
         Best first.

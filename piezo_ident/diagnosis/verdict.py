@@ -266,7 +266,7 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
         if not findings.effects:
-            return 'may hide in the hysteresis'
+            return 'may hide in the base model'
         return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
     if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'

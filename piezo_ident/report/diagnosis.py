@@ -288,7 +288,7 @@ def _alike(result: Diagnosis) -> list[str]:
         return []
     names, what = ', '.join(result.group.names), 'what would'
     if not result.effects:
-        names, what = f'{names}, which may hide in the hysteresis', 'what would tell'
+        names, what = f'{names}, which may hide in the base model', 'what would tell'
     return [names, f'{what}: {result.group.separating_experiment}']
 
 

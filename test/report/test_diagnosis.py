@@ -44,7 +44,7 @@ def test_a_refit_tells_of_its_law_of_what_may_hide_and_of_the_motions_it_stands_
     result = example('refitted')
     for text in (page_html(diagnosis_page(result, [], [])), diagnosis_text(result)):
         words = ' '.join(text.split())
-        assert 'creep, thermal_drift, gain_drift, which may hide in the hysteresis' in words
+        assert 'creep, thermal_drift, gain_drift, which may hide in the base model' in words
         assert 'not a sum of plays: H has a Preisach density' in words
         assert 'plays 0.300 %, duhem 0.100 %' in words
         assert 'each predicted from the others: sine:5Hz, staircase, sine:50Hz' in words
