@@ -200,26 +200,48 @@ def dynamics(
 @ordered_kernel
 def _forward(w: NDArray[np.float64], b: NDArray[np.float64], y: NDArray[np.float64]) -> None:
     y[:] = 0.0
-    for j in range(b.size):
-        # a slice, whose indices cannot be negative, lets the loop run in vector lanes
-        past = w[j : j + y.size]
-        for k in range(y.size):
+    n, nb = y.size, b.size
+    fours = nb - nb % 4
+    # slices, whose indices cannot be negative, let the loops run in vector lanes
+    for j in range(0, fours, 4):
+        past = w[j : j + n + 3]
+        b0, b1, b2, b3 = b[j], b[j + 1], b[j + 2], b[j + 3]
+        for k in range(n):
+            x = (y[k] + b0 * past[k]) + b1 * past[k + 1]
+            y[k] = (x + b2 * past[k + 2]) + b3 * past[k + 3]
+    for j in range(fours, nb):
+        past = w[j : j + n]
+        for k in range(n):
             y[k] += b[j] * past[k]
 
 
 @ordered_kernel
 def _backward(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
-    na = a.size
+    na, n = a.size, y.size - a.size
     if na == 0:
         return
-    # each output waits for the one before, which reaches it sooner in a variable
-    last = y[na - 1]
-    for k in range(y.size - na):
-        past, x = y[k : k + na], y[k + na]
-        for i in range(na - 1):
-            x -= a[i] * past[i]
-        last = x - a[na - 1] * last
-        y[k + na] = last
+    # four outputs side by side: each waits for those before it in its last three terms only
+    whole = n - n % 4 if na > 3 else 0
+    for k in range(0, whole, 4):
+        new = y[k : k + na + 4]
+        x0, x1, x2, x3 = new[na], new[na + 1], new[na + 2], new[na + 3]
+        for i in range(na - 3):
+            x0 -= a[i] * new[i]
+            x1 -= a[i] * new[i + 1]
+            x2 -= a[i] * new[i + 2]
+            x3 -= a[i] * new[i + 3]
+        a3, a2, a1 = a[na - 3], a[na - 2], a[na - 1]
+        y3, y2, y1 = new[na - 3], new[na - 2], new[na - 1]
+        x0 = ((x0 - a3 * y3) - a2 * y2) - a1 * y1
+        x1 = ((x1 - a3 * y2) - a2 * y1) - a1 * x0
+        x2 = ((x2 - a3 * y1) - a2 * x0) - a1 * x1
+        x3 = ((x3 - a3 * x0) - a2 * x1) - a1 * x2
+        new[na], new[na + 1], new[na + 2], new[na + 3] = x0, x1, x2, x3
+    for k in range(whole, n):
+        x = y[k + na]
+        for i in range(na):
+            x -= a[i] * y[k + i]
+        y[k + na] = x
 
 
 @ordered_kernel
