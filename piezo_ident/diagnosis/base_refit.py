@@ -109,6 +109,7 @@ def _selected(
 def with_refit(
     simulator: Simulator,
     given: State,
+    base: Fitted,
     findings: Findings,
     selected: Selected,
     noise: float,
@@ -121,6 +122,9 @@ def with_refit(
     rms `misfit` [% of stroke], a refit or a retuned G may hide effects.
     """
     rows, refit = simulator.rows, selected.fitted
+    if rows.percent(base.mean_square - refit.mean_square) < criteria.REFIT_FINDING:
+        # a little another G is no finding
+        selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
     gain = float(np.mean(e * e)) - refit.mean_square
     if (

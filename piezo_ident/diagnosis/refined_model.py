@@ -53,7 +53,7 @@ def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Finding
     metres = shifts * model.scaling.Y
     if findings.keeps_given or (
         not findings.effects
-        and (not _is_worth(rows, fitted, e) or _harms_the_start(simulator, given, fitted.state))
+        and (not _is_worth(rows, fitted, e) or _harms_the_whole(simulator, given, fitted.state))
     ):
         return Refined(model, given, metres, is_given=True)
     if fitted.transfer.sum() > e @ e:
@@ -83,18 +83,16 @@ def _is_worth(rows: Rows, refit: Fitted, e: Array) -> bool:
     return refit.mean_square <= least and refit_holds(rows, e, refit.transfer)
 
 
-def _harms_the_start(simulator: Simulator, given: State, fitted: State) -> bool:
+def _harms_the_whole(simulator: Simulator, given: State, fitted: State) -> bool:
     """
-    Return whether a refit errs more than the given model where the memory is not yet known.
+    Return whether a refit errs more than the given model, with the start that was not fitted.
 
-    Nothing was fitted there, and of a record that starts anywhere it can be the larger part.
+    Of a record that starts anywhere, the part in which the memory is unknown can be the larger.
     """
     squares = np.zeros(2)
     for i, state in enumerate((given, fitted)):
         for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True):
-            part = run.use & ~run.known
-            if part.any():
-                squares[i] += float(part.sum()) * float(np.var((run.x - x)[part]))
+            squares[i] += float(run.use.sum()) * float(np.var((run.x - x)[run.use]))
     return bool(squares[1] > squares[0])
 
 
