@@ -11,6 +11,8 @@ columns of a fit pass without a run of the whole chain.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import copy
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +25,17 @@ __all__ = ['Behind']
 Array = NDArray[np.float64]
 
 #: samples that pass all links while they are in the cache, about
-STRETCH = 1 << 15
+STRETCH = 1 << 14
 #: filters that run side by side in vector lanes
 LANES = 16
+
+
+class _Link(NamedTuple):
+    """A link that does not pass changes as they are, and its place."""
+
+    place: int
+    operator: Operator
+    kind: str
 
 
 class Behind:
@@ -61,10 +71,8 @@ class Behind:
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
         if new:
             kinds[0] = 'bent'
-        #: whether all links are filters, which may trade places
-        self.is_filter = {'passed', 'filtered'} >= set(kinds)
         self._links = [
-            (k, operator, kind != 'bent')
+            _Link(k, operator, kind)
             for k, (operator, kind) in enumerate(zip(operators, kinds, strict=True))
             if kind != 'passed'
         ]
@@ -84,70 +92,93 @@ class Behind:
         -------
         ndarray, shape (n // m,)
         """
-        v0 = float(self._blocks[0].v[0])
-        for k, operator, is_linear in self._links:
-            if is_linear:
-                rest = operator.reset(0.0, rest)
-            else:
-                rest = operator.reset(v0, self._rests[k] + rest) - self._rests[k + 1]
+        self._reset(self._links, rest)
         means = [
-            block_means(self._passed(cut, None if change is None else change[cut]), self._m)
+            block_means(
+                self._passed(self._links, cut, None if change is None else change[cut]), self._m
+            )
             for cut in self._cuts
         ]
         return np.concatenate(means) if means else np.empty(0)
 
-    def filtered(self, sections: Array) -> Array:
+    def filtered(self, sections: Array, signal: Array, rest: float) -> Array:
         """
-        Return what filters before the first link make, of the signal itself.
+        Return by how much the rows change when filters of a signal are added in front.
 
-        Where all links are filters, these may as well run behind the last one, all in one pass.
+        Filters may trade places: these run behind those that come first, side by side.
 
         Parameters
         ----------
         sections : ndarray, shape (k, 5)
             b_0, b_1, b_2, a_1 and a_2 of each, as of `piezo_ident.operators.dynamics.Dynamics`.
+        signal : ndarray, shape (n,)
+        rest : float
+            The signal at rest.
 
         Returns
         -------
         ndarray, shape (k, n // m)
         """
-        c = np.zeros((5, len(sections) + -len(sections) % LANES))
-        c[:, : len(sections)] = sections.T
-        rest = self._rests[0]
-        for _, operator, _ in self._links:
-            rest = operator.reset(0.0, rest)
+        count = len(sections)
+        c = np.zeros((5, count + -count % LANES))
+        c[:, :count] = sections.T
+        first = [link.kind == 'filtered' for link in self._links]
+        at = first.index(False) if False in first else len(first)
+        before, tail = self._links[:at], self._links[at:]
+        rest = self._reset(before, rest)
         b0, b1, b2, a1, a2 = c
         gain = (b0 + b1 + b2) / (1.0 + a1 + a2)
         state = rest * np.array([gain - b0, b2 - a2 * gain])
-        out = np.empty((self._n // self._m, c.shape[1]))
+        tails = [copy.deepcopy(tail) for _ in range(count if tail else 0)]
+        for links, g in zip(tails, gain, strict=False):
+            self._reset(links, rest * float(g))
+        m = 1 if tail else self._m
+        rows = np.empty((count, self._n // self._m))
         for cut in self._cuts:
-            x = self._passed(cut, self._blocks[0].x[cut])
-            _filter_means(x, c, state, self._m, out[cut.start // self._m : cut.stop // self._m])
-        return out.T[: len(sections)].copy()
+            x = self._passed(before, cut, signal[cut])
+            out = np.empty((count, x.size // m))
+            _filter_means(x, c, state, m, out)
+            row = slice(cut.start // self._m, cut.stop // self._m)
+            if not tail:
+                rows[:, row] = out
+            for i, links in enumerate(tails):
+                change = self._passed(links, cut, out[i])
+                rows[i, row] = block_means(change, self._m)
+        return rows
 
-    def _passed(self, cut: slice, change: Array | None) -> Array:
-        """Return what a stretch becomes; they come one after the other."""
+    def _reset(self, links: Sequence[_Link], rest: float) -> float:
+        """Bring links to rest, and return by how much that behind them changes with `rest`."""
+        v0 = float(self._blocks[0].v[0])
+        for k, operator, kind in links:
+            if kind != 'bent':
+                rest = operator.reset(0.0, rest)
+            else:
+                rest = operator.reset(v0, self._rests[k] + rest) - self._rests[k + 1]
+        return rest
+
+    def _passed(self, links: Sequence[_Link], cut: slice, change: Array | None) -> Array:
+        """Return what a change becomes in a stretch; stretches come one after the other."""
         whole = self._blocks[0]
         channels = {name: x[cut] for name, x in whole.channels.items()}
         block = Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
         if change is not None:
             block = block.with_signal(change)
-        for k, operator, is_linear in self._links:
-            if not is_linear:
-                x = self._blocks[k].x[cut]
-                block = operator.process(block.with_signal(x if change is None else x + block.x))
-                block = block.with_signal(block.x - self._blocks[k + 1].x[cut])
-                change = block.x
-            else:
+        for k, operator, kind in links:
+            if kind != 'bent':
                 block = operator.process(block)
+                continue
+            x = self._blocks[k].x[cut]
+            block = operator.process(block.with_signal(x if change is None else x + block.x))
+            change = block.x - self._blocks[k + 1].x[cut]
+            block = block.with_signal(change)
         return block.x
 
 
 @kernel
 def _filter_means(x: Array, c: Array, state: Array, m: int, out: Array) -> None:
     # rows of c: b_0, b_1, b_2, a_1 and a_2; state: two numbers of the transposed direct form
-    for row in range(out.shape[0]):
-        total = out[row]
+    total = np.empty(c.shape[1])
+    for row in range(out.shape[1]):
         total[:] = 0.0
         for k in range(row * m, row * m + m):
             v = x[k]
@@ -156,5 +187,7 @@ def _filter_means(x: Array, c: Array, state: Array, m: int, out: Array) -> None:
                 state[0, i] = c[1, i] * v - c[3, i] * y + state[1, i]
                 state[1, i] = c[2, i] * v - c[4, i] * y
                 total[i] += y / m
+        for i in range(out.shape[0]):
+            out[i, row] = total[i]
     for i in range(c.shape[1]):
         state[0, i], state[1, i] = alive(state[0, i]), alive(state[1, i])

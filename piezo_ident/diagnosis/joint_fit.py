@@ -26,8 +26,9 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
+from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import free_parameters, FreeParameter, Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from scipy.optimize import lsq_linear
 
@@ -284,16 +285,15 @@ def _derivatives(
 ) -> Array:
     columns = np.zeros((len(parameters), simulator.rows.n))
     tick()
-    quick = simulator.filtered(parameters)
-    for j, parameter in enumerate(parameters):
+    steps = [parameter.small(state) for parameter in parameters]
+    quick = simulator.filtered(
+        [(p.effect, p.name, p.index or 0, s) for p, s in zip(parameters, steps, strict=True)]
+    )
+    for j, (parameter, step) in enumerate(zip(parameters, steps, strict=True)):
         if j in quick:
             columns[j] = quick[j]
             continue
         tick()
-        value, step = parameter.get(state), parameter.step
-        top = parameter.upper / value if parameter.logarithmic else parameter.upper - value
-        if top < (np.exp(step) if parameter.logarithmic else step):
-            step = -step
         try:
             moved = parameter.moved(state, step)
             place = parameter.effect

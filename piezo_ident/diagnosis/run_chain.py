@@ -51,11 +51,10 @@ class RunChain:
         """Return the links from a place on, once all blocks are kept."""
         return Behind(self.operators[start:], self.rests[start:], self.blocks[start:], m)
 
-    def filtered(self, place: int, sections: Array, m: int) -> Array | None:
-        """Return what filters of what a kept link takes in add to all rows, None if not alone."""
-        rests, blocks = self.rests[place:], self.blocks[place:]
-        behind = Behind(self.operators[place + 1 :], rests, blocks, m)
-        return behind.filtered(sections) if behind.is_filter else None
+    def filtered(self, place: int, sections: Array, m: int) -> Array:
+        """Return by how much all rows change with filters of what a link takes in."""
+        behind = self.behind(place + 1, m)
+        return behind.filtered(sections, self.blocks[place].x, self.rests[place])
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:
         """Return by how much all rows differ from a kept chain's, alike but for a link here."""

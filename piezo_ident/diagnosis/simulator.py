@@ -21,7 +21,6 @@ from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.diagnosis.retuning import (
     BEYOND,
     retuned,
-    RETUNING,
     retuning_factor,
     retuning_terms,
 )
@@ -35,7 +34,7 @@ from piezo_ident.diagnosis.run_chain import (
     RunChain,
 )
 from piezo_ident.effects import Effect, find_effect
-from piezo_ident.effects.trials import number_of, with_number
+from piezo_ident.effects.trials import with_number
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filter_arx
@@ -44,16 +43,11 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 __all__ = [
     'Added',
-    'FreeParameter',
     'Simulator',
     'State',
-    'free_parameters',
 ]
 
 Array = NDArray[np.float64]
-
-#: finite difference of the logarithm of a parameter
-LOG_STEP = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,84 +115,6 @@ class State:
     def with_effect(self, added: Added) -> State:
         """Return the state with one more effect."""
         return replace(self, effects=(*self.effects, added))
-
-
-@dataclass(frozen=True)
-class FreeParameter:
-    """
-    One number that the fit may move, in one record or (None) in all.
-
-    It belongs to an effect, by its place in the state, or (None) to the retuning of G.
-    """
-
-    effect: int | None
-    record: int | None
-    name: str
-    index: int | None
-    logarithmic: bool
-    step: float
-    lower: float
-    upper: float
-
-    def get(self, state: State) -> float:
-        """Return its value."""
-        if self.effect is None:
-            return state.retuning[self.index or 0]
-        return number_of(
-            state.effects[self.effect].values[self.record or 0], self.name, self.index
-        )
-
-    def moved(self, state: State, delta: float) -> State:
-        """Return the state after a step within the bounds; relative if logarithmic."""
-        value = self.get(state)
-        if self.logarithmic:
-            value *= float(np.exp(np.clip(delta, -1.0, 1.0)))
-        else:
-            value += delta
-        value = float(np.clip(value, self.lower, self.upper))
-        if self.effect is None:
-            retuning = list(state.retuning)
-            retuning[self.index or 0] = value
-            return replace(state, retuning=tuple(retuning))
-        effects = list(state.effects)
-        effects[self.effect] = effects[self.effect].changed(
-            self.record, self.name, self.index, value
-        )
-        return replace(state, effects=tuple(effects))
-
-    def room(self, state: State) -> tuple[float, float]:
-        """Return the largest steps down and up."""
-        value = self.get(state)
-        if self.logarithmic:
-            down = max(-1.0, np.log(max(self.lower, 1e-300) / value))
-            return min(down, 0.0), max(min(1.0, np.log(self.upper / value)), 0.0)
-        return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
-
-
-def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
-    """Return every number of G's retuning and of the effects that the fit may move."""
-    found = [
-        FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
-        for i, size in enumerate(RETUNING[: len(state.retuning)])
-    ]
-    for i, added in enumerate(state.effects):
-        effect = added.effect
-        for p in effect.parameters:
-            value = added.values[0][p.name]
-            if p.scale == 'fixed' or p.kind == 'text':
-                continue
-            is_log = p.scale == 'log'
-            step = LOG_STEP if is_log else (p.step or 1e-3)
-            # the amplitude of what follows time is another one in each record
-            per_record = effect.time_driven and p.step > 0.0
-            for k in range(records) if per_record else (None,):
-                for index in range(np.size(value)) if p.vector else (None,):
-                    number = number_of(added.values[0], p.name, index)
-                    if np.isfinite(number) and not (is_log and number <= 0.0):
-                        found.append(
-                            FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)
-                        )
-    return tuple(found)
 
 
 class Simulator:
@@ -324,36 +240,37 @@ class Simulator:
         ]
         return self._joined(changes)
 
-    def filtered(self, parameters: Sequence[FreeParameter]) -> dict[int, Array]:
+    def filtered(self, wanted: Sequence[tuple[int | None, str, int, float]]) -> dict[int, Array]:
         """
-        Return derivatives of the rows by those parameters that scale a filter of a signal.
+        Return derivatives of the rows by those wanted numbers that scale a filter of a signal.
 
-        Of the remembered state, by the place of the parameter.
+        Of the remembered state, by their place.  Each is an effect's place or (None) the retuning
+        of G, the name of a parameter, the place in a list, and a step.
         """
         kept, rate = self._known(), self.model.sample_rate
         terms = retuning_terms(rate, self._band)
         found: dict[int | None, dict[int, Array]] = {}
-        for j, parameter in enumerate(parameters):
-            i, k = parameter.effect, parameter.index or 0
+        for j, (i, name, k, _) in enumerate(wanted):
             section: Array | None
             if i is None:
                 section = terms[k]
             else:
                 added = kept.state.effects[i]
-                section = added.effect.section(rate, added.values[0], parameter.name, k)
+                section = added.effect.section(rate, added.values[0], name, k)
             if section is not None:
                 found.setdefault(i, {})[j] = section
         columns: dict[int, Array] = {}
         for i, sections in found.items():
             effect = None if i is None else kept.state.effects[i].effect
+            steps = np.array([wanted[j][-1] for j in sections])
             stacked = np.stack(list(sections.values()))
+            # the numerators; a link that bends sees a small change
+            stacked[:, :3] *= steps[:, None]
             parts = [
                 chain.filtered(place_of(effect, chain.operators), stacked, self.rows.m)
                 for chain in kept.chains
             ]
-            whole = [part for part in parts if part is not None]
-            if len(whole) == len(parts):
-                columns |= dict(zip(sections, self._joined(whole), strict=True))
+            columns |= dict(zip(sections, self._joined(parts) / steps[:, None], strict=True))
         return columns
 
     def _known(self, state: State | None = None) -> _Kept:
