@@ -39,7 +39,7 @@ from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
 __all__ = [
     'Added',
@@ -130,6 +130,8 @@ class Simulator:
         #: for each run what H made last, and of what
         self._answers: list[list[Any]] = [[] for _ in rows.runs]
         self._kept: _Kept | None = None
+        #: what G makes of the columns of the law that was asked for last
+        self._of_law: tuple[Any, Array] | None = None
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -160,13 +162,22 @@ class Simulator:
         Effects are left out of these columns: they change them by a few percent, and only the
         path to the optimum depends on that.
         """
+        # the terms of narrower laws are among those of the widest, all but the bias
+        wide = law if law.name == 'bias' else replace(law, name=LAWS[-1])
+        key = (wide.name, wide.span, tuple(wide.thresholds))
+        if self._of_law is None or self._of_law[0] != key:
+            self._of_law = None
+            self._of_law = key, self._joined([*self._behind_G(wide)])
+        whole = self._of_law[1]
+        return whole if law.name == wide.name else whole[law.within(wide)]
+
+    def _behind_G(self, law: HysteresisLaw) -> Iterator[Array]:
+        """Give all rows of the columns of a law in each run."""
         links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
-        parts = []
         for source, memory in zip(self._sources, self.rows.memories, strict=True):
             behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
             raw = law.columns(source.x, memory(law.thresholds))
-            parts.append(np.stack([behind.rows(x, float(x[0])) for x in raw]))
-        return self._joined(parts)
+            yield np.stack([behind.rows(x, float(x[0])) for x in raw])
 
     def columns(self, state: State, law: HysteresisLaw, step: float) -> Array:
         """

@@ -239,10 +239,10 @@ class HysteresisLaw:
         """
         Return the places of the coefficients among those of a wider law, shape (size,).
 
-        The wider one is `any`, or `static`, of the same thresholds.
+        The wider one has the same thresholds; `duhem` holds all but those of `bias`.
         """
         m, n = self.thresholds.size, wider.densities
-        middle = m + 2 * NODES
+        middle = n - NODES * (DEGREE + 1)
         inner = {'bias': (m, middle), 'preisach': (middle, n), 'duhem': (middle, n)}
         start, stop = inner.get(self.name, (m, n if self.name in ('any', 'static') else m))
         powers = range(wider.size - (2 if self.name == 'plays' else 3), wider.size)
