@@ -201,7 +201,7 @@ class Simulator:
                 )
                 cores = (self._chain(s, i).operators[core] for s in moved)
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
-            parts.append(np.stack([behind.rows(x, float(x[0])) for x in changes]) / step)
+            parts.append(np.stack([behind.rows(x, float(x[0])) / step for x in changes]))
         return self._joined(parts)
 
     def bare(self, state: State) -> Array:
