@@ -139,15 +139,16 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
         loss = _scan(runs, 'noise')
     scan = None if loss is None else delay_from_loss(loss)
     progress('delay', 1.0)
+    has_noise = any(run.piece.find('noise') for run in runs)
     if step is not None and step.samples is not None:
         found = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
-        has_noise = any(run.piece.find('noise') for run in runs)
-        if found.agree or not has_noise:
-            return found
-        run, start, stop = _longest_noise(runs)
-        noise = _noise(run, run.u, start, stop)
-        return upheld(found, noise.fitted, noise.held)
+        return _upheld(found, runs) if has_noise and not found.agree else found
     if scan is None:
+        found = DelayResult(MAX_DELAY, float('inf'), 'none', step, loss)
+        if loss is not None and has_noise:
+            found = _upheld(found, runs)
+        if found.source != 'none':
+            return found
         what = 'too short to scan' if loss is None else 'that hides it below 30 samples'
         raise IdentificationError(
             f'delay: no step rises above the sensor noise, and a drive {what}; add larger steps, '
@@ -156,6 +157,12 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     run, start, stop = _longest_noise(runs)
     std = 0.5 * run.piece.sample_rate / _band(run, start, stop)
     return DelayResult(scan, std, 'scan', step, loss, scan)
+
+
+def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
+    run, start, stop = _longest_noise(runs)
+    noise = _noise(run, run.u, start, stop)
+    return upheld(found, noise.fitted, noise.held)
 
 
 def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:

@@ -37,3 +37,11 @@ def test_a_delay_that_no_free_run_allows_is_replaced_by_a_smaller_one():
     assert found.source == 'free run'
     assert 1 <= found.samples <= 6
     assert found.std > 1.0
+
+
+def test_noise_tells_a_delay_where_neither_steps_nor_the_loss_do():
+    found = upheld(DelayResult(30, np.inf, 'none'), *noise(6))
+    assert found.source == 'free run'
+    assert 1 <= found.samples <= 6
+    # where the delay is that long, nothing is claimed
+    assert upheld(DelayResult(30, np.inf, 'none'), *noise(33)).source == 'none'
