@@ -38,6 +38,7 @@ __all__ = [
     'choose_thresholds',
     'merged',
     'third_step',
+    'with_small',
 ]
 
 #: plays of the paper, where the data cannot choose their number
@@ -46,6 +47,8 @@ PAPER_COUNT = 10
 COUNTS = (10, 14, 20, 28, 40, 56, 80)
 #: a larger number must lower the held-out error by this share
 GAIN = 0.01
+#: thresholds below the smallest that small motion may ask for
+SMALL = 4
 #: thresholds of a wider law, and parts of the record that are predicted in turn
 FINE, PARTS = 40, 8
 #: share by which a wider law must lower the error of the parts: on loops of the kinds of Bouc and
@@ -145,6 +148,40 @@ def choose_thresholds(
             if misses == 2:
                 break
     return best
+
+
+def with_small(
+    thresholds: NDArray[np.float64],
+    fit: Sequence[Excerpt],
+    small: Sequence[Excerpt],
+    dynamics: Dynamics,
+    delay: Delay,
+) -> NDArray[np.float64]:
+    """
+    Return thresholds with smaller ones, each half of the next, where small motion needs them.
+
+    A triangle over the whole range hardly tells how a small loop opens; steps and noise move in
+    such loops.
+
+    Parameters
+    ----------
+    thresholds : ndarray, shape (m,)
+    fit : sequence of Excerpt
+    small : sequence of Excerpt
+        Small motion, which judges.
+    dynamics, delay
+        As in `factorise`.
+    """
+    finer = np.concatenate([thresholds[0] / 2.0 ** np.arange(SMALL, 0, -1), thresholds])
+    n = int(sum(e.use.sum() for e in fit))
+
+    def error(r: NDArray[np.float64]) -> float:
+        h = fit_hysteresis(factorise(fit, r, dynamics, delay), r, n).hysteresis
+        # the rows below the offsets know nothing of them
+        R = factorise(small, h.thresholds, dynamics, delay)[len(small) :, len(small) :]
+        return float(np.linalg.norm(R[:, :-1] @ [*h.weights, h.p1, h.p2] - R[:, -1]))
+
+    return finer if small and error(finer) < error(thresholds) / NO_WORSE else thresholds
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +375,7 @@ def third_step(
         law = choose_thresholds(
             fit, held, swing, G, delay, lambda share: progress('hysteresis', 0.2 + 0.1 * share)
         )
+        law = with_small(law, fit, others, G, delay)
     else:
         law = even_thresholds(swing, PAPER_COUNT)
     n, rows = int(sum(e.use.sum() for e in fitted)), sum(e.rows for e in fitted)

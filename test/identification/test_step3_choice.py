@@ -8,8 +8,12 @@ from itertools import pairwise
 import numpy as np
 from paper_stage import A, B
 from piezo_ident.identification.prepare import Excerpt
-from piezo_ident.identification.step3_choice import choose_law, choose_thresholds
-from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
+from piezo_ident.identification.step3_choice import choose_law, choose_thresholds, with_small
+from piezo_ident.identification.step3_hysteresis import (
+    even_thresholds,
+    factorise,
+    fit_hysteresis,
+)
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 import pytest
@@ -98,6 +102,7 @@ CORES = {
     'Bouc-Wen': lambda u: u + 0.25 * bouc_wen(u),
     'Duhem': lambda u: u + 0.2 * duhem(u),
     'plays': plays,
+    'fine plays': lambda u: plays(u) + Hysteresis([0.01, 0.02, 0.05], [0.2] * 3, 0.0, 0.0)(u),
 }
 
 
@@ -153,6 +158,21 @@ def test_no_choice_is_worse_than_plays_on_other_motion(core, u):
 def test_plays_stay_plays():
     for u in (TRIANGLE, WIDE):
         assert choose_law([excerpt('plays', u)], G, D).law is None
+
+
+@pytest.mark.parametrize('core', ['fine plays', 'plays'])
+def test_small_motion_asks_for_smaller_thresholds(core):
+    small = 0.03 * np.random.default_rng(1).standard_normal(600).repeat(10)
+    whole = excerpt(core, np.concatenate([TRIANGLE, legs(0, 0.5), 0.5 + small]))
+    first = np.arange(whole.u.size) < TRIANGLE.size
+    fit, other = (Excerpt(whole.u, whole.x, use) for use in (first, ~first))
+    # the smallest play of the truth is 0.03
+    r = even_thresholds(1.0, 10) if core == 'fine plays' else np.array([0.03, 0.137, 0.3])
+    found = with_small(r, [fit], [other], G, D)
+    assert np.all(np.diff(found) > 0.0)
+    assert found[-r.size :].tolist() == r.tolist()
+    assert found.size == r.size + 4 * (core == 'fine plays')
+    assert with_small(r, [fit], [], G, D) is r
 
 
 def test_several_excerpts_have_offsets_of_their_own():
