@@ -284,10 +284,10 @@ def _diagnosed(
 
 
 def _missed(model: StageModel) -> float:
-    """Return the error of the model where it was identified, % of stroke; 0 where unknown."""
+    """Return what the model missed of fast motion at its identification, % of stroke, or 0."""
     errors = model.identification.get('errors')
-    known = errors.values() if isinstance(errors, Mapping) else ()
-    return max((float(x) for x in known if isinstance(x, int | float)), default=0.0)
+    known = errors.get('fast_motion') if isinstance(errors, Mapping) else None
+    return float(known) if isinstance(known, int | float) else 0.0
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:

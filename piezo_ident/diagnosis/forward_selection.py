@@ -71,7 +71,8 @@ class ForwardSelection:
 
     `certain` are effects that a test of their own has shown, whatever they explain of the rest;
     `smallest` is the rms of the smallest other effect that is taken, and `missed` what the model
-    missed when it was identified, % of stroke: no change of the dynamics since is smaller.
+    missed of fast motion when it was identified, % of stroke: no change of the dynamics since is
+    smaller.
     `given` is the mean square that the model leaves as it was given: where a refit of H leaves
     more, an effect has to gain against that.
     """

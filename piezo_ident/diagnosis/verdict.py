@@ -243,7 +243,7 @@ def set_aside(
     """
     Return the candidates that were not tried though data might show them, and why not.
 
-    `missed` is what the model missed when it was identified, % of stroke.
+    `missed` is what the model missed of fast motion when it was identified, % of stroke.
     """
     tried = _visible(selected.rounds)
     size = rows.percent(selected.rounds[0].before.mean_square - noise)
@@ -255,7 +255,7 @@ def set_aside(
         if effect.in_dynamics and size < criteria.NEWS * missed:
             found[name] = (
                 f'only {size:.2g} % of stroke are left for it; the model missed {missed:.2g} % '
-                'when it was identified'
+                'of fast motion when it was identified'
             )
         elif effect.rate_independent and selected.imitated is None:
             found[name] = 'a sum of plays leaves nothing for it'

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.fast_motion import high_passed
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.results import ErrorRow, Memories
 from piezo_ident.model.initial_memory import forgetting, forgotten, start_memory
@@ -20,7 +21,14 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
-__all__ = ['errors_of', 'key_of', 'noise_floor_of', 'predictions_of', 'validation_errors']
+__all__ = [
+    'errors_of',
+    'fast_error',
+    'key_of',
+    'noise_floor_of',
+    'predictions_of',
+    'validation_errors',
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +123,28 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
         for p in predictions
     ]
     return residual_noise_floor(parts, all_stretches(parts))
+
+
+def fast_error(predictions: Sequence[Prediction], noise: float) -> float:
+    """
+    Return the error of all fast motion beyond the noise, % of stroke.
+
+    A zero that moved and what creeps are no part of it: a change of the dynamics is neither.
+
+    Parameters
+    ----------
+    predictions : sequence of Prediction
+    noise : float
+        Noise floor [m], rms.
+    """
+    stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
+    squares = [
+        high_passed(p.run.piece.y - p.y_hat, p.run.piece.sample_rate)[p.run.use] ** 2
+        / stroke_of[p.run.record] ** 2
+        - (noise / stroke_of[p.run.record]) ** 2
+        for p in predictions
+    ]
+    return 100.0 * float(np.sqrt(max(np.concatenate(squares).mean(), 0.0)))
 
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:

@@ -20,7 +20,16 @@ from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step1_delay import find_jumps
 from scipy import ndimage, signal
 
-__all__ = ['EDGES', 'FAINT', 'HIGH_PASS', 'FastMotion', 'Samples', 'moving', 'rms_above']
+__all__ = [
+    'EDGES',
+    'FAINT',
+    'HIGH_PASS',
+    'FastMotion',
+    'Samples',
+    'high_passed',
+    'moving',
+    'rms_above',
+]
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -175,7 +184,7 @@ class FastMotion:
         whole, fitted, held = [], [], []
         warm_up = int(WARM_UP * rate)
         for e in signals:
-            w, x = (_high_passed(z, rate) for z in (e.u, e.x))
+            w, x = (high_passed(z, rate) for z in (e.u, e.x))
             out = _held_blocks(e, max(1, int(BLOCK * rate)))
             whole += _cut(w, x, e.use, warm_up)
             fitted += _cut(w, x, e.use & ~out, warm_up)
@@ -183,7 +192,8 @@ class FastMotion:
         return cls(whole, fitted, held, rate)
 
 
-def _high_passed(x: Vector, rate: float) -> Vector:
+def high_passed(x: Vector, rate: float) -> Vector:
+    """Return a signal above `HIGH_PASS`; all but its start where the rate is too low for that."""
     if 4.0 * HIGH_PASS > rate:
         return np.asarray(x - x[0])
     sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')

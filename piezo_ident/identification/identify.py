@@ -20,6 +20,7 @@ import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
+    fast_error,
     key_of,
     noise_floor_of,
     predictions_of,
@@ -151,7 +152,8 @@ def _identify(
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
-    provenance = _provenance(result, [record.name for record in records])
+    names = [record.name for record in records]
+    provenance = _provenance(result, names, fast_error(predictions, floor.rms or 0.0))
     return replace(result, model=replace(model, identification=provenance))
 
 
@@ -267,7 +269,7 @@ def first_steps(
     return replace(steps, delay=delay, dynamics=found)
 
 
-def _provenance(result: Identification, names: list[str]) -> dict[str, Any]:
+def _provenance(result: Identification, names: list[str], fast: float) -> dict[str, Any]:
     """Return what the model file says about its origin."""
     fit, dynamics = result.hysteresis, result.dynamics
     m = fit.hysteresis.thresholds.size
@@ -296,6 +298,7 @@ def _provenance(result: Identification, names: list[str]) -> dict[str, Any]:
                 for data in ('fitted', 'selection', 'held out', 'validation')
                 if np.isfinite(result.error(data))
             },
+            'fast_motion': fast,
         },
         'uncertainties': {
             'delay': result.delay.std if np.isfinite(result.delay.std) else None,
