@@ -38,7 +38,9 @@ from piezo_ident.identification.results import (
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
 from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step
+from piezo_ident.identification.step3_hysteresis import fit_again
 from piezo_ident.identification.three_steps import (
+    beside_law,
     first_step,
     model_of,
     second_step,
@@ -173,6 +175,12 @@ def _labelled(
     runs = with_starts(unstarted, lag_of(G, delay))
     fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
     hysteresis = third_step(fit, held, G, delay, settings, progress, others=small_excerpts(runs))
+    if hysteresis.law != 'plays':
+        # G was found beside plays
+        refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay)
+        if refined is not None:
+            dynamics, G = refined
+            hysteresis = fit_again(hysteresis, fit, G, delay)
     model = model_of(rate, scaling, hysteresis, G, delay)
     warnings = []
     if not _worth_its_dynamics(model, runs):

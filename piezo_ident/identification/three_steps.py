@@ -14,7 +14,7 @@ for.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import functools
 
 import numpy as np
@@ -22,14 +22,20 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.delay_check import upheld
 from piezo_ident.identification.linear_part import fast_part
-from piezo_ident.identification.prepare import END_HELD, Excerpt, Run
+from piezo_ident.identification.noise_segment import (
+    band_of,
+    longest_noise,
+    noise_segment,
+    NoiseSegment,
+)
+from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
     simulation_error,
 )
-from piezo_ident.identification.spectra import excited_band, frequency_response, prefilter
+from piezo_ident.identification.spectra import frequency_response
 from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_steps
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
@@ -52,6 +58,7 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
 
 __all__ = [
+    'beside_law',
     'first_step',
     'model_of',
     'second_step',
@@ -74,47 +81,8 @@ WARM_UP = 2000
 CANDIDATES = 5
 #: what is slower than this is creep, not dynamics: it is filtered out before G is refined [Hz]
 SLOWEST = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Noise:
-    """Input and output of a noise segment, prefiltered to its band [Hz]; the end is held out."""
-
-    fitted: tuple[NDArray[np.float64], NDArray[np.float64]]
-    held: tuple[NDArray[np.float64], NDArray[np.float64]]
-    band: float
-
-
-def _noise(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> _Noise:
-    rate = run.piece.sample_rate
-    if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
-        raise IdentificationError(
-            f'{run.record}: voltage or displacement is constant in the noise segment'
-        )
-    band = _band(run, start, stop)
-    u, y = (prefilter(x[start:stop], rate, band) for x in (signal, run.x))
-    fit = slice(min(500, u.size // 20), u.size - int(END_HELD * u.size))
-    return _Noise((u[fit], y[fit]), (u[fit.stop :], y[fit.stop :]), band)
-
-
-def _band(run: Run, start: int, stop: int) -> float:
-    u = run.u[start:stop]
-    return excited_band(u - u.mean(), run.piece.sample_rate)
-
-
-def _longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
-    found = [
-        (stop - start, run, start, stop)
-        for run in runs
-        for s in run.piece.find('noise')
-        for start, stop in run.unbroken(s.start, s.stop)
-    ]
-    n, run, start, stop = max(found, key=lambda item: item[0])
-    if n < 2000:
-        raise IdentificationError(
-            f'{run.record}: the noise segment has {n} samples; at least 2000 are needed'
-        )
-    return run, start, stop
+#: share by which G refined beside another law of H must err less
+WORTH = 0.25
 
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
@@ -154,14 +122,14 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
             f'delay: no step rises above the sensor noise, and a drive {what}; add larger steps, '
             'or set --delay'
         )
-    run, start, stop = _longest_noise(runs)
-    std = 0.5 * run.piece.sample_rate / _band(run, start, stop)
+    run, start, stop = longest_noise(runs)
+    std = 0.5 * run.piece.sample_rate / band_of(run, start, stop)
     return DelayResult(scan, std, 'scan', step, loss, scan)
 
 
 def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
-    run, start, stop = _longest_noise(runs)
-    noise = _noise(run, run.u, start, stop)
+    run, start, stop = longest_noise(runs)
+    noise = noise_segment(run, run.u, start, stop)
     return upheld(found, noise.fitted, noise.held)
 
 
@@ -207,7 +175,7 @@ def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
 
 
 def _orders(
-    noise: _Noise,
+    noise: NoiseSegment,
     settings: Settings,
     delay: int,
     candidates: int,
@@ -278,7 +246,7 @@ def second_step(
         When no order gives a stable model.
     """
     d = delay.samples
-    run, start, stop = _longest_noise(runs)
+    run, start, stop = longest_noise(runs)
 
     def part(start: float, width: float) -> Callable[[float], None]:
         return lambda share: progress('dynamics', start + width * share)
@@ -286,7 +254,7 @@ def second_step(
     progress('dynamics', 0.0)
     # only good enough to undo the hysteresis
     rate = run.piece.sample_rate
-    raw = _noise(run, run.u, start, stop)
+    raw = noise_segment(run, run.u, start, stop)
     [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
     del raw  # of an hour's record it is a gigabyte
     G = fast_part(first, rate)
@@ -302,7 +270,7 @@ def second_step(
 
     H = undo(G)
     progress('dynamics', 0.45)
-    undone = _noise(run, run.through(H), start, stop)
+    undone = noise_segment(run, run.through(H), start, stop)
     found = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
     result, G = _best_in_free_run(found, runs, H, delay, progress)
     H = undo(G)
@@ -356,6 +324,22 @@ def _best_in_free_run(
             G = fast_part(fit.dynamics, rate)
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
     return result, G
+
+
+def beside_law(
+    runs: Sequence[Run], H: Hysteresis, dynamics: DynamicsResult, G: Dynamics, delay: Delay
+) -> tuple[DynamicsResult, Dynamics] | None:
+    """
+    Return G refined beside an H of another law than that it was found with.
+
+    None where it does not err clearly less on what was held out.
+    """
+    stretches, held = _stretches(runs, H, delay)
+    fit = output_error(stretches, G, maxiter=8)
+    refined = fast_part(fit.dynamics, runs[0].piece.sample_rate)
+    if simulation_error(held, refined) > (1.0 - WORTH) * simulation_error(held, G):
+        return None
+    return replace(dynamics, covariance=fit.normalised_covariance), refined
 
 
 def _stretches(

@@ -12,8 +12,13 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.prepare import runs_of, scaling_of
 from piezo_ident.identification.results import Settings, silent
-from piezo_ident.identification.step3_hysteresis import factorise
-from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
+from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
+from piezo_ident.identification.three_steps import (
+    beside_law,
+    first_step,
+    second_step,
+    triangle_excerpts,
+)
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
@@ -69,6 +74,26 @@ def test_dynamics_are_found_with_the_hysteresis_undone():
     assert result.methods['output error'] <= min(result.methods.values()) * 1.05
     assert 3000 < result.band < 4500
     assert result.slope_measured == pytest.approx(result.slope_model, rel=0.02)
+
+
+def test_dynamics_are_refined_where_they_do_not_suit_h():
+    given, delay, r = runs(record()), Delay(3), PAPER.model.hysteresis.thresholds
+    found, _ = second_step(given, delay, Settings(order=(10, 10)), silent)
+    truth = PAPER.model.dynamics.normalised()
+    H = fit_hysteresis(factorise(triangle_excerpts(given), r, truth, delay), r, 1).hysteresis
+    # a tenth of it answers through a slower pole
+    slow = np.array([-np.exp(-2 * np.pi * 300 / 2e4)])
+    b = 0.9 * np.convolve(truth.b, [1.0, *slow]) + 0.1 * (1 + slow[0]) * np.pad(truth.b, (0, 1))
+    bent = Dynamics(np.convolve([1.0, *truth.a], [1.0, *slow])[1:], b)
+    assert beside_law(given, H, found, truth, delay) is None
+    refined = beside_law(given, H, found, bent, delay)
+    assert refined is not None
+    f = np.array([50.0, 120, 500, 1500, 2500])
+    before, after = (
+        np.abs(G.response(f, 2e4) - truth.response(f, 2e4)) for G in (bent, refined[1])
+    )
+    assert after.max() < 0.1 * before.max()
+    assert refined[0].covariance.shape == (22, 22)
 
 
 def test_short_and_silent_noise_are_refused():
