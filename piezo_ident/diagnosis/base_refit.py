@@ -86,12 +86,12 @@ def effects_beside(
 def _selected(
     simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
-    found = search.run(wide)
+    found = search.run(wide, plays)
     beside, widest = plays, wide
     if found.taken:
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
     both = search.beside(beside, widest, found)
-    if len(both.taken) > len(found.taken):
+    if both.imitated in both.taken:
         return plays, both
     fitted = both.fitted
     if not found.taken:

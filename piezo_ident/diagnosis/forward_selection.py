@@ -106,13 +106,16 @@ class ForwardSelection:
         self._candidates = [find_effect(name) for name in names if name not in settings.without]
         self._have = {setting.name for setting in simulator.model.effects}
         self._count = 0
+        self._plain: Fitted | None = None
 
-    def run(self, base: Fitted) -> Selected:
+    def run(self, base: Fitted, plays: Fitted) -> Selected:
         """
         Select what no H imitates, from the widest base; without any, the base is the fit.
 
-        What can only follow the path of the command is left to `beside`.
+        What can only follow the path of the command is left to `beside`.  `plays` is a sum of
+        plays refitted: a wide H that has made up for an effect hardly lets go of it.
         """
+        self._plain = self.retuned(plays)
         size = self._simulator.rows.percent(self._explainable(base))
         self._allowed = [
             effect
@@ -122,14 +125,8 @@ class ForwardSelection:
             and effect.name not in TESTED
             and not (effect.in_dynamics and size < criteria.NEWS * self._missed)
         ]
-        shown = list[Round]()
-        self._base, retuned = base, self.retuned(base)
-        for name in self._certain:
-            this = self._round(retuned, [e for e in self._candidates if e.name == name])
-            # what one leaves by its form is no line of its own
-            if this.contenders and (not shown or self._gain(this) > self._indistinct):
-                shown.append(this)
-                retuned = this.contenders[0]
+        self._base = base
+        shown, retuned = self._of_tests(self.retuned(base))
         if shown:
             state = replace(retuned.state, retuning=())
             base = fit_jointly(self._simulator, state, base.base)
@@ -142,6 +139,18 @@ class ForwardSelection:
         if len(found.taken) > len(shown) or size < self._smallest:
             return found
         return replace(found, linear=self._instead(base, retuned))
+
+    def _of_tests(self, fitted: Fitted) -> tuple[list[Round], Fitted]:
+        """Return what tests of their own have shown, and the fit with that."""
+        shown = list[Round]()
+        for name in self._certain:
+            this = self._round(fitted, [e for e in self._candidates if e.name == name])
+            # what one leaves by its form is no line of its own
+            form = (1.0 - criteria.LAW_FITS) * max(map(self._gain, shown), default=0.0)
+            if this.contenders and (not shown or self._gain(this) > max(form, self._indistinct)):
+                shown.append(this)
+                fitted = this.contenders[0]
+        return shown, fitted
 
     def _beside_a_linear_change(
         self,
@@ -198,7 +207,11 @@ class ForwardSelection:
             least /= criteria.AHEAD
         if self._left(this) > min(least, (1.0 - criteria.NAMED) * left):
             return found
-        return replace(found, taken=(*found.taken, this), fitted=this.contenders[0])
+        # what beside the wide H was explained by another effect
+        stay = sum(one.contenders[0].name in TESTED for one in found.taken)
+        fitted, dropped = without_needless(self._simulator, this.contenders[0], self._least, stay)
+        taken = [one for i, one in enumerate(found.taken) if i not in dropped]
+        return replace(found, taken=(*taken, this), fitted=fitted)
 
     def retuned(self, fitted: Fitted) -> Fitted:
         """Return a fit with G retuned, too."""
@@ -270,8 +283,9 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
+        plain = None if fitted.state.effects else self._plain
         this = search_round(
-            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
+            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick, plain
         )
         shown = tuple(c for c in this.contenders if shows(self._simulator, c, self._noise))
         return replace(this, contenders=shown)

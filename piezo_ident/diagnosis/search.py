@@ -38,7 +38,7 @@ from piezo_ident.diagnosis.cross_validation import (
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import Added, Simulator
+from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
@@ -123,12 +123,14 @@ def search_round(
     noise: float,
     rng: np.random.Generator,
     tick: Tick,
+    plain: Fitted | None = None,
 ) -> Round:
     """
     Score all candidates and fit the best of them jointly.
 
     `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
-    `rng` draws the shifts of the surrogates.
+    `rng` draws the shifts of the surrogates.  The joint fits start from a `plain` sum of plays,
+    too: a wide H may have made up for an effect.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
@@ -154,7 +156,17 @@ def search_round(
     least = WORTH_FIT * max(total - noise * n, 1e-300)
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
-    contenders, warnings = _contenders(simulator, before, promising[:JOINT_FITS], tick)
+    starts = [
+        (
+            scores[0].effect,
+            # a law that looks best while it is small need not be the one that fits best
+            [before.state.with_effect(started(simulator.rows, s)) for s in scores[:STARTS]],
+        )
+        for scores in promising[:JOINT_FITS]
+    ]
+    if plain is not None:
+        _add_plain(simulator, before, plain, starts, lines)
+    contenders, warnings = _contenders(simulator, before, starts, tick)
     tick(1.0)
     return Round(
         before=before,
@@ -166,10 +178,33 @@ def search_round(
     )
 
 
+def _add_plain(
+    simulator: Simulator,
+    before: Fitted,
+    plain: Fitted,
+    starts: Sequence[tuple[type[Effect], list[State]]],
+    lines: Sequence[float],
+) -> None:
+    """Add the best start of each effect beside a plain sum of plays, as an H of the wide law."""
+    law = before.state.law
+    if law is None or law.name == 'plays':
+        return
+    state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
+    best: dict[str, Scored] = {}
+    none = np.zeros((simulator.rows.n, 0))
+    for scored in score_trials(simulator, plain, [effect for effect, _ in starts], lines, none):
+        name = scored.effect.name
+        if scored.is_possible and (name not in best or scored.error < best[name].error):
+            best[name] = scored
+    for effect, states in starts:
+        if effect.name in best:
+            states.append(state.with_effect(started(simulator.rows, best[effect.name])))
+
+
 def _contenders(
     simulator: Simulator,
     before: Fitted,
-    promising: Sequence[Sequence[Scored]],
+    starts: Sequence[tuple[type[Effect], Sequence[State]]],
     tick: Tick,
 ) -> tuple[list[Fitted], list[str]]:
     """Return the promising candidates fitted jointly, best first, and the fits that failed."""
@@ -179,13 +214,11 @@ def _contenders(
     def alive() -> None:
         tick(at)
 
-    for i, scores in enumerate(promising):
-        at = 0.5 + 0.5 * i / len(promising)
+    for i, (effect, states) in enumerate(starts):
+        at = 0.5 + 0.5 * i / len(starts)
         alive()
-        effect, fits, failure = scores[0].effect, [], ''
-        # a law that looks best while it is small need not be the one that fits best
-        for start in scores[:STARTS]:
-            state = before.state.with_effect(started(simulator.rows, start))
+        fits, failure = [], ''
+        for state in states:
             try:
                 fits.append(
                     fit_jointly(simulator, state, before.base, iterations=FIRST, tick=alive)

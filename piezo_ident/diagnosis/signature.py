@@ -51,10 +51,13 @@ def has_place(name: str) -> bool:
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
-    Return whether the effect added last shows where it should; True for one without such a place.
+    Return whether the effect added last shows where it should, with values that can be.
 
-    `noise` is the mean square of the noise of a row.
+    True for one without such a place; `noise` is the mean square of the noise of a row.
     """
+    added = fitted.state.effects[-1]
+    if not all(added.effect.is_plausible(values) for values in added.values):
+        return False
     if fitted.name not in _PLACES:
         return True
     rows, state = simulator.rows, fitted.state

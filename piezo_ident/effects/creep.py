@@ -17,6 +17,11 @@ from piezo_ident.operators.chain import Block
 
 __all__ = ['Creep']
 
+#: time after a step up to which motion may be that of dynamics [s]
+AT_ONCE = 0.05
+#: share of what creeps on after a step that may come back
+BACK = 0.2
+
 
 @kernel
 def _crept(
@@ -97,6 +102,19 @@ class Creep(Effect):
         # single times would fit a decade better and the next one worse
         sets = [ladder(shortest, longest, 7), ladder(3 * shortest, longest / 3, 4)]
         return tuple(cls.trial({'time_constant': taus}) for taus in sets)
+
+    @classmethod
+    def is_plausible(cls, values: Mapping[str, Any]) -> bool:
+        """
+        Return whether what follows a step goes on in the direction of the step.
+
+        Shares of neighbouring time constants trade with each other, so that single ones may be
+        below zero; the fastest make up for dynamics.
+        """
+        gain, tau = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
+        t = np.geomspace(min(AT_ONCE, tau.max()), tau.max(), 100)
+        steps = np.diff(-np.expm1(-t[:, None] / tau) @ gain)
+        return bool(-steps[steps < 0.0].sum() <= BACK * steps[steps > 0.0].sum())
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: every element has caught up."""

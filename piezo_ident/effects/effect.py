@@ -250,6 +250,15 @@ class Effect:
         return cls.neutral(values)
 
     @classmethod
+    def is_plausible(cls, values: Mapping[str, Any]) -> bool:
+        """
+        Return whether a stage can be so; the bounds of single parameters do not tell.
+
+        By default True.  A diagnosis names no effect with values that are not.
+        """
+        return True
+
+    @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
         """Return the delay [samples] that an effect `in_delay_line` adds."""
         return 0.0

@@ -217,6 +217,22 @@ def test_lines_that_another_axis_makes_are_no_hum(truths):
     assert after < before / 5
 
 
+@pytest.mark.parametrize(
+    ('effect', 'size', 'seed', 'other'),
+    [
+        # a large drift bends a wide H, beside which creep fits better at first
+        ('thermal_drift', 1.0, 1, 'creep'),
+        # beside a wide H ends of the range look like a bent sensor, until saturation is tried
+        ('saturation', 0.3, 2, 'sensor_nonlinearity'),
+    ],
+)
+def test_what_looks_like_another_effect_at_first_stands_alone(truths, effect, size, seed, other):
+    model, record, _ = measured(effect, size, seed)
+    result = diagnose(model, record, DiagnosisSettings(effects=(other, effect)))
+    assert [e.name for e in result.effects] == [effect], result.sentence
+    assert result.after.overall < 0.1 * result.before.overall
+
+
 def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
     model, record, unseen = measured('noncongruent_minor_loops', 0.3, 1)
     few = DiagnosisSettings(effects=('creep', 'noncongruent_minor_loops', 'sensor_nonlinearity'))

@@ -181,6 +181,24 @@ def test_many_parameters_may_make_up_for_the_form_of_the_law_before(rows, parame
     assert search._takes(this, 0.3 * WHOLE, first=False)
 
 
+@pytest.mark.parametrize(('left', 'names'), [(0.015, ['cross_coupling']), (0.005, None)])
+def test_what_another_axis_leaves_by_its_form_is_no_line(rows, left, names):
+    search = object.__new__(forward_selection.ForwardSelection)
+    search._simulator = SimpleNamespace(rows=rows)
+    search._certain = forward_selection.TESTED[::-1]
+    search._candidates = [find_effect(name) for name in search._certain]
+    rounds = {
+        'cross_coupling': a_round(contender('cross_coupling', 0.02)),
+        'periodic_disturbance': a_round(
+            contender('periodic_disturbance', left), before=0.02 * WHOLE
+        ),
+    }
+    search._round = lambda start, effects: rounds[effects[0].name]
+    shown, last = search._of_tests(None)
+    assert [this.contenders[0].name for this in shown] == (names or list(search._certain))
+    assert last is shown[-1].contenders[0]
+
+
 # -- a change of G, or an effect that bent it ---------------------------------------------------
 
 
@@ -209,7 +227,7 @@ def choose(rows):
             return forward_selection.Selected((first,), taken, start, bent, frozenset())
 
         search._from = selected
-        found = search.run(starts['as it is'])
+        found = search.run(starts['as it is'], starts['as it is'])
         # what acts behind G competes, what only follows the path does not
         assert [effect.name for effect in search._allowed] == list(names[:3])
         start = next(k for k, v in starts.items() if v is found.fitted)

@@ -76,6 +76,23 @@ def test_creep_is_its_exponentials():
     assert_allclose(y, law, atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    ('gain', 'can_be'),
+    [
+        ([0.01, 0.02, 0.01], True),
+        # neighbours trade, and the fastest one makes up for dynamics
+        ([-0.05, 0.03, -0.002], True),
+        ([0.01, -0.03, 0.02], False),
+        ([-0.01, -0.02, -0.01], False),
+    ],
+)
+def test_creep_goes_on_in_the_direction_of_the_step(gain, can_be):
+    values = {'gain': gain, 'time_constant': [0.01, 0.3, 3.0]}
+    assert find_effect('creep').is_plausible(values) == can_be
+    # what one record alone shows has no such rule
+    assert find_effect('thermal_drift').is_plausible({'rate': -0.1})
+
+
 # -- rate dependence ---------------------------------------------------------------------------
 
 
