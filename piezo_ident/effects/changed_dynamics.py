@@ -28,6 +28,8 @@ class ChangedDynamics(Effect):
     A resonance that moved from (w, zeta) to (w', zeta') is exactly of this form, with the new
     frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: then
     the old mode times the effect is the new one.  A mode that was added with a share g has k = 0.
+    So g stays below 1, and above -3 for a mode that did not move by more than a factor of two: a
+    larger one far above the band would be any lag.
 
     Notes
     -----
@@ -50,8 +52,8 @@ class ChangedDynamics(Effect):
     parameters = (
         Parameter('frequency', 'Hz', 'frequency of mode m', NAN, 1e-3, 1e6, True, scale='log'),
         Parameter('damping', '1', 'damping ratio zeta_m', NAN, 1e-4, 10.0, True, scale='log'),
-        Parameter('gain', '1', 'share g_m', 0.0, -100.0, 100.0, True, step=1e-3),
-        Parameter('rate_gain', '1', 'share k_m of the rate', 0.0, -100.0, 100.0, True, step=1e-3),
+        Parameter('gain', '1', 'share g_m', 0.0, -3.0, 1.0, True, step=1e-3),
+        Parameter('rate_gain', '1', 'share k_m of the rate', 0.0, -2.0, 2.0, True, step=1e-3),
     )
 
     def prepare(self) -> None:
@@ -85,7 +87,7 @@ class ChangedDynamics(Effect):
         for f, z in tried:
             # far below a mode M - 1 goes with the square of the frequency, and R with itself
             far = max(1.0, f / band)
-            steps = {'gain': min(1.0, 1e-3 * far**2), 'rate_gain': min(1.0, 1e-3 * far)}
+            steps = {'gain': min(0.5, 1e-3 * far**2), 'rate_gain': min(1.0, 1e-3 * far)}
             trials.append(cls.trial({'frequency': [f], 'damping': [z]}, steps=steps))
         return tuple(trials)
 

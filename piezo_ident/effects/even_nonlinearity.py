@@ -36,9 +36,9 @@ class EvenNonlinearity(Effect):
     description = 'even powers of the voltage in the static curve; 0.1 .. 2 % of stroke'
     needs = 'slow sweeps over the full range, and equal minor loops at several biases'
     parameters = (
-        Parameter('square', '1', 'coefficient p0 of v^2', 0.0, -10.0, 10.0, step=1e-3),
-        Parameter('fourth', '1', 'coefficient p4 of v^4', 0.0, -10.0, 10.0, step=1e-3),
-        Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('square', '1', 'coefficient p0 of v^2', 0.0, -1.0, 1.0, step=1e-3),
+        Parameter('fourth', '1', 'coefficient p4 of v^4', 0.0, -1.0, 1.0, step=1e-3),
+        Parameter('sixth', '1', 'coefficient p6 of v^6', 0.0, -1.0, 1.0, step=1e-3),
     )
 
     @classmethod

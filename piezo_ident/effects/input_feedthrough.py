@@ -33,7 +33,7 @@ class InputFeedthrough(Effect):
     description = 'the drive leaks into the reading, ahead of the motion; up to 0.5 % of stroke'
     needs = 'steps or wide-band noise, sampled faster than the delay'
     parameters = (
-        Parameter('gain', '1', 'share k0 of the command', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('gain', '1', 'share k0 of the command', 0.0, -1.0, 1.0, step=1e-3),
         Parameter('rate_gain', 's', 'share k1 of its rate', 0.0, -1.0, 1.0, step=1e-6),
     )
 

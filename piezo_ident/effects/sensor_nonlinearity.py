@@ -37,9 +37,9 @@ class SensorNonlinearity(Effect):
     )
     needs = 'the full range both slowly and near the first resonance, and loops at five biases'
     parameters = (
-        Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -10.0, 10.0, step=1e-3),
-        Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -10.0, 10.0, step=1e-3),
-        Parameter('fourth', '1', 'coefficient c4 of x^4', 0.0, -10.0, 10.0, step=1e-3),
+        Parameter('square', '1', 'coefficient c2 of x^2', 0.0, -1.0, 1.0, step=1e-3),
+        Parameter('cubic', '1', 'coefficient c3 of x^3', 0.0, -1.0, 1.0, step=1e-3),
+        Parameter('fourth', '1', 'coefficient c4 of x^4', 0.0, -1.0, 1.0, step=1e-3),
     )
 
     @classmethod
