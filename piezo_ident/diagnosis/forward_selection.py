@@ -322,9 +322,11 @@ class ForwardSelection:
             for i in dropped:
                 del taken[i]
         left = self._beyond_noise(fitted)
-        if left > (1.0 - criteria.TOGETHER) * explainable and not all(
-            has_place(this.contenders[0].name) for this in taken[len(shown) :]
-        ):
+        new = [find_effect(this.contenders[0].name) for this in taken[len(shown) :]]
+        # any G that is a little off looks partly like a change of the dynamics
+        linear = any(effect.in_dynamics for effect in new)
+        least = criteria.NAMED if linear else criteria.TOGETHER
+        if left > (1.0 - least) * explainable and not all(has_place(e.name) for e in new):
             taken = [*shown]
         self._progress('candidates', 1.0)
         tried = self._have | {effect.name for effect in self._candidates}
