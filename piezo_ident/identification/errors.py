@@ -125,26 +125,19 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
     return residual_noise_floor(parts, all_stretches(parts))
 
 
-def fast_error(predictions: Sequence[Prediction], noise: float) -> float:
+def fast_error(predictions: Sequence[Prediction]) -> float:
     """
-    Return the error of all fast motion beyond the noise, % of stroke.
+    Return the error of all fast motion, % of stroke.
 
     A zero that moved and what creeps are no part of it: a change of the dynamics is neither.
-
-    Parameters
-    ----------
-    predictions : sequence of Prediction
-    noise : float
-        Noise floor [m], rms.
     """
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
-    squares = [
-        high_passed(p.run.piece.y - p.y_hat, p.run.piece.sample_rate)[p.run.use] ** 2
-        / stroke_of[p.run.record] ** 2
-        - (noise / stroke_of[p.run.record]) ** 2
+    errors = [
+        high_passed(p.run.piece.y - p.y_hat, p.run.piece.sample_rate)[p.run.use]
+        / stroke_of[p.run.record]
         for p in predictions
     ]
-    return 100.0 * float(np.sqrt(max(np.concatenate(squares).mean(), 0.0)))
+    return 100.0 * float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
