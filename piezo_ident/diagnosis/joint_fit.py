@@ -48,6 +48,8 @@ Array = NDArray[np.float64]
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
 #: first damping, a share of the energy of each column
 DAMPING = 1e-4
+#: share of what shows a parameter that other kinds of excitation must hold to tell it
+FIRM = 0.01
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
 
@@ -127,8 +129,9 @@ class Fitted:
 
         Blocks of one number in `sets` are held out together; spread over all data when absent.
         """
+        prior = self.prior if sets is None else _firm(self.prior, self.moving)
         sets = rows.fold if sets is None else sets
-        return held_out_residual(rows, self.J, self.e, self.prior[self.free], sets)
+        return held_out_residual(rows, self.J, self.e, prior[self.free], sets)
 
 
 def base_thresholds(swing: float) -> Array:
@@ -228,8 +231,19 @@ def fit_jointly(
         parameters=parameters,
         prior=prior,
         errors=held_out_errors(equations, rows.fold, prior[free])[:, 0],
-        transfer=held_out_errors(equations, rows.group, prior[free])[:, 0],
+        transfer=held_out_errors(equations, rows.group, _firm(prior, moving)[free])[:, 0],
     )
+
+
+def _firm(prior: Array, moving: Array) -> Array:
+    """
+    Return a prior that keeps parameters which only a kind of excitation left out can tell.
+
+    A limit of the slew rate that nothing but a multisine reaches would be anything without it.
+    """
+    firm = prior.copy()
+    firm[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
+    return firm
 
 
 def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, str, int], float]:

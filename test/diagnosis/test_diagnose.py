@@ -467,6 +467,16 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
     assert errors[rows.fold == 2].sum() == pytest.approx(left @ left, rel=1e-6)
 
 
+def test_a_limit_that_one_kind_of_excitation_reaches_is_kept(truths):
+    model, record, unseen = measured('slew_limit', 0.3, 2)
+    found = diagnose(model, record)
+    assert [effect.name for effect in found.effects] == ['slew_limit']
+    # without the multisine nothing tells the limit, and any would do
+    assert found.after.overall < 0.2 * found.before.overall
+    before, after = unseen_errors(found, unseen)
+    assert after < 0.3 * before
+
+
 def test_columns_near_the_optimum_are_derivatives(truths):
     model, record, _ = measured(None, 0.0, 1)
     rows = make_rows(model, [record])
