@@ -55,9 +55,9 @@ class GainDrift(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return one, three and six stretches; the first knot stays, as a constant gain is H's."""
+        """Return one to twelve stretches; the first knot stays, as a constant gain is H's."""
         trials = []
-        for stretches in (1, 3, 6):
+        for stretches in (1, 3, 6, 12):
             knots = np.linspace(0.0, max(view.duration, 1e-6), stretches + 1)
             full = cls.trial({'time': knots})
             trials.append(Trial(full.values, full.moves[1:], full.steps[1:]))
