@@ -86,7 +86,7 @@ def effects_beside(
 def _selected(
     simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
-    found = search.run(wide, plays)
+    found = search.run(wide)
     beside, widest = plays, wide
     if found.taken:
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted

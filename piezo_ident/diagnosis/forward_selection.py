@@ -106,16 +106,13 @@ class ForwardSelection:
         self._candidates = [find_effect(name) for name in names if name not in settings.without]
         self._have = {setting.name for setting in simulator.model.effects}
         self._count = 0
-        self._plays: Fitted | None = None
 
-    def run(self, base: Fitted, plays: Fitted) -> Selected:
+    def run(self, base: Fitted) -> Selected:
         """
         Select what no H imitates, from the widest base; without any, the base is the fit.
 
-        What can only follow the path of the command is left to `beside`.  `plays` is a sum of
-        plays refitted: a wide H that has made up for an effect hardly lets go of it.
+        What can only follow the path of the command is left to `beside`.
         """
-        self._plays = plays
         size = self._simulator.rows.percent(self._explainable(base))
         self._allowed = [
             effect
@@ -283,11 +280,8 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        plain = None if fitted.state.effects else self._plays
-        if plain is not None and fitted.state.retuning:
-            plain = self.retuned(plain)
         this = search_round(
-            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick, plain
+            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
         )
         shown = tuple(c for c in this.contenders if shows(self._simulator, c, self._noise))
         return replace(this, contenders=shown)

@@ -30,7 +30,9 @@ def without_needless(
     for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
         without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
-        if without.mean_square - fitted.mean_square < least:
+        # what the others make up for by values that cannot be, they do not explain
+        can_be = all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values)
+        if can_be and without.mean_square - fitted.mean_square < least:
             fitted = without
             dropped.append(i)
     return fitted, tuple(dropped)

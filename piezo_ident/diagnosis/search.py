@@ -36,11 +36,12 @@ from piezo_ident.diagnosis.cross_validation import (
     solve,
     with_columns,
 )
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.residual.stretches import block_means
 
 __all__ = ['Round', 'Scored', 'score_trials', 'search_round', 'started']
@@ -123,14 +124,12 @@ def search_round(
     noise: float,
     rng: np.random.Generator,
     tick: Tick,
-    plain: Fitted | None = None,
 ) -> Round:
     """
     Score all candidates and fit the best of them jointly.
 
     `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
-    `rng` draws the shifts of the surrogates.  The joint fits start from a `plain` sum of plays,
-    too: a wide H may have made up for an effect.
+    `rng` draws the shifts of the surrogates.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
@@ -164,8 +163,7 @@ def search_round(
         )
         for scores in promising[:JOINT_FITS]
     ]
-    if plain is not None:
-        _add_plain(simulator, before, plain, starts, lines)
+    _add_plain_starts(simulator, before, starts, lines)
     contenders, warnings = _contenders(simulator, before, starts, tick)
     tick(1.0)
     return Round(
@@ -178,17 +176,22 @@ def search_round(
     )
 
 
-def _add_plain(
+def _add_plain_starts(
     simulator: Simulator,
     before: Fitted,
-    plain: Fitted,
     starts: Sequence[tuple[type[Effect], list[State]]],
     lines: Sequence[float],
 ) -> None:
-    """Add the best start of each effect beside a plain sum of plays, as an H of the wide law."""
+    """
+    Add the best start of each effect beside a sum of plays, as an H of the wide law.
+
+    A wide H that has made up for an effect hardly lets go of it.
+    """
     law = before.state.law
-    if law is None or law.name == 'plays':
+    if not starts or law is None or law.name == 'plays':
         return
+    plays = HysteresisLaw('plays', law.thresholds, law.span)
+    plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays))
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
     best: dict[str, Scored] = {}
     none = np.zeros((simulator.rows.n, 0))

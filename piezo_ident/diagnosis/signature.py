@@ -51,15 +51,15 @@ def has_place(name: str) -> bool:
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
-    Return whether the effect added last shows where it should, with values that can be.
+    Return whether the effect added last shows where it should; True for one without such a place.
 
-    True for one without such a place; `noise` is the mean square of the noise of a row.
+    So it has to with values that can be; `noise` is the mean square of the noise of a row.
     """
+    if fitted.name not in _PLACES:
+        return True
     added = fitted.state.effects[-1]
     if not all(added.effect.is_plausible(values) for values in added.values):
         return False
-    if fitted.name not in _PLACES:
-        return True
     rows, state = simulator.rows, fitted.state
     y = simulator.run(state)
     c = y - simulator.run(replace(state, effects=state.effects[:-1]))

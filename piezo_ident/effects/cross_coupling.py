@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
@@ -12,6 +15,9 @@ from piezo_ident.effects.second_order import SecondOrderSection, slope_of_mode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['CrossCoupling']
+
+#: corner below which nothing follows another axis but heat [Hz]
+SLOWEST = 0.5
 
 
 class CrossCoupling(Effect):
@@ -81,6 +87,14 @@ class CrossCoupling(Effect):
                 steps = {'gain': 1e-3 / std, 'rate_gain': 1e-3 / (2 * np.pi * f * std)}
                 trials.append(cls.trial(shape, steps=steps))
         return tuple(trials)
+
+    @classmethod
+    def is_plausible(cls, values: Mapping[str, Any]) -> bool:
+        """Return whether the low-pass is one of mechanics: a slower one makes a drift."""
+        frequency, damping = float(values['frequency']), float(values['damping'])
+        # of two real poles the slower one
+        slow = 1.0 if damping <= 1.0 else damping - np.sqrt(damping**2 - 1.0)
+        return bool(slow * frequency >= SLOWEST)
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest; the channel's rest value is known with its first sample only."""

@@ -227,7 +227,7 @@ def choose(rows):
             return forward_selection.Selected((first,), taken, start, bent, frozenset())
 
         search._from = selected
-        found = search.run(starts['as it is'], starts['as it is'])
+        found = search.run(starts['as it is'])
         # what acts behind G competes, what only follows the path does not
         assert [effect.name for effect in search._allowed] == list(names[:3])
         start = next(k for k, v in starts.items() if v is found.fitted)

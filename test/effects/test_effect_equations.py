@@ -93,6 +93,14 @@ def test_creep_goes_on_in_the_direction_of_the_step(gain, can_be):
     assert find_effect('thermal_drift').is_plausible({'rate': -0.1})
 
 
+@pytest.mark.parametrize(
+    ('frequency', 'damping', 'can_be'), [(70.0, 5.4, True), (1.0, 0.7, True), (70.0, 100.0, False)]
+)
+def test_coupling_is_no_drift(frequency, damping, can_be):
+    values = {'frequency': frequency, 'damping': damping}
+    assert find_effect('cross_coupling').is_plausible(values) == can_be
+
+
 # -- rate dependence ---------------------------------------------------------------------------
 
 
