@@ -113,13 +113,15 @@ def with_refit(
     findings: Findings,
     selected: Selected,
     noise: float,
+    single: float,
     misfit: float,
 ) -> Findings:
     """
     Return what H alone accounts for, where no effect was found.
 
     That a refit of it brought what there was to gain is a finding; and what a wider H takes, the
-    rms `misfit` [% of stroke], a refit or a retuned G may hide effects.
+    rms `misfit` [% of stroke], a refit or a retuned G may hide effects.  `noise` and `single` are
+    the mean squares of the noise of a row and of a sample.
     """
     rows, refit = simulator.rows, selected.fitted
     if rows.percent(base.mean_square - refit.mean_square) < criteria.REFIT_FINDING:
@@ -128,7 +130,8 @@ def with_refit(
     e = rows.x - simulator.run(given)
     gain = float(np.mean(e * e)) - refit.mean_square
     if (
-        rows.percent(gain) >= criteria.REFIT_FINDING
+        # noise moved the weights when they were identified, too
+        rows.percent(gain - single) >= criteria.REFIT_FINDING
         and gain >= refit.mean_square - noise
         and refit_holds(rows, e, refit.transfer)
     ):

@@ -228,7 +228,8 @@ def _diagnosed(
     progress('verdict', 0.0)
     findings = judge(rows, base, selected, noise)
     if not findings.effects:
-        findings = with_refit(simulator, given, base, findings, selected, noise, misfit)
+        whole = noise if single is None else single
+        findings = with_refit(simulator, given, base, findings, selected, noise, whole, misfit)
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
