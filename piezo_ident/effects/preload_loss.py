@@ -36,7 +36,7 @@ class PreloadLoss(Effect):
     )
     needs = 'slow sweeps over the full range, and minor loops on both sides of the kink'
     parameters = (
-        Parameter('gain', '1', 'loss k of slope below theta', 0.0, -1.0, 1.0, step=3e-3),
+        Parameter('gain', '1', 'loss k of slope below theta', 0.0, 0.0, 1.0, step=3e-3),
         Parameter('threshold', '1', 'voltage theta of the kink', NAN, -10.0, 10.0),
     )
 
