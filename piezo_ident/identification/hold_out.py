@@ -102,7 +102,7 @@ def _place(run: Run, n_held: int) -> int:
         if moved < TRAVELS * travel[-1] / n:
             continue
         share = min(
-            [float(np.ptp(rest) / np.ptp(u)) ** 4]
+            [float(np.ptp(rest) / max(float(np.ptp(u)), np.finfo(float).tiny)) ** 4]
             + [float(1.0 - (e[stop] - e[start]) / e[-1]) for e in energy]
         )
         if share >= STAYS:
