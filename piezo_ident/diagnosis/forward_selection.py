@@ -114,11 +114,12 @@ class ForwardSelection:
         What can only follow the path of the command is left to `beside`.
         """
         size = self._simulator.rows.percent(self._explainable(base))
+        has_dynamics = self._simulator.model.dynamics.a.size > 0
         self._allowed = [
             effect
             for effect in self._candidates
-            # behind G nothing follows the path of the command alone: no H bends or holds a ring
-            if (not effect.rate_independent or effect.slot == 'output')
+            # behind a G nothing follows the path of the command alone: no H bends or holds a ring
+            if (not effect.rate_independent or (effect.slot == 'output' and has_dynamics))
             and effect.name not in TESTED
             and not (effect.in_dynamics and size < criteria.NEWS * self._missed)
         ]

@@ -208,7 +208,10 @@ def choose(rows):
 
     def chosen(linear, bent):
         search = object.__new__(forward_selection.ForwardSelection)
-        search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
+        search._simulator = SimpleNamespace(
+            rows=SimpleNamespace(**vars(rows), passes=9.0),
+            model=SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2))),
+        )
         search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
         search._certain, search._given = (), np.inf
         names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
