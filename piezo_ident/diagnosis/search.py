@@ -212,6 +212,7 @@ def _contenders(
 ) -> tuple[list[Fitted], list[str]]:
     """Return the promising candidates fitted jointly, best first, and the fits that failed."""
     contenders, warnings = list[Fitted](), list[str]()
+    beside_wide: dict[str, Fitted] = {}
     at = 0.5
 
     def alive() -> None:
@@ -233,12 +234,18 @@ def _contenders(
                 failure = f'{effect.name} was not judged: {error}'
         if fits:
             contenders.append(min(fits, key=lambda f: f.mean_square))
+            beside_wide[effect.name] = min(fits[:STARTS], key=lambda f: f.mean_square)
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
     for i, contender in enumerate(contenders[:FINAL]):
         try:
             contenders[i] = _to_the_end(simulator, contender, alive)
+            other = beside_wide[contender.name]
+            if other is not contender:
+                # a few iterations do not tell which base leads further
+                ends = contenders[i], _to_the_end(simulator, other, alive)
+                contenders[i] = min(ends, key=lambda f: f.mean_square)
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
     contenders.sort(key=lambda c: c.mean_square)
