@@ -87,7 +87,8 @@ RICHER_AHEAD = 0.95
 SIMPLER = 1.3
 #: most names of a class
 CLASS_SIZE = 3
-#: a change of the dynamics exceeds what the model missed of fast motion so many times
+#: a change of the dynamics that exceeds what the model missed of fast motion less than so many
+#: times has to fit its law
 NEWS = 2.0
 #: share from which a linear change is a finding of its own, not a side effect on G
 LINEAR = 0.5

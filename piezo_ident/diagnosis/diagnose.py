@@ -23,7 +23,6 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.base_refit import effects_beside, refits, with_refit
 from piezo_ident.diagnosis.forward_selection import (
     ForwardSelection,
-    smallest_detectable,
 )
 from piezo_ident.diagnosis.found_effects import found_effects
 from piezo_ident.diagnosis.joint_fit import Fitted
@@ -41,6 +40,7 @@ from piezo_ident.diagnosis.verdict import (
     errors_of_laws,
     judge,
     set_aside,
+    smallest_detectable,
     untestable_of,
 )
 from piezo_ident.identification.prepare import same_rate

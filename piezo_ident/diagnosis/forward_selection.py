@@ -28,7 +28,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
-__all__ = ['TESTED', 'ForwardSelection', 'Selected', 'smallest_detectable', 'takes']
+__all__ = ['TESTED', 'ForwardSelection', 'Selected', 'takes']
 
 #: effects that have a test of their own, by lines and by coherence with a further channel
 TESTED = ('periodic_disturbance', 'cross_coupling')
@@ -121,9 +121,9 @@ class ForwardSelection:
             # behind a G nothing follows the path of the command alone: no H bends or holds a ring
             if (not effect.rate_independent or (effect.slot == 'output' and has_dynamics))
             and effect.name not in TESTED
-            and not (effect.in_dynamics and size < criteria.NEWS * self._missed)
+            and not (effect.in_dynamics and size < self._missed)
         ]
-        self._base = base
+        self._base, self._is_new = base, size >= criteria.NEWS * self._missed
         shown, retuned = self._of_tests(self.retuned(base))
         if shown:
             state = replace(retuned.state, retuning=())
@@ -320,10 +320,7 @@ class ForwardSelection:
                 del taken[i]
         left = self._beyond_noise(fitted)
         new = [find_effect(this.contenders[0].name) for this in taken[len(shown) :]]
-        # any G that is a little off looks partly like a change of the dynamics
-        linear = any(effect.in_dynamics for effect in new)
-        least = criteria.NAMED if linear else criteria.TOGETHER
-        if left > (1.0 - least) * explainable and not all(has_place(e.name) for e in new):
+        if left > (1.0 - self._wanted(new)) * explainable:
             taken = [*shown]
         self._progress('candidates', 1.0)
         tried = self._have | {effect.name for effect in self._candidates}
@@ -331,6 +328,15 @@ class ForwardSelection:
         if len(taken) == len(shown):
             fitted = shown[-1].contenders[0] if shown else self._base
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
+
+    def _wanted(self, effects: Sequence[type[Effect]]) -> float:
+        """Return the share that effects must explain together."""
+        if all(has_place(effect.name) for effect in effects):
+            return 0.0
+        if not any(effect.in_dynamics for effect in effects):
+            return criteria.TOGETHER
+        # any G that is a little off looks partly like a change of the dynamics
+        return criteria.NAMED if self._is_new else criteria.LAW_FITS
 
 
 # -- is it an effect? ----------------------------------------------------------------------------
@@ -374,25 +380,3 @@ def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:
     """Return whether what an effect costs some kinds of excitation is much of what it gains."""
     change = np.bincount(rows.group, after.errors - before.errors)
     return bool(change[change > 0.0].sum() > -criteria.HARM * change.sum())
-
-
-def smallest_detectable(
-    rows: Rows, base: Fitted, selected: Selected, noise: float
-) -> float | None:
-    """
-    Return the size that a further effect must have to be taken, rms in % of stroke.
-
-    None where the range was passed so rarely that none is taken.
-    """
-    if rows.passes < criteria.PASSES:
-        return None
-    # what follows time alone fits any slow residual
-    last = selected.rounds[-1].chance
-    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
-    share = criteria.FURTHER if selected.taken else criteria.ADDED
-    least = max(
-        criteria.BEYOND_CHANCE * chance,
-        criteria.LEAST_GAIN * (base.mean_square - noise),
-        share * (selected.fitted.mean_square - noise),
-    )
-    return max(criteria.SMALLEST_EFFECT, rows.percent(least))

@@ -43,6 +43,7 @@ __all__ = [
     'judge',
     'rivals_of',
     'set_aside',
+    'smallest_detectable',
     'untestable_of',
 ]
 
@@ -256,7 +257,7 @@ def set_aside(
         effect = find_effect(name)
         if name in tried or name in tested:
             continue
-        if effect.in_dynamics and size < criteria.NEWS * missed:
+        if effect.in_dynamics and size < missed:
             found[name] = (
                 f'only {size:.2g} % of stroke are left for it; the model missed {missed:.2g} % '
                 'of fast motion when it was identified'
@@ -264,6 +265,28 @@ def set_aside(
         elif effect.rate_independent and selected.imitated is None:
             found[name] = 'a sum of plays leaves nothing for it'
     return found
+
+
+def smallest_detectable(
+    rows: Rows, base: Fitted, selected: Selected, noise: float
+) -> float | None:
+    """
+    Return the size that a further effect must have to be taken, rms in % of stroke.
+
+    None where the range was passed so rarely that none is taken.
+    """
+    if rows.passes < criteria.PASSES:
+        return None
+    # what follows time alone fits any slow residual
+    last = selected.rounds[-1].chance
+    chance = max((x for n, x in last.items() if not find_effect(n).time_driven), default=0.0)
+    share = criteria.FURTHER if selected.taken else criteria.ADDED
+    least = max(
+        criteria.BEYOND_CHANCE * chance,
+        criteria.LEAST_GAIN * (base.mean_square - noise),
+        share * (selected.fitted.mean_square - noise),
+    )
+    return max(criteria.SMALLEST_EFFECT, rows.percent(least))
 
 
 def _why_not(name: str, share: float, findings: Findings, last: Round, passes: float) -> str:

@@ -6,7 +6,7 @@
 from types import SimpleNamespace
 
 import numpy as np
-from piezo_ident.diagnosis import forward_selection
+from piezo_ident.diagnosis import criteria, forward_selection
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
 from piezo_ident.diagnosis.forward_selection import takes
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
@@ -274,6 +274,16 @@ def test_what_is_left_has_to_exceed_the_limit_by_more_than_it_scatters(
     left = fitted(size**2 * WHOLE, shape=np.where(np.arange(BLOCKS) < blocks, 1.0, 1e-9))
     selected = SimpleNamespace(fitted=left, taken=(), bent=None)
     assert judge(rows, left, selected, 0.0).verdict == verdict
+
+
+def test_a_change_of_g_explains_nearly_all_that_is_left():
+    search = object.__new__(forward_selection.ForwardSelection)
+    static, slow, linear = map(find_effect, ('saturation', 'creep', 'amplifier_lag'))
+    for search._is_new, share in ((True, criteria.NAMED), (False, criteria.LAW_FITS)):
+        assert search._wanted([linear]) == search._wanted([static, linear]) == share
+        assert search._wanted([static]) == search._wanted([static, slow]) == criteria.TOGETHER
+        # what shows where it alone acts needs no share
+        assert search._wanted([slow]) == 0.0
 
 
 # -- a refit of H ------------------------------------------------------------------------------
