@@ -287,8 +287,11 @@ def _diagnosed(
 def _missed(model: StageModel) -> float:
     """Return what the model missed of fast motion at its identification, % of stroke, or 0."""
     errors = model.identification.get('errors')
-    known = errors.get('fast_motion') if isinstance(errors, Mapping) else None
-    return float(known) if isinstance(known, int | float) else 0.0
+    known = errors if isinstance(errors, Mapping) else {}
+    fast = known.get('fast_motion')
+    # a file without it tells the error of all motion at least
+    told = known.values() if fast is None else (fast,)
+    return max((float(x) for x in told if isinstance(x, int | float)), default=0.0)
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
