@@ -14,6 +14,11 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.fast_motion import high_passed
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.results import ErrorRow, Memories
+from piezo_ident.identification.step3_hysteresis import (
+    factorise,
+    fine_thresholds,
+    fit_hysteresis,
+)
 from piezo_ident.model.initial_memory import forgetting, forgotten, start_memory
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
@@ -125,12 +130,21 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
     return residual_noise_floor(parts, all_stretches(parts))
 
 
-def fast_error(predictions: Sequence[Prediction]) -> float:
+def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> float:
     """
-    Return the error of all fast motion, % of stroke.
+    Return what G and the delay leave of all fast motion beside a fine H, % of stroke.
 
-    A zero that moved and what creeps are no part of it: a change of the dynamics is neither.
+    A few plays miss small loops, and fast motion with them; a diagnosis fits a fine H of its own.
+    A zero that moved and what creeps are no part of it.
     """
+    if law == 'plays':
+        excerpts = [run.excerpt(run.use) for run in runs]
+        swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+        r = fine_thresholds(swing, swing / 10.0)
+        n = sum(int(e.use.sum()) for e in excerpts)
+        R = factorise(excerpts, r, model.dynamics, model.delay)
+        model = replace(model, hysteresis=fit_hysteresis(R, r, n).hysteresis)
+    predictions = predictions_of(model, runs)
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
     errors = [
         high_passed(p.run.piece.y - p.y_hat, p.run.piece.sample_rate)[p.run.use]

@@ -155,7 +155,7 @@ def _identify(
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
     names = [record.name for record in records]
-    provenance = _provenance(result, names, fast_error(predictions))
+    provenance = _provenance(result, names, fast_error(judged, fit.hysteresis.law, runs))
     return replace(result, model=replace(model, identification=provenance))
 
 
