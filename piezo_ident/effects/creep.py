@@ -20,7 +20,7 @@ __all__ = ['Creep']
 #: time after a step up to which motion may be that of dynamics [s]
 AT_ONCE = 0.05
 #: share of what creeps on after a step that may come back
-BACK = 0.2
+BACK = 0.5
 
 
 @kernel
