@@ -109,11 +109,13 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
     left = max(fitted.mean_square - noise, 0.0)
     if not taken:
         size = rows.percent(left)
+        # beside much noise little is left that its estimate might not have missed
+        doubt = (1.0 + criteria.NOISE_KNOWN) ** 2 - 1.0
+        least = (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2 + doubt * noise
         # what is hardly beyond the limit is claimed if it is so by more than it scatters
-        limit = noise + (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2
-        excess = fitted.errors - limit * np.bincount(rows.block, minlength=fitted.errors.size)
-        scatters = standard_errors(excess) < criteria.STANDARD_ERRORS
-        small = size < (2.0 if scatters else 1.0) * criteria.SMALLEST_EFFECT
+        each = (noise + least) * np.bincount(rows.block, minlength=fitted.errors.size)
+        scatters = standard_errors(fitted.errors - each) < criteria.STANDARD_ERRORS
+        small = left < (4.0 if scatters else 1.0) * least
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / max(explainable, 1e-300), 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)

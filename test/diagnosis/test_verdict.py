@@ -276,6 +276,15 @@ def test_what_is_left_has_to_exceed_the_limit_by_more_than_it_scatters(
     assert judge(rows, left, selected, 0.0).verdict == verdict
 
 
+@pytest.mark.parametrize(('rms', 'verdict'), [(0.05, 'unexplained'), (0.5, 'none')])
+def test_beside_much_noise_little_is_no_finding(rows, rms, verdict):
+    # 0.1 % beyond a noise [% of stroke] that is known to a tenth
+    noise = rms**2 * WHOLE
+    left = fitted(noise + 0.01 * WHOLE)
+    selected = SimpleNamespace(fitted=left, taken=(), bent=None)
+    assert judge(rows, left, selected, noise).verdict == verdict
+
+
 def test_a_change_of_g_explains_nearly_all_that_is_left():
     search = object.__new__(forward_selection.ForwardSelection)
     static, slow, linear = map(find_effect, ('saturation', 'creep', 'amplifier_lag'))
