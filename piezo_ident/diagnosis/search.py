@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.criteria import (
+    AHEAD,
     FINAL,
     FIRST,
     JOINT_FITS,
@@ -244,8 +245,9 @@ def _contenders(
             other = beside_wide[contender.name]
             if other is not contender:
                 # a few iterations do not tell which base leads further
-                ends = contenders[i], _to_the_end(simulator, other, alive)
-                contenders[i] = min(ends, key=lambda f: f.mean_square)
+                other = _to_the_end(simulator, other, alive)
+                if other.mean_square < AHEAD * contenders[i].mean_square:
+                    contenders[i] = other
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
     contenders.sort(key=lambda c: c.mean_square)
