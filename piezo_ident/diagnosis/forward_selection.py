@@ -23,7 +23,7 @@ from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round, score_trials, search_round
-from piezo_ident.diagnosis.signature import has_place, shows
+from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
@@ -281,11 +281,9 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        this = search_round(
+        return search_round(
             self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
         )
-        shown = tuple(c for c in this.contenders if shows(self._simulator, c, self._noise))
-        return replace(this, contenders=shown)
 
     def _from(
         self,

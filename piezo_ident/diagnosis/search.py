@@ -39,6 +39,7 @@ from piezo_ident.diagnosis.cross_validation import (
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
@@ -100,7 +101,8 @@ class Round:
     best : dict of str to Scored
         The best trial of every candidate that could be tried.
     contenders : tuple of Fitted
-        Candidates that were fitted jointly with everything else, best first.
+        Candidates that were fitted jointly with everything else, best first, and show where they
+        should.
     chance : dict of str to float
         Mean square that a candidate gains on surrogates of the residual, at best.
     visible : dict of str to float
@@ -165,7 +167,7 @@ def search_round(
         for scores in promising[:JOINT_FITS]
     ]
     _add_plain_starts(simulator, before, starts, lines)
-    contenders, warnings = _contenders(simulator, before, starts, tick)
+    contenders, warnings = _contenders(simulator, before, starts, noise, tick)
     tick(1.0)
     return Round(
         before=before,
@@ -209,9 +211,10 @@ def _contenders(
     simulator: Simulator,
     before: Fitted,
     starts: Sequence[tuple[type[Effect], Sequence[State]]],
+    noise: float,
     tick: Tick,
 ) -> tuple[list[Fitted], list[str]]:
-    """Return the promising candidates fitted jointly, best first, and the fits that failed."""
+    """Return the candidates that show, fitted jointly, best first, and the fits that failed."""
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
     at = 0.5
@@ -246,10 +249,14 @@ def _contenders(
             if other is not contender:
                 # a few iterations do not tell which base leads further
                 other = _to_the_end(simulator, other, alive)
-                if other.mean_square < AHEAD * contenders[i].mean_square:
+                ahead = contenders[i].mean_square < other.mean_square / AHEAD
+                if shows(simulator, other, noise) and not (
+                    ahead and shows(simulator, contenders[i], noise)
+                ):
                     contenders[i] = other
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
+    contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
 
