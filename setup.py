@@ -91,12 +91,12 @@ setup(
     entry_points={
         'console_scripts': [
             'piezo_ident = piezo_ident.cli:main',
-            'excitation = piezo_ident.nodes.excitation:main',
-            'stage = piezo_ident.nodes.stage:main',
-            'identifier = piezo_ident.nodes.identifier:main',
-            'model = piezo_ident.nodes.model:main',
-            'recorder = piezo_ident.nodes.recorder:main',
-            'player = piezo_ident.nodes.player:main',
+            'excitation = piezo_ident.nodes.main:excitation',
+            'stage = piezo_ident.nodes.main:stage',
+            'identifier = piezo_ident.nodes.main:identifier',
+            'model = piezo_ident.nodes.main:model',
+            'recorder = piezo_ident.nodes.main:recorder',
+            'player = piezo_ident.nodes.main:player',
         ],
     },
 )

@@ -4,13 +4,13 @@
 
 """A DAQ card in the place of the node `stage`, with all that a driver of an amplifier must do."""
 
-import sys
 import time
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Kind, SampleClock
+from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples
@@ -105,4 +105,4 @@ class Driver(LabNode):
 
 
 if __name__ == '__main__':
-    sys.exit(run(Driver))
+    ENDING.leave(run(Driver))

@@ -92,7 +92,7 @@ class Nodes:
     ) -> None:
         """Start a node; `arguments` stand before ``--ros-args``."""
         name = f'{namespace}/{executable}'.lstrip('/')
-        code = f'import sys; from piezo_ident.nodes.{executable} import main; sys.exit(main())'
+        code = f'from piezo_ident.nodes.main import {executable}; {executable}()'
         command = [sys.executable, '-c', code, *arguments, '--ros-args']
         if namespace:
             command += ['-r', f'__ns:=/{namespace.strip("/")}']

@@ -130,7 +130,7 @@ class Hosts:
         """Start a node on a host."""
         file = self.folder / f'{executable}.yaml'
         file.write_text(json.dumps({'/**': {'ros__parameters': dict(parameters)}}))
-        code = f'import sys; from piezo_ident.nodes.{executable} import main; sys.exit(main())'
+        code = f'from piezo_ident.nodes.main import {executable}; {executable}()'
         arguments = ['--ros-args', '--params-file', str(file)] if parameters else ['--ros-args']
         self.start(host, [sys.executable, '-c', code, *arguments], executable)
 

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import itertools
 from pathlib import Path
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -209,8 +208,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         graph.wait('recorder', 'done')
         time.sleep(1.5)
         told = graph.diagnostics
-    # a busy machine may need the second signal
-    if any(code not in (0, -signal.SIGTERM) for code in graph.codes.values()):
+    if any(graph.codes.values()):
         raise PiezoIdentError(f'not ended cleanly: {graph.codes}')
     parts = sorted(folder.glob('bag*'))
     recorded = recorded_samples(parts)

@@ -92,7 +92,12 @@ class WorkerProcess:
         self._channel, theirs = context.Pipe()
         # no daemon: its jobs may need processes of their own
         self._process = context.Process(target=_serve, args=(theirs, *self._options))
-        self._process.start()
+        # Ctrl-C at a terminal reaches the process too, before it can say that it ignores it
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()
         self._finish = weakref.finalize(self, _end, self._process, self._channel)
 
@@ -188,6 +193,7 @@ class WorkerProcess:
 def _serve(channel: Connection, nice: int, warm_up: Callable[[], object] | None) -> None:
     # Ctrl-C at a terminal reaches all processes; the parent decides
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
     cancelled = threading.Event()
 

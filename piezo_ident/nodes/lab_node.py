@@ -5,7 +5,7 @@
 What all nodes share: parameters, status, diagnostics, services that answer at once, a clean end.
 
 rclpy's own signal handlers shut the context down before a node can ramp its drive to rest, so
-the signals are taken here.
+the signals are taken by `piezo_ident.nodes.ending`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import os
 from pathlib import Path
-import signal
 import sys
 import threading
 import time
@@ -26,6 +25,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -49,6 +49,8 @@ __all__ = ['LabNode', 'Rate', 'guard_settings', 'run']
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
 SWITCH = 2e-4
+#: how long a node may go on being made, and how long it may take to close, after a signal [s]
+STARTING, CLOSING = 1.0, 1.8
 #: callbacks in a row that fail before a node gives up
 MOST_FAILURES = 1000
 
@@ -84,6 +86,8 @@ class LabNode(Node):
     """
 
     executable: str
+    #: how long it may take to close [s]
+    patience = CLOSING
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
@@ -287,24 +291,19 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
         Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
         not start.
     """
-    stop = threading.Event()
     # a thread beside the executor, one that reads YAML say, must not hold a block up for long
     sys.setswitchinterval(SWITCH)
+    ENDING.listen()
+    ENDING.patience = STARTING
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor()
-
-    def on_signal(*_: object) -> None:
-        stop.set()
-        # a silent node would otherwise notice it at the end of its wait
-        executor.wake()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    ENDING.on_wanted = executor.wake
     node, code = None, 0
     try:
         node = make()
+        ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience
         executor.add_node(node)
-        _spin(executor, node, stop)
+        _spin(executor, node)
     except (PiezoIdentError, ParameterException) as error:
         sys.stderr.write(f'piezo_ident: error: {error}\n')
         code = 2
@@ -316,6 +315,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
             except Exception as error:  # noqa: BLE001
                 _report(node, error, 'it ends all the same')
                 code = code or 1
+            ENDING.unfinished = ''
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown(timeout_sec=0.5)
@@ -323,9 +323,9 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _spin(executor: SingleThreadedExecutor, node: LabNode, stop: threading.Event) -> None:
+def _spin(executor: SingleThreadedExecutor, node: LabNode) -> None:
     failures = 0
-    while rclpy.ok() and not stop.is_set():
+    while rclpy.ok() and not ENDING.is_wanted.is_set():
         try:
             executor.spin_once(timeout_sec=0.2)
             failures = 0

@@ -291,7 +291,3 @@ def _tried(model: StageModel) -> StageModel:
 def main(argv: list[str] | None = None) -> int:
     """Run the node."""
     return run(ModelNode, argv)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -34,7 +34,7 @@ from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliabi
 __all__ = ['PlayerNode', 'chosen_topics', 'main']
 
 #: how long the end of the node waits for the replay to end [s]
-PATIENCE = 1.5
+PATIENCE = 1.0
 #: between the match of the subscribers and the first message, for them to know of it too [s]
 SETTLE = 0.2
 #: how often progress is reported [s]

@@ -60,6 +60,7 @@ class RecorderNode(LabNode):
     """Records topics into bags."""
 
     executable = 'recorder'
+    patience = END + 0.5
 
     def __init__(self, **kwargs: Any) -> None:
         self._inputs: RawSubscriptions | None = None

@@ -39,7 +39,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from observer import ENDS, Observer
-from processes import alive, best_of_three, Handle, in_time, Late, take_domain
+from processes import alive, best_of_three, crowd, Handle, in_time, Late, listens, take_domain
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -47,7 +47,17 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-__all__ = ['ENDS', 'Graph', 'Handle', 'Late', 'alive', 'best_of_three', 'in_time']
+__all__ = [
+    'ENDS',
+    'Graph',
+    'Handle',
+    'Late',
+    'alive',
+    'best_of_three',
+    'crowd',
+    'in_time',
+    'listens',
+]
 
 ROOT = Path(__file__).resolve().parents[2]
 PROFILE = Path(__file__).with_name('prompt_discovery.xml')
@@ -135,7 +145,7 @@ class Graph(Observer):
         command = [
             sys.executable,
             '-c',
-            f'import sys; from piezo_ident.nodes.{executable} import main; sys.exit(main())',
+            f'from piezo_ident.nodes.main import {executable}; {executable}()',
             '--ros-args',
         ]
         if namespace:

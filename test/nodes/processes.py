@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import ctypes
 import fcntl
@@ -18,7 +18,17 @@ import sys
 import tempfile
 from typing import Any, IO
 
-__all__ = ['LIMIT', 'Handle', 'Late', 'alive', 'best_of_three', 'in_time', 'take_domain']
+__all__ = [
+    'LIMIT',
+    'Handle',
+    'Late',
+    'alive',
+    'best_of_three',
+    'crowd',
+    'in_time',
+    'listens',
+    'take_domain',
+]
 
 #: what has not happened within this time will not happen [s]; the machine may be busy
 LIMIT = 60.0
@@ -54,6 +64,30 @@ def best_of_three(attempt: Callable[[], None]) -> None:
             print(f'{late}; once more')
         else:
             return
+
+
+@contextlib.contextmanager
+def crowd() -> Iterator[None]:
+    """Make the machine three times slower: two programs on each processor that do nothing else."""
+    idlers = [
+        subprocess.Popen(
+            [sys.executable, '-S', '-c', 'while True: pass'],
+            preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
+        )
+        for _ in range(2 * (os.cpu_count() or 1))
+    ]
+    try:
+        yield
+    finally:
+        for idler in idlers:
+            idler.kill()
+            idler.wait()
+
+
+def listens(pid: int) -> bool:
+    """Return whether a process takes SIGTERM itself."""
+    fields = re.search(r'^SigCgt:\t(\w+)', Path(f'/proc/{pid}/status').read_text(), re.M)
+    return bool(fields and int(fields[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 def alive(pid: int) -> bool:

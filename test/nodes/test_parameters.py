@@ -60,4 +60,4 @@ def test_executables_of_launch_files_are_installed():
             if getattr(call.func, 'id', '') == 'node':
                 assert f"'{call.args[0].value} = piezo_ident.nodes." in setup
     for node in NODES:
-        assert f"'{node} = piezo_ident.nodes.{node}:main'" in setup
+        assert f"'{node} = piezo_ident.nodes.main:{node}'" in setup

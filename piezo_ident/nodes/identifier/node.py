@@ -50,7 +50,7 @@ TELL = 0.5
 #: how often it is looked for what has come [s]
 DRAIN = 0.02
 #: how long the end of the node waits for the work to end [s]
-PATIENCE = 1.7
+PATIENCE = 0.6
 
 
 class IdentifierNode(LabNode):

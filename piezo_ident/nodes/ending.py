@@ -1,0 +1,95 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+SIGINT and SIGTERM, heard by a thread from the first line of a process on.
+
+A Python signal handler waits until the main thread is back from what it does, and that may be a
+compiler.  The thread hears a signal at once.  A process that has nothing to close yet ends there
+and then; one that has gets some time for it, and is ended when that is over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+import signal
+import sys
+import threading
+import time
+
+__all__ = ['ENDING', 'SIGNALS', 'Ending']
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Ending:
+    """
+    The end of this process.
+
+    Attributes
+    ----------
+    is_wanted : threading.Event
+        Set by a signal.
+    patience : float
+        Time that the process may take to end by itself after a signal [s].
+    on_wanted : callable
+        Called once, in another thread, after `is_wanted` was set.
+    unfinished : str
+        What is cut off when the process has to be ended; then the exit code is 1.
+    """
+
+    def __init__(self) -> None:
+        self.is_wanted = threading.Event()
+        self.patience = 0.0
+        self.on_wanted: Callable[[], object] = _nothing
+        self.unfinished = ''
+        self._is_listening = False
+
+    def listen(self) -> None:
+        """Take the two signals; from the main thread."""
+        if self._is_listening:
+            return
+        self._is_listening = True
+        heard, told = os.pipe()
+        os.set_blocking(told, False)
+        # written to by the handler in C, at once
+        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        for number in SIGNALS:
+            signal.signal(number, _nothing)
+        threading.Thread(target=self._watch, args=(heard,), name='signals', daemon=True).start()
+
+    def _watch(self, heard: int) -> None:
+        os.read(heard, 1)
+        begin = time.monotonic()
+        self.is_wanted.set()
+        self.on_wanted()
+        while (left := begin + self.patience - time.monotonic()) > 0.0:
+            # the patience may change meanwhile
+            time.sleep(min(left, 0.05))
+        if self.unfinished:
+            sys.stderr.write(f'piezo_ident: error: ended before {self.unfinished}\n')
+        self.leave(1 if self.unfinished else 0)
+
+    @staticmethod
+    def leave(code: int) -> None:
+        """
+        End the process without taking its interpreter down.
+
+        That takes long on a busy machine, and a signal that comes meanwhile kills the process.
+        """
+        for stream in (sys.stdout, sys.stderr):
+            # closed by whoever started the process, or full
+            try:
+                stream.flush()
+            except (AttributeError, OSError, ValueError):
+                pass
+        os._exit(code)
+
+
+def _nothing(*_: object) -> None:
+    """Do nothing."""
+
+
+#: there is one for a process, as there is one set of signal handlers
+ENDING = Ending()
