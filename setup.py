@@ -37,6 +37,7 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'PyYAML>=6,<7',
+        'click>=8.1,<9',
         'jinja2>=3.1,<4',
         'matplotlib>=3.6,<4',
         # for bags of a killed recorder; package.xml cannot name it, and it need not be there

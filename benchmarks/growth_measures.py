@@ -156,7 +156,9 @@ def predict_bag(size: float, folder: Path) -> Measure:
     """Measure ``piezo_ident predict MODEL BAG --out OUT.npz``."""
     model = folder / 'paper.yaml'
     paper().save(model)
-    return _command(size, folder, lambda bag, out: ['predict', str(model), bag, '--out', out])
+    return _command(
+        size, folder, lambda bag, out: ['predict', str(model), bag, '--overwrite', '--out', out]
+    )
 
 
 def _command(size: float, folder: Path, arguments: Callable[[str, str], list[str]]) -> Measure:

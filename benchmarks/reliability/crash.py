@@ -114,7 +114,12 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
         Job('report', 'report', _report, ('numbers.json', 'loops.png', 'report.html')),
         *(command('convert', f'--overwrite SAMPLES OUT/{x}', x) for x in FORMATS),
         command('simulate', '--overwrite --program PROGRAM OUT/r.npz', 'r.npz'),
-        command('predict', 'STAGE SAMPLES --out OUT/p.csv --plot OUT/p.png', 'p.csv', 'p.png'),
+        command(
+            'predict',
+            'STAGE SAMPLES --overwrite --out OUT/p.csv --plot OUT/p.png',
+            'p.csv',
+            'p.png',
+        ),
     ]
     if slow:
         for name, wanted in (('identification', 'learn.npz'), ('validation', 'check.npz')):
@@ -122,10 +127,11 @@ def jobs(inputs: Path, *, slow: bool) -> list[Job]:
                 ['simulate', '--program', name, str(inputs / wanted), '--overwrite']
             )
         works += [
-            command('identify', 'IN/learn.npz --model OUT/model.yaml --report OUT/report',
+            command('identify', 'IN/learn.npz --overwrite --model OUT/model.yaml '
+                    '--report OUT/report',
                     'model.yaml', 'report/report.html', 'report/identification.json'),
             command('diagnose', 'STAGE IN/check.npz --only creep --model OUT/refined.yaml '
-                    '--report OUT/report',
+                    '--overwrite --report OUT/report',
                     'refined.yaml', 'report/report.html', 'report/diagnosis.json'),
         ]  # fmt: skip
     return works

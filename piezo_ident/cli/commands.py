@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
@@ -24,7 +24,7 @@ from piezo_ident.record import io as record_io
 __all__ = ['run']
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: SimpleNamespace) -> None:
     """
     Do what the arguments ask for.
 
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> None:
     COMMANDS[args.verb](args, Console(args.json))
 
 
-def simulate_command(args: argparse.Namespace, console: Console) -> None:
+def simulate_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident simulate``."""
     out: Path = args.out
     _check_record_output(args)
@@ -77,7 +77,7 @@ def simulate_command(args: argparse.Namespace, console: Console) -> None:
     )
 
 
-def convert_command(args: argparse.Namespace, console: Console) -> None:
+def convert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_apart(args.out, args.record)
     _check_record_output(args)
@@ -93,19 +93,19 @@ def convert_command(args: argparse.Namespace, console: Console) -> None:
     console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
-def diagnose_command(args: argparse.Namespace, console: Console) -> None:
+def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident diagnose``."""
     from piezo_ident.cli.diagnose_command import diagnose_command as command
 
     command(args, console)
 
 
-def _check_record_output(args: argparse.Namespace) -> None:
+def _check_record_output(args: SimpleNamespace) -> None:
     check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
     check_file(args.out, overwrite=args.overwrite, folder_too=True)
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace, Console], None]] = {
+COMMANDS: Mapping[str, Callable[[SimpleNamespace, Console], None]] = {
     'convert': convert_command,
     'diagnose': diagnose_command,
     'effects': effects_command,

@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict, fields
+from dataclasses import asdict
+from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
 from piezo_ident.cli.model_commands import check_order, checked, keep, print_files, read_both
-from piezo_ident.cli.records import naming
+from piezo_ident.cli.records import given, naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -28,7 +28,7 @@ from piezo_ident.report import (
 __all__ = ['diagnose_command']
 
 
-def diagnose_command(args: argparse.Namespace, console: Console) -> None:
+def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident diagnose``."""
     check_each(args)
     settings = _settings(args)
@@ -66,10 +66,9 @@ def diagnose_command(args: argparse.Namespace, console: Console) -> None:
     )
 
 
-def _settings(args: argparse.Namespace) -> DiagnosisSettings:
+def _settings(args: SimpleNamespace) -> DiagnosisSettings:
     only, without = effect_names(args.only), effect_names(args.without)
     if not set(only or catalogue()) - set(without):
         raise ConfigError('--only and --without leave no candidate; name one that is not in both')
-    named = {**vars(args), 'effects': only or None, 'without': without}
-    names = {f.name for f in fields(DiagnosisSettings)}
-    return DiagnosisSettings(**{k: x for k, x in named.items() if k in names})
+    named = {**given(args, DiagnosisSettings), 'effects': only or None, 'without': without}
+    return DiagnosisSettings(**named)

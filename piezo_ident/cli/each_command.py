@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 import statistics
+from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.records import check_bag_options, expand, options_of
@@ -38,26 +38,26 @@ SPREAD = {
 }
 
 
-def check_each(args: argparse.Namespace) -> None:
+def check_each(args: SimpleNamespace) -> None:
     """Refuse options that go only with --each, or not with it."""
     if args.each is None:
         for option in ('jobs', 'scheduler', 'reports'):
             if getattr(args, option):
                 raise ConfigError(f'--{option} goes with --each DIR; add it, or leave this out')
         return
-    for option in ('model', 'report', 'validation'):
+    for option in ('model', 'report', 'validation', 'overwrite'):
         if getattr(args, option):
             raise ConfigError(f'--{option} does not go with --each')
     if args.jobs == 0:
         raise ConfigError('--jobs 0: give at least 1')
 
 
-def identify_each(args: argparse.Namespace, settings: Settings, console: Console) -> None:
+def identify_each(args: SimpleNamespace, settings: Settings, console: Console) -> None:
     """Run ``piezo_ident identify RECORD... --each DIR``."""
     _each(args, Identify(settings, options_of(args)), console)
 
 
-def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console: Console) -> None:
+def diagnose_each(args: SimpleNamespace, settings: DiagnosisSettings, console: Console) -> None:
     """Run ``piezo_ident diagnose MODEL RECORD... --each DIR``."""
     if not args.model_file.is_dir():
         # a bad model is one error, not one a record
@@ -65,7 +65,7 @@ def diagnose_each(args: argparse.Namespace, settings: DiagnosisSettings, console
     _each(args, Diagnose(args.model_file.absolute(), settings, options_of(args)), console)
 
 
-def _each(args: argparse.Namespace, task: Task, console: Console) -> None:
+def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
     paths = expand(args.records, console)
     check_bag_options(paths, args)
     folder: Path = args.each

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 import difflib
 import inspect
 import textwrap
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ def effect_names(texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(effect_name(name) for name in names if name))
 
 
-def effects_command(args: argparse.Namespace, console: Console) -> None:
+def effects_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident effects``."""
     if args.name is not None:
         effect = catalogue()[effect_name(args.name)]

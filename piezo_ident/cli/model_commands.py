@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, ch
 from piezo_ident.cli.records import (
     data_of,
     expand_apart,
+    given,
     naming,
     print_faults,
     read_all,
     RECORD_FILES,
 )
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.identify import identify
@@ -52,11 +53,10 @@ TABLE_FILES = ('.csv', '.npz')
 PICTURES = ('.png', '.pdf', '.svg')
 
 
-def identify_command(args: argparse.Namespace, console: Console) -> None:
+def identify_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident identify``."""
     check_each(args)
-    named = vars(args)
-    settings = Settings(**{f.name: named[f.name] for f in fields(Settings) if f.name in named})
+    settings = Settings(**given(args, Settings))
     if args.each is not None:
         identify_each(args, settings, console)
         return
@@ -84,7 +84,7 @@ def identify_command(args: argparse.Namespace, console: Console) -> None:
 
 
 def checked(
-    args: argparse.Namespace, kind: type, console: Console, *others: Path
+    args: SimpleNamespace, kind: type, console: Console, *others: Path
 ) -> tuple[list[Path], list[Path]]:
     """Return the records for the work and for validation; refuse outputs before the work."""
     from piezo_ident.report import check_report_folder
@@ -95,10 +95,10 @@ def checked(
         check_folder(args.report)
     if args.model is not None:
         check_suffix(args.model, MODEL_FILES, 'a model')
-        # a report makes its folder first
-        if args.model.parent != args.report:
-            check_file(args.model, overwrite=True)
         check_distinct(args.model, inputs)
+        # a report makes its folder first
+        if args.model.parent != args.report or args.report.is_dir():
+            check_file(args.model, overwrite=args.overwrite)
     if args.report is not None:
         other = 'diagnosis' if kind is Identification else 'identification'
         if (args.report / f'{other}.json').exists():
@@ -106,18 +106,22 @@ def checked(
         for name in ('model.yaml', 'diagnosis.json', 'report.html'):
             check_distinct(args.report / name, inputs)
         check_report_folder(args.report, kind)
+        if (args.report / 'report.html').exists() and not args.overwrite:
+            raise DataError(
+                f'{args.report}: holds a report already; choose another folder or add --overwrite'
+            )
     return paths, further
 
 
 def read_both(
-    paths: Sequence[Path], further: Sequence[Path], args: argparse.Namespace
+    paths: Sequence[Path], further: Sequence[Path], args: SimpleNamespace
 ) -> tuple[list[Record], list[Record]]:
     """Read records and those for validation as the records of one call."""
     everything = read_all([*paths, *further], args)
     return everything[: len(paths)], everything[len(paths) :]
 
 
-def keep(result: Identification | Diagnosis, args: argparse.Namespace) -> None:
+def keep(result: Identification | Diagnosis, args: SimpleNamespace) -> None:
     """Write report and model where the arguments say."""
     from piezo_ident.report import write_report
 
@@ -128,7 +132,7 @@ def keep(result: Identification | Diagnosis, args: argparse.Namespace) -> None:
             result.model.save(args.model)
 
 
-def print_files(args: argparse.Namespace, console: Console, note: str = '') -> dict[str, Any]:
+def print_files(args: SimpleNamespace, console: Console, note: str = '') -> dict[str, Any]:
     """Print where model and report are, and return that for programs."""
     page = None if args.report is None else str(args.report / 'report.html')
     console.say()
@@ -141,7 +145,7 @@ def print_files(args: argparse.Namespace, console: Console, note: str = '') -> d
     return {'model': None if args.model is None else str(args.model), 'report': page}
 
 
-def predict_command(args: argparse.Namespace, console: Console) -> None:
+def predict_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident predict``."""
     for path, suffixes, what in (
         (args.out, TABLE_FILES, 'a prediction'),
@@ -149,8 +153,8 @@ def predict_command(args: argparse.Namespace, console: Console) -> None:
     ):
         if path is not None:
             check_suffix(path, suffixes, what)
-            check_file(path, overwrite=True)
             check_distinct(path, [args.model, args.record])
+            check_file(path, overwrite=args.overwrite)
     check_order(args.model, args.record, 'predict')
     model = load(args.model)
     (record,) = read_all([args.record], args, voltage_alone=True)

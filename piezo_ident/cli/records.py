@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from piezo_ident.cli.console import Console
@@ -27,6 +27,7 @@ __all__ = [
     'data_of',
     'expand',
     'expand_apart',
+    'given',
     'naming',
     'options_of',
     'print_faults',
@@ -98,7 +99,7 @@ def expand_apart(
     return paths, further
 
 
-def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
+def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
     """Refuse options that choose topics where no record is a bag."""
     tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
@@ -108,22 +109,18 @@ def check_bag_options(paths: Sequence[Path], args: argparse.Namespace) -> None:
             )
 
 
-def options_of(args: argparse.Namespace) -> ReadOptions:
+def given(args: SimpleNamespace, kind: type) -> dict[str, Any]:
+    """Return the options that are fields of settings; those that are absent keep the defaults."""
+    named = {f.name: getattr(args, f.name, None) for f in fields(kind)}
+    return {name: x for name, x in named.items() if x is not None}
+
+
+def options_of(args: SimpleNamespace) -> ReadOptions:
     """Return how the arguments have records read."""
-    limits = args.voltage_limits
-    if limits is not None and not limits[0] < limits[1]:
-        low, high = limits
-        raise ConfigError(f'--voltage-limits {low:g} {high:g}: give the lower one first')
-    return ReadOptions(
-        displacement_unit=args.displacement_unit,
-        voltage_limits=limits and tuple(limits),
-        namespace=args.namespace,
-        voltage_topic=args.voltage_topic,
-        displacement_topic=args.displacement_topic,
-    )
+    return ReadOptions(**given(args, ReadOptions))
 
 
-def read_all(paths: Sequence[Path], args: argparse.Namespace, **further: Any) -> list[Record]:
+def read_all(paths: Sequence[Path], args: SimpleNamespace, **further: Any) -> list[Record]:
     """Read the records of one call; files of one name keep their folders in their names."""
     check_bag_options(paths, args)
     options = replace(options_of(args), **further)

@@ -178,7 +178,7 @@ def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
     (folder / 'notes.txt').write_text('not a record')
     model, report = tmp_path / 'm.yaml', tmp_path / 'deep' / 'report'
     model.write_text('an older one')
-    argv = ['identify', folder, '--model', model, '--report', report, *FAST]
+    argv = ['identify', folder, '--model', model, '--report', report, '--overwrite', *FAST]
     data = json.loads(succeed(capsys, *argv, '--validation', made / 'sine.csv', '--json'))
     assert data['files'] == {'model': str(model), 'report': str(report / 'report.html')}
     assert load(model).delay.samples == 2

@@ -131,7 +131,7 @@ def test_a_model_that_lacks_nothing_stays_as_it_is(capsys, made, quick):
     argv = ['diagnose', made / 'model.yaml', made / 'val.npz', '--model', made / 'same.yaml']
     text = succeed(capsys, *argv)
     assert f'model: {made / "same.yaml"} (the same as {made / "model.yaml"}' in text
-    data = json.loads(succeed(capsys, *argv, '--json'))
+    data = json.loads(succeed(capsys, *argv, '--overwrite', '--json'))
     assert data['model_changes'] == []
 
 

@@ -1,0 +1,183 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The options of all verbs, each in one list; nothing heavy is imported here.
+
+A new way to read records is one line of `READING`, under the name of a field of `ReadOptions`:
+every verb that reads records then has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+from piezo_ident.common.config import shipped_names
+
+UNITS = ('m', 'mm', 'um', 'nm')
+
+
+def _name(text: str) -> str:
+    # an empty shell variable; as a path it would be the working folder
+    if not text.strip():
+        raise click.BadParameter(f'{text!r} is empty; give a name, or leave it out')
+    if text.startswith('--'):
+        raise click.BadParameter(f'{text!r} is an option; a name is missing before it')
+    return text
+
+
+def _file(text: str) -> Path:
+    return Path(_name(text))
+
+
+def _unit(text: str) -> str:
+    # both characters that look like a micro
+    unit = text.replace('\u00b5', 'u').replace('\u03bc', 'u')
+    if unit not in UNITS:
+        raise click.BadParameter(f'{text!r} is no unit; give {", ".join(UNITS)}')
+    return unit
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise click.BadParameter(f'{text!r} is no whole number; give 0 or more')
+    return int(text)
+
+
+def _order(text: str) -> tuple[int, ...]:
+    parts = text.split(',')
+    if len(parts) != 2:
+        raise click.BadParameter(f'{text!r} is no order; give two numbers, say 10,10')
+    return tuple(map(_whole, parts))
+
+
+def _thresholds(text: str) -> int | None:
+    return None if text == 'auto' else _whole(text)
+
+
+def _limits(ctx: Any, param: Any, limits: tuple[float, float] | None) -> Any:
+    if limits is not None and not limits[0] < limits[1]:
+        raise click.BadParameter('give the lower one first')
+    return limits
+
+
+def _among(known: Callable[[], Iterable[str]]) -> dict[str, Any]:
+    """Return what completes a name: from those that there are, or else from files."""
+
+    def complete(ctx: Any, param: Any, start: str) -> list[CompletionItem]:
+        names = [CompletionItem(x) for x in known() if x.startswith(start)]
+        return names or [CompletionItem(start, type='file')]
+
+    return {'shell_complete': complete}
+
+
+def _effects() -> Iterable[str]:
+    from piezo_ident.effects import catalogue
+
+    return catalogue()
+
+
+def _option(name: str, kind: Any, metavar: str | None, text: str, **more: Any) -> click.Option:
+    # absent is None, so that defaults have one place
+    more = {**(_among(tuple) if kind is _file else {}), **more}
+    return click.Option([name], type=kind, metavar=metavar, help=text, **more)
+
+
+def _flag(name: str, text: str) -> click.Option:
+    return click.Option([name], is_flag=True, help=text)
+
+
+def _argument(name: str, metavar: str, **more: Any) -> click.Argument:
+    return click.Argument([name], metavar=metavar, **{'type': _file, **_among(tuple), **more})
+
+
+JSON = _flag('--json', 'Print the result as JSON, also an error.')
+OVERWRITE = _flag('--overwrite', 'Replace outputs that exist.')
+
+MODEL, MODEL_FILE = _argument('model', 'MODEL'), _argument('model_file', 'MODEL')
+IN, OUT = _argument('record', 'IN'), _argument('out', 'OUT')
+RECORD, RECORDS = (
+    _argument('record', 'RECORD'),
+    _argument('records', 'RECORD...', nargs=-1, required=True),
+)
+EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effects))
+
+#: how records are read: fields of `ReadOptions`, whose defaults hold where an option is absent
+READING = [
+    _option('--displacement-unit', _unit, 'm|mm|um|nm', 'Of y in the files (default: m).'),
+    _option('--voltage-limits', float, 'LO HI', 'Refuse others [V].', nargs=2, callback=_limits),
+    _option('--namespace', _name, 'NAME', 'Of the topics of a bag.'),
+    _option('--voltage-topic', _name, 'TOPIC', 'Topic of a bag with the voltage.'),
+    _option('--displacement-topic', _name, 'TOPIC', 'Topic of a bag with the displacement.'),
+]
+
+EACH = [
+    _option('--each', _file, 'DIR', 'Take every record on its own; what is done there is kept.'),
+    _option('--jobs', _whole, 'N', 'Processes (default: one a core).'),
+    _option('--scheduler', _name, 'ADDRESS', 'Dask scheduler whose workers do it.'),
+    _flag('--reports', 'Write a report of every record too.'),
+]
+
+RESULTS = [
+    _option('--model', _file, 'YAML', 'Write the model there.'),
+    _option('--report', _file, 'DIR', 'Write page and pictures there.'),
+    _option('--validation', _file, 'RECORD...', 'Predict these; do not fit them.', multiple=True),
+    OVERWRITE,
+]
+
+OUTPUT = [
+    OVERWRITE,
+    _option('--storage', click.Choice(['mcap', 'sqlite3']), None, 'Of a bag (default: mcap).'),
+]
+
+PREDICT = [
+    _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
+    _option('--plot', _file, 'PICTURE', 'Picture of measured and predicted.'),
+    OVERWRITE,
+]
+
+
+def _shipped(kind: str, default: str) -> dict[str, Any]:
+    return {'default': default, **_among(lambda: shipped_names(kind))}
+
+
+SIMULATE = [
+    _option(
+        *('--config', _name, 'STAGE', 'Stage: a file, or the name of one (default: stage_paper).'),
+        **_shipped('stage_', 'stage_paper'),
+    ),
+    _option(
+        *('--program', _name, 'FILE', 'Program, or the name of one (default: identification).'),
+        **_shipped('program_', 'identification'),
+    ),
+    _option('--seed', _whole, 'N', "Of the sensor noise (default: the stage's own)."),
+    _option('--sample-rate', float, 'HZ', "Sampling rate (default: the stage's own)."),
+]
+
+#: fields of `Settings`
+IDENTIFY = [
+    _option(
+        '--thresholds', _thresholds, 'N|auto', 'Number of plays (default: by held-out error).'
+    ),
+    _option('--order', _order, 'NA,NB', 'Of G (default: searched).'),
+    _option('--max-order', _whole, 'N', 'Of the search (default: 15).'),
+    _option('--delay', _whole, 'SAMPLES', 'Delay (default: identified).'),
+    _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is not fitted.'),
+    _option('--solver', click.Choice(['least_squares', 'swarm']), None, 'Of the weights.'),
+    _flag('--polish', 'Let least squares finish what the swarm found.'),
+    _option('--seed', _whole, 'N', 'Of the swarm (default: 0).'),
+]
+
+#: fields of `DiagnosisSettings`, and names of effects
+_SEVERAL = {'multiple': True, **_among(_effects)}
+DIAGNOSE = [
+    _option('--only', _name, 'NAME', 'Try this effect and no other; several times.', **_SEVERAL),
+    _option('--without', _name, 'NAME', 'Do not try this effect; several times.', **_SEVERAL),
+    _option('--most-effects', _whole, 'N', 'Effects that are added (default: 4).'),
+    _option('--most-samples', _whole, 'N', 'Searched, of the beginnings of the records.'),
+    _option('--seed', _whole, 'N', 'Of what is drawn (default: 0).'),
+]
