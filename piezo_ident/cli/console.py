@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
+import logging
 import math
 import shutil
 import signal
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from piezo_ident.identification.results import Progress
-from piezo_ident.model.files import plain
+if TYPE_CHECKING:
+    from piezo_ident.identification.results import Progress
+
 
 __all__ = ['Console', 'deferred_interrupts']
 
@@ -75,8 +77,21 @@ class Console:
     def result(self, data: Any) -> None:
         """Write the result for programs; nothing as text."""
         if self.as_json:
+            from piezo_ident.model.files import plain
+
             text = json.dumps(_finite(plain(data)), indent=2, ensure_ascii=False, allow_nan=False)
             sys.stdout.write(f'{text}\n')
+
+    @contextmanager
+    def notices(self) -> Iterator[None]:
+        """Show what the package logs, such as that it compiles: on a terminal only."""
+        log = logging.getLogger('piezo_ident')
+        handler = _Lines() if sys.stderr.isatty() else logging.NullHandler()
+        log.addHandler(handler)
+        try:
+            yield
+        finally:
+            log.removeHandler(handler)
 
     @contextmanager
     def progress(self) -> Iterator[Progress]:
@@ -111,6 +126,15 @@ class Console:
         finally:
             for bar in bars.values():
                 bar.close()
+
+
+class _Lines(logging.Handler):
+    """Lines on a terminal, above the bars that are there."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from tqdm import tqdm
+
+        tqdm.write(f'piezo_ident: {_harmless(record.getMessage())}', file=sys.stderr)
 
 
 def _harmless(text: str) -> str:

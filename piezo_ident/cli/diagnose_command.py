@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
-from piezo_ident.cli.model_commands import check_order, checked, keep, print_files, read_both
-from piezo_ident.cli.records import given, naming
+from piezo_ident.cli.identify_command import checked, keep, print_files, read_both
+from piezo_ident.cli.records import check_order, given, naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import difflib
+import importlib
 import json
 import os
 import signal
@@ -23,6 +24,7 @@ import click
 from click.shell_completion import get_completion_class
 from piezo_ident import __version__
 from piezo_ident.cli import options
+from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import PiezoIdentError
 
 __all__ = ['cli', 'main']
@@ -231,9 +233,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             # machine makes identifications eight times slower
             for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
                 os.environ.setdefault(name, '1')
-        from piezo_ident.cli import commands
-
-        commands.run(given)
+        # a verb imports only what it needs
+        home = 'record' if given.verb in ('convert', 'simulate') else given.verb
+        module = importlib.import_module(f'piezo_ident.cli.{home}_command')
+        console = Console(given.json)
+        with console.notices():
+            getattr(module, f'{given.verb}_command')(given, console)
         sys.stdout.flush()
         if argv is None:
             # all is written; an interrupt of the interpreter's end would print a traceback

@@ -16,14 +16,15 @@ from typing import Any
 
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
-from piezo_ident.many.run import MARK
 from piezo_ident.record import io as record_io
 from piezo_ident.record.assemble import ReadOptions
 from piezo_ident.record.record import Record
 
 __all__ = [
+    'MODEL_FILES',
     'RECORD_FILES',
     'check_bag_options',
+    'check_order',
     'data_of',
     'expand',
     'expand_apart',
@@ -35,6 +36,7 @@ __all__ = [
 ]
 
 BAG_FILES = ('.mcap', '.db3')
+MODEL_FILES = ('.yaml', '.yml')
 RECORD_FILES = ('.csv', '.npz', '.mat', *BAG_FILES)
 
 
@@ -51,6 +53,8 @@ def naming(*names: str) -> Iterator[None]:
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:
     """Return the records that are named: a folder that is no bag stands for all in it."""
+    from piezo_ident.many.run import MARK
+
     records = []
     for path in paths:
         if not path.is_dir() or _is_record(path):
@@ -97,6 +101,15 @@ def expand_apart(
         if os.path.realpath(path) in fitted:
             raise DataError(f'{path}: is among the records too; it is no validation')
     return paths, further
+
+
+def check_order(model: Path, record: Path, verb: str) -> None:
+    """Refuse a model and a record in the wrong order."""
+    order = f'MODEL comes first: piezo_ident {verb} model.yaml record.csv'
+    if model.suffix.lower() in RECORD_FILES or model.is_dir():
+        raise ConfigError(f'{model}: is a record, no model file; {order}')
+    if record.suffix.lower() in MODEL_FILES:
+        raise ConfigError(f'{record}: is no record; {order}')
 
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:

@@ -4,16 +4,20 @@
 """
 How a numerical loop becomes a compiled kernel: cached on disk, without the interpreter lock.
 
-Where neither the installation nor the home of the user can be written, nothing is cached, and each
-process compiles its kernels anew.
+Compiled kernels are kept in the folder ``NUMBA_CACHE_DIR`` where that is set, else in
+``__pycache__`` beside their files, else, where the installation cannot be written, in the cache of
+the user (``~/.cache/numba``).  Where none of them can be written, each process compiles its
+kernels anew.  A process that compiles says so on the log ``piezo_ident``, once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import logging
 from typing import Any, cast, TypeVar
 
 from numba import njit
+from numba.core import event
 
 __all__ = ['STILL', 'alive', 'kernel', 'ordered_kernel']
 
@@ -45,9 +49,41 @@ def ordered_kernel(function: F) -> F:
 
 def _compiled(function: F, **options: Any) -> F:
     try:
-        return cast(F, njit(cache=True, nogil=True, **options)(function))
+        made = njit(cache=True, nogil=True, **options)(function)
     except RuntimeError:  # no folder for the cache
-        return cast(F, njit(nogil=True, **options)(function))
+        made = njit(nogil=True, **options)(function)
+    _NOTICE.kernels.append(made)
+    return cast(F, made)
+
+
+class _Notice(event.Listener):
+    """Says that a process compiles kernels, when the first of them is not in the cache."""
+
+    def __init__(self) -> None:
+        self.kernels: list[Any] = []
+        self._said = False
+
+    def on_start(self, event: Any) -> None:
+        first = event.data['dispatcher']
+        if self._said or not any(first is kernel for kernel in self.kernels):
+            return
+        self._said = True
+        folder = first.stats.cache_path
+        logging.getLogger('piezo_ident').warning(
+            'compiling the numerical loops that this work needs, %s first: 3 to 10 s on an idle '
+            'machine, a minute on a busy one; %s',
+            f'{first.__module__.removeprefix("piezo_ident.")}.{first.__name__}',
+            f'once, they are kept in {folder}'
+            if folder
+            else 'again in each process: no folder for them can be written, set NUMBA_CACHE_DIR',
+        )
+
+    def on_end(self, event: Any) -> None:
+        """Say nothing: the next line of the program tells."""
+
+
+_NOTICE = _Notice()
+event.register('numba:compile', _NOTICE)  # type: ignore[no-untyped-call]
 
 
 @ordered_kernel

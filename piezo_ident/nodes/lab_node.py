@@ -11,6 +11,7 @@ the signals are taken by `piezo_ident.nodes.ending`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import logging
 import os
 from pathlib import Path
 import sys
@@ -91,6 +92,7 @@ class LabNode(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
+        logging.getLogger('piezo_ident').addHandler(_ToRos(self))
         self._declared: dict[str, Declaration] = {}
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
@@ -262,6 +264,17 @@ class LabNode(Node):
 
     def close(self) -> None:
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
+
+
+class _ToRos(logging.Handler):
+    """Puts what the package logs, such as that it compiles, on the log of a node."""
+
+    def __init__(self, node: LabNode) -> None:
+        super().__init__()
+        self._log = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._log.info(record.getMessage())
 
 
 def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import contextlib
 from dataclasses import replace
 import json
+import logging
 import os
 import pty
 import signal
@@ -44,6 +45,32 @@ def test_heavy_libraries_wait_for_the_arguments():
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[1] == '[]'
+
+
+@pytest.mark.parametrize(
+    ('verb', 'spared'),
+    [
+        ('effects', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'rosbags', 'matplotlib')),
+        ('predict', ('scipy.signal', 'scipy.stats', 'matplotlib', 'jinja2')),
+        ('record', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'matplotlib')),
+    ],
+)
+def test_a_verb_imports_only_what_it_needs(verb, spared):
+    code = (
+        f'import sys, piezo_ident.cli.{verb}_command; '
+        f'print([m for m in {spared!r} if m in sys.modules])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'
+
+
+def test_notices_are_for_terminals(capsys, monkeypatch):
+    log = logging.getLogger('piezo_ident')
+    for is_terminal, said in ((False, ''), (True, 'piezo_ident: compiling\n')):
+        monkeypatch.setattr(sys.stderr, 'isatty', lambda known=is_terminal: known)
+        with Console().notices():
+            log.warning('compiling')
+        assert capsys.readouterr() == ('', said)
 
 
 def test_the_module_runs_as_a_program():

@@ -123,9 +123,9 @@ OUTPUTS = (
 def test_what_cannot_work(capsys, tmp_path, made, monkeypatch, case):
     if case in OUTPUTS:
         for work in (
-            'model_commands.identify',
-            'model_commands.free_run',
-            'commands.SimulatedStage',
+            'identify_command.identify',
+            'predict_command.free_run',
+            'record_command.SimulatedStage',
         ):
             monkeypatch.delattr(f'piezo_ident.cli.{work}')
     for name in ('empty', 'mine'):

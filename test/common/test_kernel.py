@@ -28,3 +28,25 @@ def test_a_read_only_installation_without_a_home_imports(tmp_path):
         text=True,
     )
     assert done.stdout.split() == ['0.0', '2.0'], done.stderr
+    # each process compiles again, and says how to change that
+    assert done.stderr.count('\n') == 1 and 'set NUMBA_CACHE_DIR' in done.stderr
+
+
+def test_what_compiles_says_so_once(tmp_path):
+    code = (
+        'import numpy as np; from piezo_ident.operators.kernels import held\n'
+        'from piezo_ident.common.kernel import alive; alive(1.0); held(1.0, 0.0, 2.0)'
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, '-c', code],
+            env={**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stderr
+        for _ in range(2)
+    ]
+    assert said[0].startswith('compiling ') and 'common.kernel.alive' in said[0]
+    assert str(tmp_path) in said[0] and said[0].count('\n') == 1
+    assert said[1] == ''

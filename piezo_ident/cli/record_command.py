@@ -1,18 +1,15 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``simulate`` and ``convert``, and where the other verbs are."""
+"""``simulate`` and ``convert``: the verbs that write records."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.effects_command import effects_command
-from piezo_ident.cli.model_commands import identify_command, predict_command
 from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
 from piezo_ident.cli.records import data_of, print_faults, read_all, RECORD_FILES
 from piezo_ident.common.config import find_config
@@ -21,19 +18,7 @@ from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record import io as record_io
 
-__all__ = ['run']
-
-
-def run(args: SimpleNamespace) -> None:
-    """
-    Do what the arguments ask for.
-
-    Raises
-    ------
-    PiezoIdentError
-        With a message that names the file and the cure.
-    """
-    COMMANDS[args.verb](args, Console(args.json))
+__all__ = ['convert_command', 'simulate_command']
 
 
 def simulate_command(args: SimpleNamespace, console: Console) -> None:
@@ -93,23 +78,6 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
     console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
-def diagnose_command(args: SimpleNamespace, console: Console) -> None:
-    """``piezo_ident diagnose``."""
-    from piezo_ident.cli.diagnose_command import diagnose_command as command
-
-    command(args, console)
-
-
 def _check_record_output(args: SimpleNamespace) -> None:
     check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
     check_file(args.out, overwrite=args.overwrite, folder_too=True)
-
-
-COMMANDS: Mapping[str, Callable[[SimpleNamespace, Console], None]] = {
-    'convert': convert_command,
-    'diagnose': diagnose_command,
-    'effects': effects_command,
-    'identify': identify_command,
-    'predict': predict_command,
-    'simulate': simulate_command,
-}

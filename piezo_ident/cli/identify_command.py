@@ -1,0 +1,125 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``identify``, and what it shares with ``diagnose``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from piezo_ident.cli.console import Console, deferred_interrupts
+from piezo_ident.cli.each_command import check_each, identify_each
+from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
+from piezo_ident.cli.predict_command import error_data, print_errors
+from piezo_ident.cli.records import expand_apart, given, MODEL_FILES, naming, read_all
+from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.sines import sine_errors
+from piezo_ident.record.record import Record
+
+__all__ = [
+    'checked',
+    'identify_command',
+    'keep',
+    'print_files',
+    'read_both',
+]
+
+
+def identify_command(args: SimpleNamespace, console: Console) -> None:
+    """``piezo_ident identify``."""
+    check_each(args)
+    settings = Settings(**given(args, Settings))
+    if args.each is not None:
+        identify_each(args, settings, console)
+        return
+    from piezo_ident import report
+
+    paths, further = checked(args, Identification, console)
+    records, validation = read_both(paths, further, args)
+    with naming(*(record.name for record in records)), console.progress() as progress:
+        result = identify(records, settings, validation=validation, progress=progress)
+    keep(result, args)
+    console.say(report.identification_text(result))
+    checks = []
+    for record in validation:
+        run = free_run(result.model, record)
+        sines = sine_errors(result.model, record) if record.find('sine') else ()
+        checks.append(
+            {**error_data(run), 'record': record.name, 'sines': list(map(asdict, sines))}
+        )
+        console.say(f'\n{record.name}, not fitted:')
+        print_errors(run, console)
+        if sines:
+            console.say(f'\n{report.table_one(sines)}')
+    files = print_files(args, console)
+    console.result({**report.to_json(result), 'validation': checks, 'files': files})
+
+
+def checked(
+    args: SimpleNamespace, kind: type, console: Console, *others: Path
+) -> tuple[list[Path], list[Path]]:
+    """Return the records for the work and for validation; refuse outputs before the work."""
+    from piezo_ident.report import check_report_folder
+
+    paths, further = expand_apart(args.records, args.validation, console)
+    inputs = [*others, *paths, *further]
+    if args.report is not None:
+        check_folder(args.report)
+    if args.model is not None:
+        check_suffix(args.model, MODEL_FILES, 'a model')
+        check_distinct(args.model, inputs)
+        # a report makes its folder first
+        if args.model.parent != args.report or args.report.is_dir():
+            check_file(args.model, overwrite=args.overwrite)
+    if args.report is not None:
+        other = 'diagnosis' if kind is Identification else 'identification'
+        if (args.report / f'{other}.json').exists():
+            raise ConfigError(f'{args.report}: holds the report of {other}; choose another folder')
+        for name in ('model.yaml', 'diagnosis.json', 'report.html'):
+            check_distinct(args.report / name, inputs)
+        check_report_folder(args.report, kind)
+        if (args.report / 'report.html').exists() and not args.overwrite:
+            raise DataError(
+                f'{args.report}: holds a report already; choose another folder or add --overwrite'
+            )
+    return paths, further
+
+
+def read_both(
+    paths: Sequence[Path], further: Sequence[Path], args: SimpleNamespace
+) -> tuple[list[Record], list[Record]]:
+    """Read records and those for validation as the records of one call."""
+    everything = read_all([*paths, *further], args)
+    return everything[: len(paths)], everything[len(paths) :]
+
+
+def keep(result: Identification | Diagnosis, args: SimpleNamespace) -> None:
+    """Write report and model where the arguments say."""
+    from piezo_ident.report import write_report
+
+    with deferred_interrupts() as check:
+        if args.report is not None:
+            write_report(result, args.report, progress=check)
+        if args.model is not None:
+            result.model.save(args.model)
+
+
+def print_files(args: SimpleNamespace, console: Console, note: str = '') -> dict[str, Any]:
+    """Print where model and report are, and return that for programs."""
+    page = None if args.report is None else str(args.report / 'report.html')
+    console.say()
+    if args.model is not None:
+        console.say(f'model: {args.model}{note}')
+    if page is not None:
+        console.say(f'report: {page}')
+    if args.model is None and page is None:
+        console.say('nothing was written; --model YAML keeps the model, --report DIR the report')
+    return {'model': None if args.model is None else str(args.model), 'report': page}
