@@ -1,5 +1,6 @@
 # make demo    a simulated stage on the running graph: demo_report/index.html
 # make test    the checks and the tests
+# make docs    the documentation site: build/site/index.html
 #
 # Each makes its own virtual environment from a bare Python: make PYTHON=python3.12 test
 
@@ -9,7 +10,7 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
-.PHONY: attack netns soak
+.PHONY: attack docs netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash study table-one clean distclean
 .DELETE_ON_ERROR:
@@ -40,6 +41,11 @@ test-graph: .venv/.test
 # the same tests on the versions that Jazzy stands on
 test-jazzy: .venv-jazzy/.test
 	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
+
+# a warning is an error; test/test_site.py builds it the same way
+docs: .venv-docs/.docs
+	.venv-docs/bin/sphinx-build -q -W --keep-going -b html docs build/site
+	@echo build/site/index.html
 
 # side by side with the peers, in an environment of their own: forty minutes to over an hour;
 # QUICK=1 for a short version, which goes to build/
@@ -104,11 +110,12 @@ colcon: .venv/.colcon
 .venv/.colcon: EXTRAS := [colcon,ros]
 .venv-jazzy/.test: EXTRAS := [test]
 .venv-bench/.bench: EXTRAS := [bench]
+.venv-docs/.docs: EXTRAS := [docs]
 .venv-jazzy/.test: CONSTRAINTS := -c constraints-jazzy.txt
 
 .venv-jazzy/.test: constraints-jazzy.txt
 
-.venv/.made .venv-jazzy/.made .venv-bench/.made:
+.venv/.made .venv-jazzy/.made .venv-bench/.made .venv-docs/.made:
 	$(PYTHON) -m venv --clear $(@D)
 	touch $@
 
@@ -124,10 +131,14 @@ colcon: .venv/.colcon
 	.venv-bench/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
 	touch $@
 
+.venv-docs/.docs: .venv-docs/.made $(DECLARED)
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
+	touch $@
+
 clean:
 	rm -rf build install log dist demo_report *.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name .venv\* -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv .venv-jazzy .venv-bench
+	rm -rf .venv .venv-jazzy .venv-bench .venv-docs

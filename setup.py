@@ -15,6 +15,15 @@ cluster = [
     'distributed>=2024.5',
 ]
 
+# the documentation site
+docs = [
+    'myst-parser>=3,<6',
+    'pydata-sphinx-theme>=0.15,<1',
+    'sphinx>=7.4,<10',
+    'sphinx-copybutton>=0.5,<1',
+    'sphinx-design>=0.6,<1',
+]
+
 lint = [
     'mypy>=2.4,<3',
     'ruff>=0.17,<0.18',
@@ -57,8 +66,10 @@ setup(
             'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
         ],
         'cluster': cluster,
+        'docs': docs,
         'test': [
             *cluster,
+            *docs,
             *lint,
             'hypothesis>=6,<7',
             'ipykernel>=6,<8',

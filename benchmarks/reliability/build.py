@@ -55,7 +55,7 @@ A file is opened by the reader of its library: the csv module, NumPy, SciPy, ros
 and PyYAML. What these refuse ends in one line that names the file. SciPy reads MATLAB files in a
 process of its own, since some damage ends it. No pickle is loaded from a file. YAML is read by the
 safe loader, up to 500,000 characters and as many values; samples may unpack to 8 GiB
-(`piezo_ident/common/files.py`). [SECURITY.md](../SECURITY.md) says what is not kept off.
+(`piezo_ident/common/files.py`). [SECURITY.md](SECURITY.md) says what is not kept off.
 
 An effect plug-in is code that somebody installed; it can do what any program can. One that cannot
 be imported is skipped with a warning.
@@ -85,7 +85,7 @@ when it dies: against SIGKILL and power failure only a watchdog in the amplifier
 ## Two hosts
 
 DDS finds its peers on other hosts by multicast. Where that is kept to the local machine
-(`ROS_AUTOMATIC_DISCOVERY_RANGE`, see [SECURITY.md](../SECURITY.md)), both hosts need
+(`ROS_AUTOMATIC_DISCOVERY_RANGE`, see [SECURITY.md](SECURITY.md)), both hosts need
 
     export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
     export ROS_DOMAIN_ID=...                      # the same on both, and of no other graph

@@ -1,0 +1,34 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The documentation site builds without a warning, and holds every public name."""
+
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import piezo_ident as pi
+import pytest
+
+pytest.importorskip('sphinx')
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    done = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', DOCS, tmp_path / 'site'],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    # what a browser would ask other machines for as it opens a page
+    page = (tmp_path / 'site' / 'index.html').read_text(encoding='utf-8')
+    assert not re.findall(r'(?:src|<link[^>]* href)="(?:https?:)?//[^"]*', page)
+
+
+def test_the_reference_holds_every_public_name():
+    page = (DOCS / 'api.md').read_text(encoding='utf-8')
+    named = re.findall(r'^\.\. auto\w+:: piezo_ident\.(\w+)$', page, re.MULTILINE)
+    assert sorted(named) == sorted(set(pi.__all__) - {'__version__'})
