@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         ModelError,
         PiezoIdentError,
     )
+    from piezo_ident.control.inverse import Inverse, invert
     from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
@@ -57,6 +58,7 @@ _HOMES = {
     'GuardSettings': 'live.guard',
     'Identification': 'identification.results',
     'IdentificationError': 'common.errors',
+    'Inverse': 'control.inverse',
     'ModelError': 'common.errors',
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
@@ -68,6 +70,7 @@ _HOMES = {
     'effects': 'effects',
     'free_run': 'model.free_run',
     'identify': 'identification.identify',
+    'invert': 'control.inverse',
     'load': 'model.files',
     'read': 'record.io',
     'report': 'report',
@@ -86,6 +89,7 @@ __all__ = [
     'GuardSettings',
     'Identification',
     'IdentificationError',
+    'Inverse',
     'ModelError',
     'PiezoIdentError',
     'Program',
@@ -98,6 +102,7 @@ __all__ = [
     'effects',
     'free_run',
     'identify',
+    'invert',
     'load',
     'read',
     'report',

@@ -35,6 +35,7 @@ ROOMS = (
     'identification',
     'diagnosis',
     'control',
+    'control',
     'live',
     'report',
     'many',

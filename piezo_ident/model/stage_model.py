@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 import os
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,9 @@ from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record.record import Piece, Record
+
+if TYPE_CHECKING:
+    from piezo_ident import Inverse
 
 __all__ = ['EffectSetting', 'Scaling', 'StageModel']
 
@@ -289,6 +292,25 @@ class StageModel:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
         return self.stream(start).follow(piece)
+
+    def inverse(self, wanted: ArrayLike, **options: Any) -> Inverse:
+        """
+        Return the voltage under which the model moves as wanted; see `piezo_ident.invert`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import piezo_ident as pi
+        >>> model = pi.SimulatedStage.load('paper').model
+        >>> wanted = 20e-6 * (1.5 - np.cos(np.arange(2000) / 100))
+        >>> drive = model.inverse(wanted)
+        >>> y = model.simulate(drive.v)[drive.lead :]
+        >>> bool(np.abs(y - wanted).max() < 1e-7)
+        True
+        """
+        from piezo_ident import invert
+
+        return invert(self, wanted, **options)
 
     def stream(self, memory: ArrayLike | None = None) -> Stream:
         """

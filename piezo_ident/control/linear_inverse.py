@@ -1,0 +1,118 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The inverse of G and the delay, as a filter that looks ahead.
+
+    Q(f) = conj(G) / (|G|^2 + (epsilon G(0))^2)
+
+G has zeros outside the unit circle, where a causal inverse grows without end, and a delay, which
+none makes up for; a filter that knows the wanted motion some time ahead has neither limit.  Where
+the stage hardly moves, above its modes, epsilon keeps the voltage small.  It is the stable
+inversion of S. Devasia, D. Chen and B. Paden, "Nonlinear inversion-based output tracking", IEEE
+Trans. Automatic Control 41(7), 1996, doi:10.1109/9.508898, for a linear system, with the weight on
+the voltage of S. Devasia, "Should model-based inverse inputs be used as feedforward under plant
+uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.804478.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
+from piezo_ident.effects import find_effect
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.chain import Block
+from scipy.signal import oaconvolve
+
+__all__ = ['LinearInverse', 'linear_inverse']
+
+Array = NDArray[np.float64]
+
+#: gain of G, as a share of the static one, below which it is not made up for
+EPSILON = 3e-2
+#: what may lie outside of the filter, as a share of the sum of its magnitudes
+OUTSIDE = 1e-9
+#: lengths of the filter that are tried [samples]
+SHORTEST, LONGEST = 1 << 11, 1 << 19
+
+
+@dataclass(frozen=True, eq=False)
+class LinearInverse:
+    """
+    The filter.
+
+    Attributes
+    ----------
+    taps : ndarray, shape (ahead + 1 + behind,)
+        The earliest first.
+    ahead, behind : int
+        Samples after and before the present one that it needs.
+    """
+
+    taps: Array
+    ahead: int
+    behind: int
+
+    def __call__(self, x: Array) -> Array:
+        """Return the filtered signal; beyond its ends it rests.  Shape (n,)."""
+        padded = np.pad(x, (self.behind, self.ahead), mode='edge')
+        return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
+
+
+def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse:
+    """
+    Return the inverse of all that is linear and fast in a model: G, the delay, and their changes.
+
+    Its static gain is exact.
+
+    Raises
+    ------
+    ModelError
+        When G has no static gain, or rings for longer than `LONGEST` samples.
+    """
+    gain = model.dynamics.gain
+    if gain == 0.0 or not np.isfinite(gain):
+        raise ModelError('a model without a static gain has no inverse')
+    n = SHORTEST
+    while n <= LONGEST:
+        G = _response(model, n)
+        Q = np.conj(G) / (np.abs(G) ** 2 + (epsilon * np.abs(G[0])) ** 2)
+        taps = np.roll(np.fft.irfft(Q, n), n // 2)
+        size = np.abs(taps)
+        total = float(size.sum())
+        before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
+        # half of it stays empty, so that nothing has come round
+        if before[n // 4] + after[-(n // 4)] < OUTSIDE * total:
+            first = int(np.searchsorted(before, 0.5 * OUTSIDE * total))
+            last = n - int(np.searchsorted(after[::-1], 0.5 * OUTSIDE * total))
+            first, last = min(first, n // 2), max(last, n // 2 + 1)
+            cut = taps[first:last]
+            # the static gain of the whole model without effects; what they change is small
+            return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - first, last - 1 - n // 2)
+        n *= 2
+    raise ModelError(
+        f'the inverse of G rings for more than {LONGEST} samples; identify again with a lower '
+        'order'
+    )
+
+
+def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
+    """Return G with its delay, and with effects that filter it, at n // 2 + 1 frequencies."""
+    z = np.exp(-2j * np.pi * np.fft.rfftfreq(n))
+    delay = model.total_delay
+    G = model.dynamics.response(np.fft.rfftfreq(n), 1.0) * z**delay.samples
+    G = G * ((1.0 - delay.fraction) + delay.fraction * z)
+    impulse = np.zeros(n)
+    impulse[0] = 1.0
+    t = np.arange(n) / model.sample_rate
+    for setting in model.effects:
+        effect = find_effect(setting.name)
+        if not effect.in_dynamics or effect.in_delay_line or effect.change == 'passed':
+            continue
+        operator = effect(model.sample_rate, setting.parameters)
+        operator.reset(0.0, 0.0)
+        G = G * np.fft.rfft(operator.process(Block(t=t, v=impulse, x=impulse)).x)
+    return np.asarray(G, dtype=np.complex128)

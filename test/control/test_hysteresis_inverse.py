@@ -1,0 +1,81 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The inverse of H: for every law, however a stream is cut, within its limits."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import PAPER
+from piezo_ident.common.errors import ModelError
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.operators.hysteresis import Hysteresis
+import pytest
+
+
+def random_hysteresis(rng, law):
+    """Return an H of a law that rises everywhere."""
+    m = int(rng.integers(1, 40))
+    r = np.sort(rng.uniform(0.005, 0.99, m))
+    q = rng.uniform(0.0, 1.0, m) * rng.uniform(0.0, 1.0) / m
+    wide = {'p0': rng.uniform(-0.1, 0.1), 'curves': rng.uniform(0.0, 0.2, (m, 3)) / m}
+    wide['bias'] = rng.uniform(0.0, 0.2, m) / m
+    lags = {'relaxations': np.column_stack([2.0 ** np.arange(1, 4), rng.uniform(0, 0.03, (3, 3))])}
+    more = {'plays': {}, 'wide': wide, 'lags': lags}[law]
+    return Hysteresis(r, q, rng.uniform(-0.1, 0.2), 1.0, **more)
+
+
+def random_path(rng, n):
+    """Return a path that turns at random places, with jumps and rests, within 0 .. 1."""
+    ends = rng.uniform(0.0, 1.0, n // 20)
+    steps = rng.integers(1, 40, ends.size - 1)
+    ways = [np.linspace(a, b, k) for a, b, k in zip(ends, ends[1:], steps, strict=False)]
+    return np.concatenate(ways)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), law=st.sampled_from(['plays', 'wide', 'lags']))
+def test_h_of_its_inverse_is_the_identity(seed, law):
+    rng = np.random.default_rng(seed)
+    h, u = random_hysteresis(rng, law), random_path(rng, 600)
+    w = h(u)
+    inverse = HysteresisInverse(h)
+    assert inverse.reset(u[0]) == w[0]
+    found, reached = inverse.process(w)
+    assert_allclose(h(found), w, atol=1e-11)
+    assert_allclose(reached, w, atol=1e-11)
+    # where H rises, the voltage is the only one
+    assert_allclose(found, u, atol=1e-9)
+    cut = int(rng.integers(1, u.size))
+    inverse.reset(u[0])
+    parts = [inverse.process(part)[0] for part in (w[:cut], w[cut:])]
+    assert_array_equal(np.concatenate(parts), found)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_limits_of_voltage_and_speed_are_kept_and_the_goal_is_met_again(seed):
+    rng = np.random.default_rng(seed)
+    h = random_hysteresis(rng, 'plays')
+    w = h(np.concatenate([[0.4], random_path(rng, 400), np.full(40, 0.5)]))
+    inverse = HysteresisInverse(h, (0.2, 0.8), 0.05)
+    inverse.reset(0.4)
+    u, reached = inverse.process(w)
+    assert u.min() >= 0.2 and u.max() <= 0.8
+    assert np.abs(np.diff(np.append(0.4, u))).max() <= 0.05 + 1e-15
+    assert_allclose(h(np.append(0.4, u))[1:], reached, atol=1e-11)
+    free = (u > 0.2) & (u < 0.8) & (np.abs(np.diff(np.append(0.4, u))) < 0.05 - 1e-12)
+    assert_allclose(reached[free], w[free], atol=1e-11)
+
+
+def test_an_h_that_falls_is_refused():
+    with pytest.raises(ModelError, match=r'no inverse: its slope falls to -0\.4'):
+        HysteresisInverse(Hysteresis([0.1], [0.1], -0.8, 2.0))
+
+
+def test_it_starts_anywhere():
+    h = PAPER.hysteresis
+    inverse = HysteresisInverse(h)
+    assert inverse.reset(0.7) == h([0.7])[0]
+    assert_allclose(inverse.process(h([0.7, 0.2]))[0], [0.7, 0.2], atol=1e-12)

@@ -1,0 +1,138 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The inverse of a model: the forward model goes where it was told, or it says why not."""
+
+from dataclasses import replace
+
+from effect_table import VISIBLE
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import FS, PAPER
+import piezo_ident as pi
+from piezo_ident.common.errors import DataError
+from piezo_ident.control.linear_inverse import linear_inverse
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Delay, Dynamics
+import pytest
+from scipy.signal import lfilter
+
+
+def sine(frequency, seconds=0.25, size=25e-6):
+    """Return a sine around 35 um that starts and ends at rest."""
+    t = np.arange(round(seconds * FS)) / FS
+    envelope = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.05)
+    return 35e-6 - size * envelope * np.cos(2 * np.pi * frequency * t)
+
+
+def triangle(frequency=10.0, seconds=0.25):
+    """Return a triangle between 5 and 65 um."""
+    t = np.arange(round(seconds * FS)) / FS
+    return 5e-6 + 60e-6 * (1.0 - np.abs(2.0 * ((frequency * t) % 1.0) - 1.0))
+
+
+@pytest.mark.parametrize('wanted', [sine(1.0), sine(120.0), triangle()], ids=['1', '120', 'tri'])
+def test_the_model_goes_where_it_is_told(wanted):
+    drive = pi.invert(PAPER, wanted)
+    assert_array_equal(drive.wanted[drive.lead :], wanted)
+    assert_allclose(PAPER.simulate(drive.v), drive.predicted, atol=2e-9)
+    # 100 rms(wanted - predicted) / (max wanted - min wanted)
+    assert drive.error < 0.002
+    assert not drive.clipped.any() and not drive.warnings
+    assert drive.t[drive.lead] == 0.0 and drive.t[0] == -drive.lead / FS
+
+
+@pytest.mark.parametrize('name', sorted(VISIBLE))
+def test_it_makes_up_for_every_effect(name):
+    model = replace(PAPER, effects=(EffectSetting(name, VISIBLE[name]),))
+    # what saturation leaves
+    wanted = sine(20.0, size=5e-6)
+    n = wanted.size
+    channels = {'other_axis': np.sin(np.arange(n) / 300.0)} if name == 'cross_coupling' else {}
+    plain = pi.invert(PAPER, wanted)
+    drive = pi.invert(model, wanted, channels=channels, clip=True)
+    t = np.arange(n)
+    told = model.stream().process(
+        plain.v[plain.lead :], t / FS, {k: np.asarray(x) for k, x in channels.items()}
+    )
+    before = 100.0 * np.sqrt(np.mean((told - wanted) ** 2)) / np.ptp(wanted)
+    assert drive.error < max(0.05 * before, 0.002)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_any_stable_g_has_an_inverse_that_looks_ahead(seed):
+    rng = np.random.default_rng(seed)
+    pairs, zeros = rng.integers(1, 4), rng.integers(0, 4)
+    poles = rng.uniform(0.3, 0.98, pairs) * np.exp(1j * rng.uniform(0.1, 2.5, pairs))
+    a = np.real(np.poly([*poles, *poles.conj()]))[1:]
+    # inside and outside of the unit circle
+    b = np.real(np.poly(rng.uniform(0.2, 2.5, zeros) * -1.0))
+    dynamics = Dynamics(a, np.atleast_1d(b)).normalised()
+    delay = Delay(int(rng.integers(0, 20)), float(rng.uniform(0.0, 0.99)))
+    model = replace(PAPER, dynamics=dynamics, delay=delay)
+    x = np.zeros(6000)
+    x[2000:4000] = np.sin(np.pi * np.arange(2000) / 2000) ** 4
+    w = linear_inverse(model)(x)
+    y = model.delay.apply(lfilter(dynamics.b, np.append(1.0, dynamics.a), w))
+    assert np.abs(y - x).max() < 1e-3
+    assert_allclose(linear_inverse(model)(np.ones(10)), np.ones(10), rtol=1e-9)
+
+
+def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
+    wanted = 30e-6 + 60e-6 * np.sin(np.arange(4000) / 400.0) ** 2
+    with pytest.raises(DataError, match=r'samples .* out of reach within 0 .. 10 V: by up to 1\d'):
+        pi.invert(PAPER, wanted)
+    drive = pi.invert(PAPER, wanted, clip=True)
+    assert drive.v.max() == 10.0 and drive.v.min() >= 0.0
+    assert drive.clipped.any() and 'out of reach' in drive.warnings[0]
+    free = ~drive.clipped
+    miss = np.abs(drive.wanted - drive.predicted)
+    assert np.median(miss[free]) < 1e-8 < miss[drive.clipped].max()
+    with pytest.raises(DataError, match=r'at 100 V/s'):
+        pi.invert(PAPER, sine(120.0), slew=100.0)
+    slow = pi.invert(PAPER, sine(120.0), slew=100.0, clip=True)
+    assert np.abs(np.diff(slow.v)).max() <= 100.0 / FS * (1 + 1e-9)
+    with pytest.raises(DataError, match='starts at 100 um; between 0 and 10 V the stage rests at'):
+        pi.invert(PAPER, np.full(10, 100e-6))
+
+
+def test_limits_hold_for_any_wanted_motion():
+    rng = np.random.default_rng(8)
+    for _ in range(50):
+        wanted = 30e-6 + 30e-6 * np.cumsum(rng.standard_normal(300)) / 10.0
+        wanted[0] = 30e-6
+        low, high = np.sort(rng.uniform([0.0, 7.0], [3.0, 10.0]))
+        slew = 10.0 ** rng.uniform(2.0, 5.0)
+        drive = pi.invert(PAPER, wanted, limits=(low, high), slew=slew, clip=True)
+        assert drive.v.min() >= low - 1e-12 and drive.v.max() <= high + 1e-12
+        assert np.abs(np.diff(drive.v)).max() <= slew / FS * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    'wanted, what',
+    [([1e-6], 'vector of finite'), ([0.0, np.nan], 'vector of finite'), ('abc', 'vector of')],
+)
+def test_no_motion_is_refused(wanted, what):
+    with pytest.raises(DataError, match=what):
+        pi.invert(PAPER, wanted)
+    with pytest.raises(DataError, match='lowest, highest'):
+        pi.invert(PAPER, sine(10.0), limits=(10.0, 0.0))
+
+
+def test_a_stage_that_retracts_is_inverted_too():
+    scaling = replace(PAPER.scaling, Y=-PAPER.scaling.Y, y0=80e-6)
+    model = replace(PAPER, scaling=scaling)
+    wanted = 80e-6 - sine(20.0)
+    assert pi.invert(model, wanted).error < 0.002
+
+
+def test_a_motion_that_begins_at_once_needs_a_lead():
+    wanted = np.concatenate([np.linspace(10e-6, 40e-6, 400), np.full(400, 40e-6)])
+    drive = pi.invert(PAPER, wanted)
+    # the delay of three samples at least
+    assert drive.lead >= 3
+    assert_allclose(drive.wanted[: drive.lead], 10e-6)
+    assert drive.error < 0.01
