@@ -11,8 +11,15 @@ from types import SimpleNamespace
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
-from piezo_ident.cli.identify_command import checked, keep, print_files, read_both
-from piezo_ident.cli.records import check_order, given, naming
+from piezo_ident.cli.identify_command import (
+    checked,
+    keep,
+    print_files,
+    print_next,
+    prompt_of,
+    read_both,
+)
+from piezo_ident.cli.records import check_order, fields_of, naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -51,17 +58,20 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
-    keep(diagnosis, args)
+    prompt = prompt_of(args, [*records, *validation], [*paths, *further])
+    keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
     changed = changes(given, diagnosis.model)
     note = ', '.join(changed) or f'the same as {args.model_file}, nothing changed'
     files = print_files(args, console, f' ({note})')
+    steps = print_next(diagnosis, prompt, console)
     console.result(
         {
             **to_json(diagnosis),
             'model_changes': list(changed),
             'validation': [{'formula': FORMULA, **asdict(x)} for x in diagnosis.unseen],
             'files': files,
+            'next': steps,
         }
     )
 
@@ -70,5 +80,5 @@ def _settings(args: SimpleNamespace) -> DiagnosisSettings:
     only, without = effect_names(args.only), effect_names(args.without)
     if not set(only or catalogue()) - set(without):
         raise ConfigError('--only and --without leave no candidate; name one that is not in both')
-    named = {**given(args, DiagnosisSettings), 'effects': only or None, 'without': without}
+    named = {**fields_of(args, DiagnosisSettings), 'effects': only or None, 'without': without}
     return DiagnosisSettings(**named)

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
+import textwrap
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
+import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.each_command import check_each, identify_each
+from piezo_ident.cli.options import READING
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
 from piezo_ident.cli.predict_command import error_data, print_errors
-from piezo_ident.cli.records import expand_apart, given, MODEL_FILES, naming, read_all
+from piezo_ident.cli.records import expand_apart, fields_of, MODEL_FILES, naming, read_all
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.identify import identify
@@ -24,11 +28,16 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.record import Record
 
+if TYPE_CHECKING:
+    from piezo_ident.report import Prompt
+
 __all__ = [
     'checked',
     'identify_command',
     'keep',
     'print_files',
+    'print_next',
+    'prompt_of',
     'read_both',
 ]
 
@@ -36,7 +45,7 @@ __all__ = [
 def identify_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident identify``."""
     check_each(args)
-    settings = Settings(**given(args, Settings))
+    settings = Settings(**fields_of(args, Settings))
     if args.each is not None:
         identify_each(args, settings, console)
         return
@@ -46,7 +55,8 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
     records, validation = read_both(paths, further, args)
     with naming(*(record.name for record in records)), console.progress() as progress:
         result = identify(records, settings, validation=validation, progress=progress)
-    keep(result, args)
+    prompt = prompt_of(args, [*records, *validation], [*paths, *further])
+    keep(result, args, prompt)
     console.say(report.identification_text(result))
     checks = []
     for record in validation:
@@ -60,7 +70,9 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
         if sines:
             console.say(f'\n{report.table_one(sines)}')
     files = print_files(args, console)
-    console.result({**report.to_json(result), 'validation': checks, 'files': files})
+    steps = print_next(result, prompt, console)
+    data = {**report.to_json(result), 'validation': checks, 'files': files, 'next': steps}
+    console.result(data)
 
 
 def checked(
@@ -101,13 +113,44 @@ def read_both(
     return everything[: len(paths)], everything[len(paths) :]
 
 
-def keep(result: Identification | Diagnosis, args: SimpleNamespace) -> None:
+def prompt_of(args: SimpleNamespace, records: Sequence[Record], paths: Sequence[Path]) -> Prompt:
+    """Return how the files of a call are named, for the commands that are suggested."""
+    from piezo_ident.report import Prompt
+
+    given = getattr(args, 'model_file', '')
+    written = args.report and args.report / 'model.yaml'
+    read = {x.opts[0]: getattr(args, str(x.name)) for x in READING}
+    words = [[name, *np.atleast_1d(x)] for name, x in read.items() if x is not None]
+    return Prompt(
+        model=str(args.model or written or ('refined.yaml' if given else 'model.yaml')),
+        given=str(given),
+        records={x.name: str(path) for x, path in zip(records, paths, strict=True)},
+        reading=tuple(map(str, chain(*words))),
+    )
+
+
+def print_next(
+    result: Identification | Diagnosis, prompt: Prompt, console: Console
+) -> list[dict[str, str]]:
+    """Print what to do next by its command lines, and return that for programs."""
+    from piezo_ident.report import next_steps
+
+    steps = next_steps(result, prompt)
+    console.say('\nnext:')
+    for step in steps:
+        console.say(textwrap.indent(textwrap.fill(f'{step.reason}:', 97), '  '))
+        # in one line, to be copied
+        console.say(f'      {step.command}')
+    return [asdict(step) for step in steps]
+
+
+def keep(result: Identification | Diagnosis, args: SimpleNamespace, prompt: Prompt) -> None:
     """Write report and model where the arguments say."""
     from piezo_ident.report import write_report
 
     with deferred_interrupts() as check:
         if args.report is not None:
-            write_report(result, args.report, progress=check)
+            write_report(result, args.report, progress=check, prompt=prompt)
         if args.model is not None:
             result.model.save(args.model)
 

@@ -28,7 +28,7 @@ __all__ = [
     'data_of',
     'expand',
     'expand_apart',
-    'given',
+    'fields_of',
     'naming',
     'options_of',
     'print_faults',
@@ -122,7 +122,7 @@ def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
             )
 
 
-def given(args: SimpleNamespace, kind: type) -> dict[str, Any]:
+def fields_of(args: SimpleNamespace, kind: type) -> dict[str, Any]:
     """Return the options that are fields of settings; those that are absent keep the defaults."""
     named = {f.name: getattr(args, f.name, None) for f in fields(kind)}
     return {name: x for name, x in named.items() if x is not None}
@@ -130,7 +130,7 @@ def given(args: SimpleNamespace, kind: type) -> dict[str, Any]:
 
 def options_of(args: SimpleNamespace) -> ReadOptions:
     """Return how the arguments have records read."""
-    return ReadOptions(**given(args, ReadOptions))
+    return ReadOptions(**fields_of(args, ReadOptions))
 
 
 def read_all(paths: Sequence[Path], args: SimpleNamespace, **further: Any) -> list[Record]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -20,8 +21,9 @@ from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.diagnosis import diagnosis_page
-from piezo_ident.report.html import page_html, Shown
+from piezo_ident.report.html import Page, page_html, Shown
 from piezo_ident.report.identification import identification_page
+from piezo_ident.report.next_steps import next_steps, Prompt
 from piezo_ident.report.to_json import to_json
 
 if TYPE_CHECKING:
@@ -55,6 +57,7 @@ def write_report(
     folder: str | os.PathLike[str],
     *,
     progress: Progress = silent,
+    prompt: Prompt | None = None,
 ) -> Path:
     """
     Write the report of an identification or a diagnosis.
@@ -68,6 +71,8 @@ def write_report(
     progress : callable, optional
         Called with the name of the step and the share of it that is done; may raise `Cancelled`
         as long as nothing is written.
+    prompt : Prompt, optional
+        How the files are named in the commands that the page suggests.
 
     Returns
     -------
@@ -93,11 +98,13 @@ def write_report(
     expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
     kind = type(result)
     if isinstance(result, Diagnosis):
-        data, page, shown = _diagnosis(result, progress)
+        data, content, shown = _diagnosis(result, progress)
     else:
-        data, page, shown = _identified(result, progress)
+        data, content, shown = _identified(result, progress)
     progress('writing', 0.9)
     target = Path(folder)
+    named = prompt or Prompt(model=str(target / MODEL))
+    page = page_html(replace(content, next_steps=next_steps(result, named)))
     check_report_folder(target, kind)
     numbers = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + '\n'
     texts = {NUMBERS[kind]: numbers, MODEL: model_to_yaml(result.model)}
@@ -113,7 +120,7 @@ def write_report(
 
 def _identified(
     result: Identification, progress: Progress
-) -> tuple[dict[str, Any], str, list[Shown]]:
+) -> tuple[dict[str, Any], Page, list[Shown]]:
     # matplotlib takes half a second to import, and most commands draw nothing
     from piezo_ident.report.figures.identification import draw_identification
 
@@ -121,16 +128,16 @@ def _identified(
     drawn = draw_identification(result, runs, lambda x: progress('drawing', 0.45 * x))
     shown = _rendered(drawn, progress)
     page = identification_page(result, sines_of(runs), shown, drawn.left_out)
-    return to_json(result, runs), page_html(page), shown
+    return to_json(result, runs), page, shown
 
 
-def _diagnosis(result: Diagnosis, progress: Progress) -> tuple[dict[str, Any], str, list[Shown]]:
+def _diagnosis(result: Diagnosis, progress: Progress) -> tuple[dict[str, Any], Page, list[Shown]]:
     from piezo_ident.report.figures.diagnosis import draw_diagnosis
 
     drawn = draw_diagnosis(result, lambda x: progress('drawing', 0.45 * x))
     shown = _rendered(drawn, progress)
     page = diagnosis_page(result, shown, drawn.left_out)
-    return to_json(result), page_html(page), shown
+    return to_json(result), page, shown
 
 
 def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
+from piezo_ident.report.next_steps import Step
 from piezo_ident.report.table import Table
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class Page:
     sections: Sequence[Section]
     after: Sequence[Box]
     footer: str
+    next_steps: Sequence[Step] = ()
 
 
 def named(pictures: Sequence[Shown], *names: str) -> list[Shown]:

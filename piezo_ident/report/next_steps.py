@@ -1,0 +1,149 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What to do after a result: a reason and a command line each, the most useful first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+import math
+import shlex
+
+from piezo_ident.diagnosis.next_experiment import next_experiment
+from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.identification.results import Identification
+from piezo_ident.record.record import Record
+from piezo_ident.report.table import listed, number
+
+__all__ = ['Prompt', 'Step', 'next_steps']
+
+#: an error of so many times the sensor noise leaves little to find
+ENOUGH = 2.0
+#: the programs of the experiments
+PROGRAMS = {'sweeps': 'diagnosis', 'holds': 'holds'}
+#: what a lab records next; the name stands for a file that is not there yet
+OTHER = 'other.csv'
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """
+    How the files of a result are named at the prompt.
+
+    Attributes
+    ----------
+    model : str
+        File of the model that was found.
+    given : str
+        File of the model that was judged, of a diagnosis.
+    records : mapping of str to str
+        File of a record by its name; the name where it is absent.
+    reading : sequence of str
+        Options with which the records were read.
+    """
+
+    model: str = 'model.yaml'
+    given: str = 'model.yaml'
+    records: Mapping[str, str] = field(default_factory=dict)
+    reading: tuple[str, ...] = ()
+
+    def files(self, names: Iterable[str]) -> list[str]:
+        """Return the files of records."""
+        return [self.records.get(name, name) for name in names]
+
+    def command(self, verb: str, *words: str, reads: bool = True) -> str:
+        """Return a command line."""
+        return shlex.join(['piezo_ident', verb, *words, *(self.reading if reads else ())])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Why to do something, and the command that does it."""
+
+    reason: str
+    command: str
+
+
+def next_steps(result: Identification | Diagnosis, prompt: Prompt | None = None) -> list[Step]:
+    """
+    Return what to do after an identification or a diagnosis.
+
+    Parameters
+    ----------
+    result : Identification or Diagnosis
+    prompt : Prompt, optional
+        Names of the files.
+    """
+    named = prompt or Prompt()
+    if isinstance(result, Diagnosis):
+        return list(_after_diagnosis(result, named))
+    return list(_after_identification(result, named))
+
+
+def _after_identification(result: Identification, prompt: Prompt) -> Iterator[Step]:
+    errors, floor = result.headline, result.noise_floor
+    is_validated = errors.data == 'validation'
+    times = math.inf if not floor else errors.percent / floor
+    missing = [what for what, _ in result.not_identified]
+    if missing:
+        yield _experiment(f'{listed(missing)}: not identified', 'identification', prompt)
+    if result.settings.thresholds is not None and times > ENOUGH:
+        others = {row.record for row in result.errors if row.data == 'validation'}
+        names = [record.name for record in result.records if record.name not in others]
+        yield Step(
+            'the number of thresholds was given; the data may choose a better one',
+            prompt.command(
+                *('identify', *prompt.files(names), '--thresholds', 'auto'),
+                *('--model', prompt.model, '--overwrite'),
+            ),
+        )
+    if not is_validated:
+        yield _experiment('no motion but that of these records was tested', 'validation', prompt)
+    if is_validated and times <= ENOUGH:
+        yield _use(f'the error is {number(times, 2)} times the sensor noise', prompt, prompt.model)
+        return
+    yield Step(
+        'find out what the model lacks'
+        + ('' if is_validated else ', on a record that was not fitted'),
+        prompt.command(
+            *('diagnose', prompt.model),
+            *(prompt.files(errors.records) if is_validated else [OTHER]),
+            *('--model', 'refined.yaml', '--report', 'diagnosis'),
+        ),
+    )
+
+
+def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
+    records = [Record((residual.piece,), residual.record) for residual in result.residuals]
+    experiment = None
+    if result.verdict != 'none' or result.untestable:
+        experiment = next_experiment(result, records)
+    if experiment is not None:
+        yield _experiment(experiment.reason, PROGRAMS[experiment.kind], prompt)
+        yield Step(
+            'diagnose again, with that record',
+            prompt.command('diagnose', prompt.given, *prompt.files(result.records), OTHER),
+        )
+    if result.verdict == 'none':
+        yield _use('the model lacks nothing that these data show', prompt, prompt.given)
+    elif not result.unseen:
+        yield Step(
+            'check the refined model on a record that took no part',
+            prompt.command('predict', prompt.model, OTHER),
+        )
+
+
+def _experiment(reason: str, program: str, prompt: Prompt) -> Step:
+    return Step(
+        f'{reason}; drive the stage with the voltage (columns t and v) that this command makes, '
+        'and record it',
+        prompt.command('simulate', '--program', program, 'excitation.csv', reads=False),
+    )
+
+
+def _use(reason: str, prompt: Prompt, model: str) -> Step:
+    return Step(
+        f'{reason}; predict a planned motion (columns t and v)',
+        prompt.command('predict', model, 'scan.csv', '--out', 'predicted.csv', reads=False),
+    )

@@ -1,0 +1,80 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a result suggests to do next: commands that are understood, and fit the result."""
+
+from dataclasses import replace
+from html import unescape
+import shlex
+
+from diagnosis_examples import example
+import piezo_ident as pi
+from piezo_ident.cli.main import cli
+from piezo_ident.report import next_steps, Prompt
+import pytest
+
+NAMED = Prompt(
+    'new.yaml', 'old.yaml', {'val.npz': 'my lab/val.npz'}, ('--voltage-limits', '0', '9')
+)
+
+
+def commands(result, prompt=NAMED):
+    lines = [step.command for step in next_steps(result, prompt)]
+    for line in lines:
+        program, *words = shlex.split(line)
+        assert program == 'piezo_ident'
+        assert vars(cli.main(words, 'piezo_ident', standalone_mode=False)), line
+    return lines
+
+
+def test_a_motion_that_was_not_fitted_comes_first(identified, unlabelled):
+    result = replace(identified, errors=[e for e in identified.errors if e.data != 'validation'])
+    *_, excitation, diagnose = commands(result)
+    assert excitation == 'piezo_ident simulate --program validation excitation.csv'
+    assert diagnose.startswith('piezo_ident diagnose new.yaml other.csv --model refined.yaml')
+    # as the records were read
+    assert diagnose.endswith('--voltage-limits 0 9')
+    missing = replace(unlabelled, not_identified=(('delay', 'no steps'),))
+    assert commands(missing)[0] == 'piezo_ident simulate --program identification excitation.csv'
+
+
+def test_the_error_on_validation_decides(identified):
+    (fitted, *_) = identified.errors
+    row = replace(fitted, record='val.npz', segment='sine:1Hz', data='validation')
+
+    def after(factor, thresholds=None):
+        settings = replace(identified.settings, thresholds=thresholds)
+        row_of = replace(row, percent=factor * 0.1)
+        return commands(replace(identified, errors=(row_of,), noise_floor=0.1, settings=settings))
+
+    (use,) = after(1.5)
+    assert use == 'piezo_ident predict new.yaml scan.csv --out predicted.csv'
+    (diagnose,) = after(3.0)
+    assert diagnose.startswith("piezo_ident diagnose new.yaml 'my lab/val.npz' --model")
+    again, _ = after(3.0, thresholds=10)
+    assert '--thresholds auto --model new.yaml --overwrite' in again
+    assert len(after(1.5, thresholds=10)) == 1
+
+
+@pytest.mark.parametrize('verdict', ['named', 'class', 'unexplained', 'refitted'])
+def test_a_diagnosis_asks_for_the_experiment_that_decides(verdict):
+    result = example(verdict)
+    excitation, diagnose, *check = commands(result)
+    assert excitation.startswith('piezo_ident simulate --program ')
+    assert diagnose.startswith("piezo_ident diagnose old.yaml 'my lab/val.npz' other.csv")
+    assert [line.split()[:3] for line in check] == [['piezo_ident', 'predict', 'new.yaml']]
+
+
+def test_a_model_that_lacks_nothing_is_used():
+    result = replace(example('none'), untestable=())
+    assert commands(result) == ['piezo_ident predict old.yaml scan.csv --out predicted.csv']
+
+
+def test_the_page_shows_the_commands(tmp_path, identified):
+    page = pi.write_report(identified, tmp_path / 'report', prompt=NAMED)
+    html = unescape(page.read_text(encoding='utf-8'))
+    for line in commands(identified):
+        assert f'<pre>{line}</pre>' in html
+    # without names, those of the folder
+    page = pi.write_report(identified, tmp_path / 'report')
+    assert str(tmp_path / 'report' / 'model.yaml') in page.read_text(encoding='utf-8')
