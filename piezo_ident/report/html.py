@@ -21,6 +21,8 @@ __all__ = ['Box', 'Page', 'Section', 'Shown', 'named', 'page_html', 'pairs', 'su
 
 #: size on the screen of a pixel of a picture: the letters of both then have one size
 SHOWN = 0.72
+#: a narrow screen shows a picture no smaller than this share of its width, and scrolls
+LEAST = 0.65
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class Shown:
     def width(self) -> int:
         """Width on the screen; that in pixels stands at bytes 16 to 19 of every PNG."""
         return round(SHOWN * int.from_bytes(self.png[16:20], 'big'))
+
+    @property
+    def least_width(self) -> int:
+        """Least width on the screen at which its letters can be read."""
+        return round(LEAST * self.width)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ __all__ = [
 WIDTH = 99
 #: columns of a table of faults in the data
 FAULTS = ('fault', 'count', 'where', 'action')
+#: longer cells are wrapped on a page [characters]
+PROSE = 28
 #: names on a line, at most
 LISTED = 8
 
@@ -55,6 +57,15 @@ class Table:
         """Whether each column, but for the first, holds text rather than numbers."""
         cells = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
         return tuple(i > 0 and not all(map(_is_number, column)) for i, column in enumerate(cells))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What each column holds on a page: numbers (empty), a word (text), or prose."""
+        longest = [max(map(len, column), default=0) for column in zip(*self.rows, strict=True)]
+        kinds = zip(self.text_columns, longest, strict=False)
+        return tuple(
+            ('prose' if size > PROSE else 'text') if is_text else '' for is_text, size in kinds
+        )
 
     def lines(self) -> list[str]:
         """Return the table for a terminal; a last column of text is wrapped."""

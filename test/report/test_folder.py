@@ -98,6 +98,20 @@ def test_page_is_one_file_with_every_picture(folders):
         assert '@import' not in html
 
 
+def test_page_is_legible_on_a_phone_and_in_the_dark(folders):
+    html = (folders[0][1] / 'report.html').read_text(encoding='utf-8')
+    # a picture scrolls rather than shrinks to illegible letters
+    widths = re.findall(r'width="(\d+)" style="min-width: (\d+)px"', html)
+    assert len(widths) == len(Outline(html).pictures)
+    assert all(0.6 * int(width) < int(least) <= int(width) for width, least in widths)
+    # what is dark in one scheme is light in the other: text has no colour of its own
+    style = html[html.index('body {') : html.index('</style>')]
+    assert 'prefers-color-scheme: dark' in html
+    assert not re.search(r'[{;\s]color: #', style)
+    # an empty line of headings is none
+    assert not re.search(r'<thead>\s*<tr>(?:\s*<th[^>]*></th>)+\s*</tr>', html)
+
+
 def test_page_begins_with_the_headline(folders):
     for (result, folder), text in zip(folders, (headline, diagnosis_headline), strict=True):
         html = (folder / 'report.html').read_text(encoding='utf-8')

@@ -172,6 +172,9 @@ def test_lengths_and_columns():
     ]
     table = Table('t', ('', 'n', 'text'), [('a', '1', 'b'), ('bb\x1b', '12', '2')])
     assert table.text_columns == (False, False, True)
+    # words stay whole on a narrow screen, and prose alone is wrapped
+    wide = Table('t', ('', 'n', 'word', 'why'), [('a' * 50, '1', 'noise', 'so it is ' * 9)])
+    assert wide.kinds == ('', '', 'text', 'prose')
     assert table.lines() == ['t:', '      n  text', 'a     1  b', 'bb?  12  2']
     assert Table('', ('', ''), [('a', 'b ' * 60)]).lines()[1].startswith('   b b')
     assert Table('t', ('', 'n'), []).text_columns == (False, False)
