@@ -46,6 +46,8 @@ def see(client, space: Path, executable: str, log: Path) -> None:
     finally:
         process.kill()
     said = log.read_text(encoding='utf-8', errors='replace').strip()
+    # the log of a node is no complaint
+    said = '\n'.join(line for line in said.splitlines() if not line.startswith('[INFO]'))
     if code or said:
         sys.exit(f'{executable}: exit code {code}: {said}')
     sys.stdout.write(f'{executable}: {client.status(executable)["state"]}, exit code {code}\n')

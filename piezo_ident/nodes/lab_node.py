@@ -15,6 +15,7 @@ import logging
 import os
 from pathlib import Path
 import sys
+from textwrap import shorten
 import threading
 import time
 import traceback
@@ -24,9 +25,11 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
+from piezo_ident.nodes.journal import Journal
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -96,6 +99,7 @@ class LabNode(Node):
         self._declared: dict[str, Declaration] = {}
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
+        self.journal = Journal(self.get_logger())
         self.values: dict[str, Any] = {}
         #: all values as they would be with what is just being set
         self.wanted: dict[str, Any] = {}
@@ -160,6 +164,7 @@ class LabNode(Node):
         for parameter in parameters:
             problem = self._problem(parameter.name, parameter.value)
             if problem:
+                self.journal.tell(f'parameter refused: {problem}', WARN)
                 return SetParametersResult(successful=False, reason=problem)
         return SetParametersResult(successful=True)
 
@@ -167,6 +172,7 @@ class LabNode(Node):
         changed = {p.name: p.value for p in parameters if p.name in self._declared}
         self.values.update(changed)
         if changed:
+            self.journal.tell(f'set: {_shown(changed)}')
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:
@@ -201,9 +207,14 @@ class LabNode(Node):
         with self._status_lock:
             if key == self._last_status:
                 return
-            self._last_status = key
+            before, self._last_status = self._last_status, key
             pairs = {'state': state, 'progress': f'{progress:.0f}', **values}
             self._status.publish(self._diagnostic(level, message, pairs))
+        if before and (state != before[0] or level > before[3]):
+            known = '' if message.startswith(state) else f'{state}: '
+            self.journal.tell(f'{known}{message}', level)
+        elif level != OK:
+            self.journal.warn(message, level)
 
     def _diagnostic(
         self, level: bytes, message: str, values: Mapping[str, object]
@@ -218,6 +229,8 @@ class LabNode(Node):
 
     def _publish_diagnostics(self) -> None:
         level, message, values = self.diagnose()
+        if level != OK:
+            self.journal.warn(message, level)
         array = DiagnosticArray(status=[self._diagnostic(level, message, values)])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
@@ -241,8 +254,10 @@ class LabNode(Node):
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
                 response.message, response.success = handler(), True
+                self.journal.tell(f'~/{name}: {response.message}')
             except PiezoIdentError as error:
                 response.message, response.success = str(error), False
+                self.journal.tell(f'~/{name} refused: {error}', WARN)
             # the client gets an answer, whatever failed
             except Exception as error:  # noqa: BLE001
                 _report(self, error)
@@ -262,6 +277,21 @@ class LabNode(Node):
         """Wait a moment until the last status was heard."""
         self._status.wait_for_all_acked(Duration(seconds=0.1))
 
+    def introduce(self) -> None:
+        """Write that the node is up, and which parameters are not what they are by default."""
+        changed = {
+            name: value
+            for name, value in self.values.items()
+            if (tuple(value) if isinstance(value, list) else value) != self._declared[name].default
+        }
+        said = f'; set: {_shown(changed)}' if changed else ''
+        self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
+
+    def load_kernels(self, load: Callable[[], object]) -> None:
+        """Call what loads kernels, and write that this may take its time."""
+        self.journal.tell('loads its kernels; the first time they are compiled, up to a minute')
+        load()
+
     def close(self) -> None:
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
 
@@ -275,6 +305,12 @@ class _ToRos(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._log.info(record.getMessage())
+
+
+def _shown(values: Mapping[str, Any]) -> str:
+    """Return parameters as text; one may hold a whole program."""
+    shown = {k: shorten(str(v), 60, placeholder=' ...') for k, v in values.items()}
+    return ', '.join(f'{name} = {value}' for name, value in shown.items())
 
 
 def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:
@@ -314,6 +350,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     node, code = None, 0
     try:
         node = make()
+        node.introduce()
         ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience
         executor.add_node(node)
         _spin(executor, node)
@@ -323,6 +360,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     finally:
         if node is not None:
             try:
+                node.journal.tell('ends')
                 node.close()
                 node.await_listeners()
             except Exception as error:  # noqa: BLE001

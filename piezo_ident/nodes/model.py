@@ -43,7 +43,7 @@ class ModelNode(LabNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        warm_up()
+        self.load_kernels(warm_up)
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
@@ -137,7 +137,6 @@ class ModelNode(LabNode):
     def _refuse_model(self, reason: str) -> None:
         kept = 'the old model is kept' if self._predictor.model else 'there is no model'
         self._refusal = f'model refused, {kept}: {reason}'
-        self.get_logger().warning(self._refusal)
 
     # blocks
 

@@ -211,7 +211,10 @@ class RecorderNode(LabNode):
             if due:
                 writer.flush()
                 flushed = now
-                recording.size, recording.path = writer.size, str(writer.path)
+                recording.size = writer.size
+                if recording.path != str(writer.path):
+                    recording.path = str(writer.path)
+                    self.journal.tell(f'the next part is {recording.path}')
             if recording.ready.is_set() and (due or not reported) and not last:
                 reported = True
                 problems = subscriptions.problems

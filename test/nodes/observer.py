@@ -20,6 +20,7 @@ from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import from_message, LATCHED, SERVICE, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from processes import Handle, LIMIT
+from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -63,6 +64,7 @@ class Observer:
         self._messages: dict[str, list[Float64MultiArray]] = {}
         self._samples: dict[str, list[Samples]] = {}
         self._arrivals: dict[str, list[float]] = {}
+        self._lines: list[tuple[str, int, str]] = []
         self._texts: dict[str, list[str]] = {}
         self._publishers: dict[str, Any] = {}
         self._unknown: set[tuple[str, str]] = set()
@@ -171,6 +173,15 @@ class Observer:
         """Return when each block of a topic that is collected came, on time.monotonic."""
         self.collect(topic)
         return self._arrivals[topic]
+
+    def lines(self) -> list[tuple[str, int, str]]:
+        """Return node, level and text of all lines on /rosout; subscribes on first use."""
+        if not self._lines:
+            self._lines.append(('observer', Log.INFO, 'listens'))
+            self._hear(
+                Log, '/rosout', lambda m: self._lines.append((m.name, m.level, m.msg)), HEARD
+            )
+        return self._lines
 
     def texts(self, topic: str) -> list[str]:
         """Return the latched texts of a topic (model, report) so far; subscribes on first use."""

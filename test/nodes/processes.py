@@ -162,6 +162,12 @@ class Handle:
         return self._log.read_text(encoding='utf-8', errors='replace')
 
     @property
+    def complaints(self) -> str:
+        """What it wrote beside the lines of its log that are no errors."""
+        lines = self.log.splitlines()
+        return '\n'.join(x for x in lines if not x.startswith(('[INFO]', '[WARN]')))
+
+    @property
     def has_spoken(self) -> bool:
         """Whether its first status was heard."""
         return len(self.graph.statuses(self.name)) > self._said

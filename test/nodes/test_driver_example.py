@@ -151,5 +151,5 @@ def test_a_stream_joins_by_a_ramp_within_limits_that_were_just_set(lab, begin):
 def test_it_ends_at_rest(lab, begin):
     send(lab, [9.0] * 100)
     driver = lab.handle('stage')
-    assert driver.stop(signal.SIGTERM) == 0 and driver.log == ''
+    assert driver.stop(signal.SIGTERM) == 0 and not driver.complaints
     lab.wait(lambda: at_rest(lab), 'rest')

@@ -38,7 +38,7 @@ def end(g: Graph) -> None:
     g.wait(look, 'the end of all nodes')
     for handle in g.handles:
         assert handle.process.returncode == 0, (handle.name, handle.log)
-        assert handle.log == '', handle.name
+        assert not handle.complaints, handle.name
         in_time(took[handle.name], PROMISED, f'the end of {handle.name}')
 
 

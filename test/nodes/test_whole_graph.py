@@ -17,6 +17,7 @@ import piezo_ident as pi
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED
 import pytest
+from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 #: what `Graph` keeps beside the values of a diagnosis
@@ -27,6 +28,7 @@ OTHERS = {'message', 'level', 'hardware_id'}
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp('whole')
     with Graph() as g:
+        g.lines()
         g.texts('model')
         g.texts('report')
         g.start_all(
@@ -37,7 +39,7 @@ def whole(tmp_path_factory):
             ('recorder', {'output': str(folder / 'bag')}),
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
         )
-        g.output = folder
+        g.output, g.asked = folder, []
         yield g
 
 
@@ -68,6 +70,31 @@ def test_a_run_through_the_whole_graph(whole):
     assert whole.set('excitation', 'subscribers', 3)[0]
     record = pi.read(whole.output / 'bag')
     assert record.n == round(3.37 * 20_000) and record.faults == ()
+
+
+@pytest.mark.parametrize(
+    ('node', 'level', 'line'),
+    [
+        ('recorder', Log.INFO, r'piezo_ident \S+ is up; set: output = .*bag'),
+        ('stage', Log.INFO, 'loads its kernels; '),
+        ('identifier', Log.INFO, '~/run: the program is requested'),
+        ('excitation', Log.INFO, 'set: program = '),
+        ('excitation', Log.INFO, 'running: '),
+        ('stage', Log.INFO, 'running: '),
+        ('identifier', Log.INFO, r'done: .*\d % of stroke'),
+        ('model', Log.INFO, 'predicting: with topic model'),
+        ('recorder', Log.INFO, r'done: \d+ messages in .*bag'),
+        ('recorder', Log.WARN, '~/stop refused: not recording'),
+        ('excitation', Log.WARN, 'parameter refused: .*no_such_program'),
+    ],
+)
+def test_the_log_tells_what_happened(whole, node, level, line):
+    if 'recorder/stop' not in whole.asked:
+        whole.asked = ['recorder/stop']
+        assert not whole.call('recorder/stop')[0]
+        assert not whole.set('excitation', 'program', 'no_such_program')[0]
+    said = whole.lines()
+    whole.wait(lambda: any(x[:2] == (node, level) and re.match(line, x[2]) for x in said), line)
 
 
 def test_live_replayed_and_offline_models_are_equal(whole):
@@ -269,7 +296,7 @@ def test_a_signal_ends_what_is_at_rest(whole):
         for node in NODES:
             handle = whole.handle(node)
             assert handle.process.wait(60) == 0, (node, handle.log)
-            assert handle.log == '', node
+            assert not handle.complaints, node
         in_time(time.monotonic() - begin, 2.0, 'the end of six nodes at rest')
 
     best_of_three(attempt)

@@ -67,9 +67,8 @@ class IdentifierNode(LabNode):
         self._steps = Steps()
         self._identified: Identification | None = None
         self._session = DiagnosisSession(self, self._capture)
-        # what the running identification uses of the capture, and the model last published
-        self._using: dict[str, int] = {}
-        self._published = ''
+        # what the running job uses of the capture, and the model last published
+        self._using, self._published = dict[str, int](), ''
         if path := self.values['model']:
             self._session.take(load(path), {})
         self._rate = Rate()
@@ -142,8 +141,7 @@ class IdentifierNode(LabNode):
             answered,
         )
 
-    def _unpublished(self) -> str:
-        # what is sent before publisher and subscription have matched is lost
+    def _unpublished(self) -> str:  # before it is met, what it sends is lost
         return ', '.join(t for t in self._inputs.unpublished if t not in ('voltage', APPLIED))
 
     # state
@@ -249,15 +247,15 @@ class IdentifierNode(LabNode):
 
     def _save(self) -> str:
         self._refuse_when_busy()
-        identified, folder = self._identified, self.values['output']
+        identified, folder = self._identified, Path(self.values['output']).expanduser().absolute()
         if identified is None and self._session.diagnosis is None:
             raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
-        if not folder:
+        if not self.values['output']:
             raise PiezoIdentError("parameter 'output' is empty; set it to the folder to write to")
-        check_folder(Path(folder))
+        check_folder(folder)
         self._task = 'saving'
         self._set_state('saving', 0.0, f'writing to {folder}')
-        self._start(functools.partial(save, identified, self._session.diagnosis, folder))
+        self._start(functools.partial(save, identified, self._session.diagnosis, str(folder)))
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
@@ -355,9 +353,11 @@ class IdentifierNode(LabNode):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
             if result.model and result.identification is not None:
-                self._identified = result.identification
-                self._session.take(result.identification.model, self._using)
+                self._identified = identified = result.identification
+                self._session.take(identified.model, self._using)
                 self._publish_model(result.model)
+                for warning in identified.warnings:
+                    self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
             self._set_state('done', 100.0, result.sentence, level)
         elif isinstance(result, DiagnosisOutcome):
@@ -369,11 +369,11 @@ class IdentifierNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""
-        passed, capture = self._passed['voltage'], self._capture
+        passed, capture = self._passed, self._capture
         values: dict[str, object] = {
             'state': self._state,
-            'rate': f'{self._rate.of(passed):.0f}',
-            'samples': min(passed, self._passed['displacement']),
+            'rate': f'{self._rate.of(passed["voltage"]):.0f}',
+            'samples': min(passed['voltage'], passed['displacement']),
             'captured': f'{capture.seconds:.3f}',
             'topics': self._kept(),
             'segments': ' '.join(capture.segments),

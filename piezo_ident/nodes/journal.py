@@ -1,0 +1,98 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a node writes to its log, and so to ``/rosout``: what is new, and not what goes on."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+__all__ = ['Journal']
+
+#: for how long a line that differs from an earlier one in its numbers alone is left out [s]
+QUIET = 10.0
+#: for how long the very same line is left out [s]
+ECHO = 1.0
+#: how many lines are remembered; what comes beyond them, as under a flood, is left out
+MOST = 50
+#: longest line, as of a parameter that holds a program
+LONGEST = 500
+
+_NUMBER = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?')
+
+
+class Journal:
+    """
+    The log of a node; from any thread.
+
+    Parameters
+    ----------
+    logger : rclpy logger
+    """
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self._lock = threading.Lock()
+        # until when lines, and lines without their numbers, are left out
+        self._lines: dict[str, float] = {}
+        self._patterns: dict[str, float] = {}
+
+    def tell(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
+        """
+        Write something that happened once.
+
+        Parameters
+        ----------
+        text : str
+        level : bytes, optional
+            As in diagnostic_msgs/DiagnosticStatus.
+        """
+        line = _line(text)
+        with self._lock:
+            lines = _fresh(self._lines)
+            is_new = line not in lines and len(lines) < MOST
+            if is_new:
+                lines[line] = time.monotonic() + ECHO
+                _fresh(self._patterns)[_NUMBER.sub('#', line)] = time.monotonic() + QUIET
+        if is_new:
+            self._write(line, level)
+
+    def warn(self, text: str, level: bytes = DiagnosticStatus.WARN) -> None:
+        """Write what may hold on, and is found again and again with other numbers."""
+        line = _line(text)
+        pattern = _NUMBER.sub('#', line)
+        with self._lock:
+            patterns = _fresh(self._patterns)
+            # a part of what was told is no news
+            known = next((p for p in patterns if pattern in p), None)
+            is_new = known is None and len(patterns) < MOST
+            patterns[known or pattern] = time.monotonic() + QUIET
+        if is_new:
+            self._write(line, level)
+
+    def _write(self, line: str, level: bytes) -> None:
+        # rclpy knows a call by its place, and takes one severity from each
+        if level == DiagnosticStatus.OK:
+            self._logger.info(line)
+        elif level == DiagnosticStatus.WARN:
+            self._logger.warning(line)
+        else:
+            self._logger.error(line)
+
+
+def _line(text: str) -> str:
+    line = ' '.join(text.split())
+    return line if len(line) <= LONGEST else f'{line[: LONGEST - 4]} ...'
+
+
+def _fresh(told: dict[str, float]) -> dict[str, float]:
+    """Forget what may be told again."""
+    now = time.monotonic()
+    for line in [line for line, until in told.items() if until <= now]:
+        del told[line]
+    return told
