@@ -248,7 +248,7 @@ class Lab:
         models = self.models()
         report = self.call_for_report('identifier/run', 'excitation')
         self.wait_for_model(models)
-        message = self.client.status('identifier')['message'].partition(' (100')[0]
+        message = self.client.status('identifier')['text'].partition(' (100')[0]
         self.progress.say(f'~/run identified the stage: {message}')
         return None, '; '.join(f'{x["name"]} {x["where"]}' for x in report['data_faults'])
 

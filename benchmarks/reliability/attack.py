@@ -353,12 +353,12 @@ class Attack:
             self.counts['models that are none'] += 1
             self.g.wait(
                 lambda seen=seen: (
-                    any('model refused' in s['message'] for s in self.g.statuses('model')[seen:])
-                    or 'model refused' in self.g.status('model')['message']
+                    any('model refused' in s['text'] for s in self.g.statuses('model')[seen:])
+                    or 'model refused' in self.g.status('model')['text']
                 ),
                 f'the model node to refuse {name}',
             )
-            said.append(self.g.status('model')['message'])
+            said.append(self.g.status('model')['text'])
         self.survived('models that are none')
         return said
 

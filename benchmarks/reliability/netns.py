@@ -305,7 +305,7 @@ def drive(program: str) -> int:
             json.dumps(
                 {
                     'state': status['state'],
-                    'message': status['message'],
+                    'message': status['text'],
                     'captured': captured[-1],
                     'lost': lost[-1],
                     'faults': [f['name'] for f in report.get('data_faults', [])],

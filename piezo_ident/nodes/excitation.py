@@ -24,6 +24,7 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 import math
+from pathlib import Path
 import threading
 import time
 from typing import Any
@@ -69,6 +70,11 @@ def read_program(text: str) -> Program:
     if '\n' in text or ('segments' in text and ':' in text):
         return parse_program(text)
     return Program.load(text)
+
+
+def _name(sequence: Sequence) -> str:
+    """Return the name of a program without the folder of its file."""
+    return Path(sequence.name).stem.removeprefix('program_')
 
 
 @dataclass(eq=False)
@@ -172,7 +178,7 @@ class ExcitationNode(LabNode):
         )
         self._thread.start()
         return (
-            f'{sequence.name}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
+            f'{_name(sequence)}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
             f'{sequence.n} samples'
         )
 
@@ -221,7 +227,7 @@ class ExcitationNode(LabNode):
         else:
             late = playing.clock.late if playing.clock else 0
             behind = f', {late} blocks late' if late else ''
-            self.report_status('done', 100.0, f'{playing.sequence.name} played{behind}')
+            self.report_status('done', 100.0, f'{_name(playing.sequence)} played{behind}')
 
     def _await_graph(self, playing: Playing) -> None:
         limit, needed = self.values['wait_limit'], self.values['subscribers']
@@ -279,7 +285,7 @@ class ExcitationNode(LabNode):
             self.report_status(
                 'running',
                 math.floor(100.0 * stop / sequence.n),
-                f'{sequence.name}: {label}{warning}',
+                f'{_name(sequence)}: {label}{warning}',
                 level,
                 segment=label,
             )

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import re
 import threading
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-__all__ = ['Journal']
+__all__ = ['Journal', 'one_line', 'shown']
 
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
@@ -52,7 +53,7 @@ class Journal:
         level : bytes, optional
             As in diagnostic_msgs/DiagnosticStatus.
         """
-        line = _line(text)
+        line = one_line(text)
         with self._lock:
             lines = _fresh(self._lines)
             is_new = line not in lines and len(lines) < MOST
@@ -64,7 +65,7 @@ class Journal:
 
     def warn(self, text: str, level: bytes = DiagnosticStatus.WARN) -> None:
         """Write what may hold on, and is found again and again with other numbers."""
-        line = _line(text)
+        line = one_line(text)
         pattern = _NUMBER.sub('#', line)
         with self._lock:
             patterns = _fresh(self._patterns)
@@ -85,9 +86,15 @@ class Journal:
             self._logger.error(line)
 
 
-def _line(text: str) -> str:
+def one_line(text: str, longest: int = LONGEST) -> str:
+    """Return a text in one line, cut where it is too long."""
     line = ' '.join(text.split())
-    return line if len(line) <= LONGEST else f'{line[: LONGEST - 4]} ...'
+    return line if len(line) <= longest else f'{line[: longest - 4].rstrip()} ...'
+
+
+def shown(values: Mapping[str, Any]) -> str:
+    """Return parameters as text; one may hold a whole program."""
+    return ', '.join(f'{name} = {one_line(str(value), 60)}' for name, value in values.items())
 
 
 def _fresh(told: dict[str, float]) -> dict[str, float]:

@@ -15,7 +15,6 @@ import logging
 import os
 from pathlib import Path
 import sys
-from textwrap import shorten
 import threading
 import time
 import traceback
@@ -29,7 +28,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.journal import Journal
+from piezo_ident.nodes.journal import Journal, one_line, shown
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -55,6 +54,8 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 SWITCH = 2e-4
 #: how long a node may go on being made, and how long it may take to close, after a signal [s]
 STARTING, CLOSING = 1.0, 1.8
+#: most characters of a message: ``ros2 topic echo`` cuts a text at 128
+LONGEST = 100
 #: callbacks in a row that fail before a node gives up
 MOST_FAILURES = 1000
 
@@ -172,7 +173,7 @@ class LabNode(Node):
         changed = {p.name: p.value for p in parameters if p.name in self._declared}
         self.values.update(changed)
         if changed:
-            self.journal.tell(f'set: {_shown(changed)}')
+            self.journal.tell(f'set: {shown(changed)}')
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:
@@ -185,10 +186,20 @@ class LabNode(Node):
     # status, diagnostics, services
 
     def report_status(
-        self, state: str, progress: float, message: str, level: bytes = OK, **values: object
+        self,
+        state: str,
+        progress: float,
+        text: str,
+        level: bytes = OK,
+        *,
+        brief: str = '',
+        **values: object,
     ) -> None:
         """
         Publish the latched status.
+
+        The prose is the value that comes last.  The message is short enough for
+        ``ros2 topic echo``, and begins with the figure that counts.
 
         Parameters
         ----------
@@ -196,25 +207,29 @@ class LabNode(Node):
             One word.
         progress : float
             Percent.
-        message : str
+        text : str
             For people.
         level : bytes, optional
             As in diagnostic_msgs/DiagnosticStatus.
+        brief : str, optional
+            The same in few words, a number first; the progress and the text by default.
         **values
             Further numbers.
         """
-        key = (state, round(progress), message, level, tuple(values.items()))
+        if not brief:
+            brief = f'{progress:.0f} %: {text}' if progress and not text[:1].isdigit() else text
+        key = (state, round(progress), text, level, brief, tuple(values.items()))
         with self._status_lock:
             if key == self._last_status:
                 return
             before, self._last_status = self._last_status, key
-            pairs = {'state': state, 'progress': f'{progress:.0f}', **values}
-            self._status.publish(self._diagnostic(level, message, pairs))
+            pairs = {'state': state, 'progress': f'{progress:.0f}', **values, 'text': text}
+            self._status.publish(self._diagnostic(level, one_line(brief, LONGEST), pairs))
         if before and (state != before[0] or level > before[3]):
-            known = '' if message.startswith(state) else f'{state}: '
-            self.journal.tell(f'{known}{message}', level)
+            known = '' if text.startswith(state) else f'{state}: '
+            self.journal.tell(f'{known}{text}', level)
         elif level != OK:
-            self.journal.warn(message, level)
+            self.journal.warn(text, level)
 
     def _diagnostic(
         self, level: bytes, message: str, values: Mapping[str, object]
@@ -284,7 +299,7 @@ class LabNode(Node):
             for name, value in self.values.items()
             if (tuple(value) if isinstance(value, list) else value) != self._declared[name].default
         }
-        said = f'; set: {_shown(changed)}' if changed else ''
+        said = f'; set: {shown(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
 
     def load_kernels(self, load: Callable[[], object]) -> None:
@@ -305,12 +320,6 @@ class _ToRos(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._log.info(record.getMessage())
-
-
-def _shown(values: Mapping[str, Any]) -> str:
-    """Return parameters as text; one may hold a whole program."""
-    shown = {k: shorten(str(v), 60, placeholder=' ...') for k, v in values.items()}
-    return ', '.join(f'{name} = {value}' for name, value in shown.items())
 
 
 def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:

@@ -243,7 +243,12 @@ class ModelNode(LabNode):
             message += '; its memory is unknown until the voltage has been at its lowest'
         text = '; '.join(filter(None, [message, *problems]))
         level = WARN if any(problems) else OK
-        self.report_status(state, 0.0, text, level, models=self._models)
+        model, brief = self._predictor.model, ''
+        values: dict[str, object] = {'models': self._models}
+        if model is not None and self._error.seconds:
+            values['residual_percent'] = error = f'{self._live_error(model):.3g}'
+            brief = f'{error} % of stroke, live error; {text}'
+        self.report_status(state, 0.0, text, level, brief=brief, **values)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return how the prediction goes."""

@@ -264,7 +264,7 @@ class PlayerNode(LabNode):
 
     # reports
 
-    def _numbers(self) -> Mapping[str, object]:
+    def _numbers(self) -> dict[str, Any]:
         replay = self._replay or Replay('', ())
         return {
             'messages': replay.messages,

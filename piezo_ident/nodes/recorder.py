@@ -17,7 +17,6 @@ keep what comes while one is closed and the next one made.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 import threading
 import time
@@ -229,7 +228,7 @@ class RecorderNode(LabNode):
     def _lost(self) -> int:
         return 0 if self._inputs is None else self._inputs.lost
 
-    def _numbers(self) -> Mapping[str, object]:
+    def _numbers(self) -> dict[str, Any]:
         recording = self._recording or Recording('')
         return {
             'messages': recording.messages,
@@ -239,7 +238,9 @@ class RecorderNode(LabNode):
         }
 
     def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
-        self.report_status(state, progress, message, level, **self._numbers())
+        numbers = self._numbers()
+        brief = f'{numbers["messages"]} messages: {message}' if state == 'recording' else message
+        self.report_status(state, progress, message, level, brief=brief, **numbers)
 
 
 def main(argv: Any = None) -> int:

@@ -255,9 +255,9 @@ class StageNode(LabNode):
     def _report_state(self) -> None:
         faults = self._recent_faults()
         now = {'running': self._segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
-        message = f'{now}; {faults}' if faults else now
+        text = f'{faults}; {now}' if faults else now
         level = WARN if faults else OK
-        self.report_status(self._state, 0.0, message, level, segment=self._segment)
+        self.report_status(self._state, 0.0, text, level, segment=self._segment)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost, altered and refused, and head-room."""

@@ -112,6 +112,8 @@ class Graph(Observer):
             self._lock.close()
         if kind is None:
             assert not self._unknown, f'states that no table knows: {self._unknown}'
+            # what ros2 topic echo shows of a text ends at 128 characters
+            assert not self._unfit, f'too long, or the prose is not the last value: {self._unfit}'
 
     def _spin(self) -> None:
         while not self._end.is_set():

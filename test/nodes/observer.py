@@ -68,6 +68,7 @@ class Observer:
         self._texts: dict[str, list[str]] = {}
         self._publishers: dict[str, Any] = {}
         self._unknown: set[tuple[str, str]] = set()
+        self._unfit: set[tuple[str, str]] = set()
         self._broken: Exception | None = None
         self._end = threading.Event()
 
@@ -98,6 +99,8 @@ class Observer:
             values = {pair.key: pair.value for pair in message.values}
             level = int.from_bytes(message.level, 'little')
             heard.append({**values, 'message': message.message, 'level': str(level)})
+            if len(message.message) > 100 or message.values[-1].key != 'text':
+                self._unfit.add((name, message.message))
             if known and values['state'] not in known:
                 self._unknown.add((executable, values['state']))
 
@@ -131,10 +134,14 @@ class Observer:
             )
 
     def status(self, name: str) -> dict[str, str]:
-        """Return the latest status of a node: state, progress, message, level, ..."""
+        """Return the latest status of a node: state, progress, message, level, text, ..."""
         self.follow(name)
         heard = self._statuses[name]
-        return heard[-1] if heard else {'state': '', 'progress': '', 'message': '', 'level': ''}
+        return (
+            heard[-1]
+            if heard
+            else dict.fromkeys(('state', 'progress', 'message', 'level', 'text'), '')
+        )
 
     def statuses(self, name: str) -> list[dict[str, str]]:
         """Return all that was heard of a node's status."""

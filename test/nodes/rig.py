@@ -26,7 +26,7 @@ def captured(g: Graph, name: str = 'identifier') -> dict[str, float]:
     """Return the seconds of each topic that an identifier says it has."""
     # at the end of a work, the status is about that
     idle = g.status(name)['state'] == 'idle'
-    text = g.status(name)['message'] if idle else g.diagnostics(name).get('topics', '')
+    text = g.status(name)['text'] if idle else g.diagnostics(name).get('topics', '')
     found = re.findall(r'([0-9.]+) s of (\w+)', text)
     return {key: float(seconds) for seconds, key in found}
 
@@ -34,7 +34,7 @@ def captured(g: Graph, name: str = 'identifier') -> dict[str, float]:
 def warned(g: Graph, node: str, said: str, since: int) -> None:
     """Wait for a warning in the status of a node."""
     g.wait(
-        lambda: any(said in s['message'] and s['level'] != '0' for s in g.statuses(node)[since:]),
+        lambda: any(said in s['text'] and s['level'] != '0' for s in g.statuses(node)[since:]),
         f'{node} to say {said!r}',
     )
 

@@ -63,12 +63,12 @@ def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
         attack.send('voltage', message)
         for node in ('stage', 'model'):
             g.wait(
-                lambda said=said, node=node: any(said in s['message'] for s in g.statuses(node)),
+                lambda said=said, node=node: any(said in s['text'] for s in g.statuses(node)),
                 f'{node} to say {said!r}',
             )
     # nothing that was sent is said again at its length
-    assert max(len(s['message']) for s in g.statuses('stage')) < 2000
-    assert max(len(s['message']) for s in g.statuses('model')) < 4000
+    assert max(len(s['text']) for s in g.statuses('stage')) < 2000
+    assert max(len(s['text']) for s in g.statuses('model')) < 4000
     g.wait(lambda: int(g.diagnostics('stage')['refused_malformed']) >= 15, 'refused blocks')
 
 

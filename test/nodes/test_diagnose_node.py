@@ -165,17 +165,17 @@ def stories(lab):
 def test_it_asks_for_what_it_lacks_and_tells_creep_from_rate_dependence(lab, stories, truth):
     said = stories[truth]
     assert said[-1]['state'] == 'done', said[-1]
-    exciting = [s['message'] for s in said if s['state'] == 'exciting']
+    exciting = [s['text'] for s in said if s['state'] == 'exciting']
     # how much was captured follows
     asked = list(dict.fromkeys(': '.join(m.split(': ')[:2]) for m in exciting))
-    print(truth, asked, said[-1]['message'])
+    print(truth, asked, said[-1]['text'])
     assert [a.split(':')[0] for a in asked] == ['asking for sweeps', 'asking for holds']
     assert truth in asked[1] and 'hold' in asked[1]
     assert {s['state'] for s in said} == {'exciting', 'diagnosing', 'done'}
     report = json.loads(lab.texts(f'{truth}/report')[-1])
     assert report['records'] == ['capture 1', 'capture 2']
     assert (report['verdict'], [e['name'] for e in report['effects']]) == ('named', [truth])
-    assert said[-1]['message'] == report['sentence'].rstrip('.')
+    assert said[-1]['text'] == report['sentence'].rstrip('.')
     error = report['error']
     assert error['after']['overall'] < 0.3 * error['before']['overall']
 
@@ -200,7 +200,7 @@ def test_save_writes_both_reports(lab, stories, tmp_path):
     truth = TRUTHS[1]
     assert lab.set(f'{truth}/identifier', 'output', str(tmp_path / 'out'))[0]
     last = end_of(lab, truth, begin(lab, truth, 'save'))[-1]
-    assert last['state'] == 'done' and last['message'].count('report.html') == 2, last
+    assert last['state'] == 'done' and last['text'].count('report.html') == 2, last
     folder = tmp_path / 'out'
     assert not load(folder / 'model.yaml').effects
     assert [e.name for e in load(folder / 'diagnosis/model.yaml').effects] == [truth]
@@ -214,14 +214,14 @@ def test_cancel_stops_the_work_and_changes_nothing(lab, stories):
     node = f'{truth}/identifier'
     models, reports = len(lab.texts(f'{truth}/model')), len(lab.texts(f'{truth}/report'))
     seen = begin(lab, truth, 'diagnose')
-    lab.wait(lambda: lab.status(node)['message'] == 'candidates', 'the candidates')
+    lab.wait(lambda: lab.status(node)['text'] == 'candidates', 'the candidates')
     ok, reason = lab.call(f'{node}/diagnose')
     assert not ok and 'busy: diagnosis' in reason
     asked = time.monotonic()
     assert lab.call(f'{node}/cancel')[0]
     last = end_of(lab, truth, seen)[-1]
     print(f'cancelled in {time.monotonic() - asked:.2f} s')
-    assert last['state'] == 'cancelled' and 'nothing was changed' in last['message']
+    assert last['state'] == 'cancelled' and 'nothing was changed' in last['text']
     assert len(lab.texts(f'{truth}/model')) == models
     assert len(lab.texts(f'{truth}/report')) == reports
 

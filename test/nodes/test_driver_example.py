@@ -94,9 +94,7 @@ def test_a_program_is_followed_bit_by_bit(lab):
         assert column(back, 't').tobytes() == column(voltage, 't').tobytes()
     np.testing.assert_array_equal(column(y), 7.5e-6 * column(voltage))
     seconds = f'{n / FS:.3f} s'
-    lab.wait(
-        lambda: lab.status('identifier')['message'].count(seconds) >= 2, 'both streams captured'
-    )
+    lab.wait(lambda: lab.status('identifier')['text'].count(seconds) >= 2, 'both streams captured')
 
 
 def test_a_second_publisher_is_refused(lab, begin):
@@ -107,7 +105,7 @@ def test_a_second_publisher_is_refused(lab, begin):
     for k in range(5):
         lab.publish('voltage', block(10_000_000 + 100 * k, 0.5, segment='foreign'))
     lab.wait(
-        lambda: any('second publisher' in s['message'] for s in lab.statuses('stage')), 'refusal'
+        lambda: any('second publisher' in s['text'] for s in lab.statuses('stage')), 'refusal'
     )
     seen = len(y)
     lab.wait(lambda: len(y) > seen + 40, 'the stream going on')

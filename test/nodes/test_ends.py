@@ -83,7 +83,7 @@ def in_the_middle(record, tmp_path):
             for b in pair:
                 g.publish(f'busy/{b.quantity}', b)
             time.sleep(0.005)
-        g.wait(lambda: g.status('busy/identifier')['message'].count('3.370 s of') == 2, 'data')
+        g.wait(lambda: g.status('busy/identifier')['text'].count('3.370 s of') == 2, 'data')
         assert g.call('busy/identifier/identify')[0]
         for where in ('', 'slow/'):
             assert g.call(f'{where}excitation/start')[0]
@@ -93,7 +93,7 @@ def in_the_middle(record, tmp_path):
         g.wait(lambda: fed and fed[-1].values[-1] == 10.0, 'the other stage at 10 V')
         g.wait(lambda: applied and applied[-1].values[-1] == 9.0, '9 V')
         g.wait(lambda: prediction and replayed, 'model and player at work')
-        g.wait(lambda: g.status('busy/identifier')['message'] == 'hysteresis', 'the swarm')
+        g.wait(lambda: g.status('busy/identifier')['text'] == 'hysteresis', 'the swarm')
         g.wait(lambda: int(g.status('recorder')['messages']) > 20, 'the recorder at work')
         helpers = g.handle('busy/identifier').children()
         assert helpers

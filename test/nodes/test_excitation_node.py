@@ -226,7 +226,7 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         g.start('excitation', {'program': SLOW, 'wait_limit': 0.3})
         status = g.finish('excitation/start')
         assert status['state'] == 'failed'
-        assert '0 of 1 subscribers on /voltage after 0.3 s' in status['message']
+        assert '0 of 1 subscribers on /voltage after 0.3 s' in status['text']
         # stop while waiting
         assert g.set('excitation', 'wait_limit', 60.0)[0]
         assert g.call('excitation/start')[0]
@@ -255,7 +255,7 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         second = g.node.create_publisher(Float64MultiArray, 'voltage', 10)
         g.wait(
             lambda: any(
-                'second publisher' in s['message'] and s['level'] == '1'
+                'second publisher' in s['text'] and s['level'] == '1'
                 for s in g.statuses('excitation')
             ),
             'the warning',

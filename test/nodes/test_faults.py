@@ -140,7 +140,7 @@ def test_what_is_wrong_with_the_stream_is_said_and_makes_no_bad_model(rig, name)
     end = rig.g.finish('identifier/identify')
     if fault.failure:
         assert end['state'] == 'failed' and end['level'] == '2'
-        assert fault.failure in end['message'] and '\n' not in end['message']
+        assert fault.failure in end['text'] and '\n' not in end['text']
         assert len(rig.models) == models and len(rig.reports) == reports
         return
     assert end['state'] == 'done', end
@@ -207,7 +207,7 @@ def test_a_stage_that_stops_answering_and_answers_late(rig):
         assert len(rig.answers) == count
         models = len(rig.models)
         end = rig.g.finish('identifier/identify')
-        assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
+        assert end['state'] == 'failed' and 'of the noise segments are missing' in end['text']
     finally:
         stage.send(signal.SIGCONT)
     rig.g.wait(lambda: len(rig.answers) >= count + 6, 'what waited for the stage')
@@ -258,7 +258,7 @@ def test_a_stage_that_is_killed_and_comes_back_joins_by_a_ramp(rig):
     rig.settle()
     rig.warned('identifier', 'samples of displacement are missing')
     end = g.finish('identifier/identify')
-    assert end['state'] == 'failed' and 'of the noise segments are missing' in end['message']
+    assert end['state'] == 'failed' and 'of the noise segments are missing' in end['text']
     assert len(rig.models) == models
 
 
@@ -271,17 +271,17 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     rig.send(BLOCKS[:K])
     g.handle('model').kill()
     node = g.restart(g.handle('model'))
-    g.wait(lambda: node.status()['message'] == 'with topic model', 'the latched model')
+    g.wait(lambda: node.status()['text'] == 'with topic model', 'the latched model')
     tick = rig.meet(rig.answered(), BLOCKS[K - 1].values[-1])
     # in the middle of a stream it cannot know the memory, and says so
     unknown = 'its memory is unknown until the voltage has been at its lowest'
-    g.wait(lambda: unknown in node.status()['message'], unknown)
+    g.wait(lambda: unknown in node.status()['text'], unknown)
     # what it says of the hold may be on its way yet
     g.wait(lambda: round(rig.prediction[-1].t[-1] * FS) == tick - 1, 'the hold to be predicted')
     count, rest = len(rig.prediction), shifted(BLOCKS[K:], tick)
     rig.send(rest)
     g.wait(lambda: len(rig.prediction) >= count + len(rest), 'predictions')
     assert column(rig.prediction[count:])[0].tobytes() == column(rest)[0].tobytes()
-    g.wait(lambda: node.status()['message'] == 'with topic model', 'a memory that is known')
+    g.wait(lambda: node.status()['text'] == 'with topic model', 'a memory that is known')
     y = column(rig.answers[-20:])[1]
     np.testing.assert_allclose(column(rig.prediction[-20:])[1], y, atol=1e-3 * np.ptp(y))

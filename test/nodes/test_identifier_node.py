@@ -51,7 +51,7 @@ def state(g):
 def captured(g, **seconds):
     """Wait until the identifier says that it has this much of each topic."""
     text = ', '.join(f'{s:.3f} s of {key}' for key, s in seconds.items()) + ' captured'
-    g.wait(lambda: g.status('identifier')['message'].split(';')[0] == text, text)
+    g.wait(lambda: g.status('identifier')['text'].split(';')[0] == text, text)
 
 
 def feed(g, pairs):
@@ -133,7 +133,7 @@ def test_what_comes_late_still_hears_the_model(fed):
     assert report['hysteresis']['weights'] == weights.tolist()
     late = fed.start('model')
     fed.wait(lambda: late.status()['state'] == 'predicting', 'the latched model')
-    assert late.status()['message'] == 'with topic model'
+    assert late.status()['text'] == 'with topic model'
     assert late.stop() == 0
     # and so does anybody else
     heard = {'model': [], 'report': []}
@@ -150,11 +150,11 @@ def test_each_step_reports_what_it_found(fed):
     models, reports = len(fed.texts('model')), len(fed.texts('report'))
     in_one = numbers(model_of(fed.texts('model')[-1]))
     end = fed.finish('identifier/identify_delay')
-    assert end['state'] == 'done' and end['message'] == 'delay: 3 samples (steps)'
+    assert end['state'] == 'done' and end['text'] == 'delay: 3 samples (steps)'
     fed.wait(lambda: len(fed.texts('report')) > reports, 'report')
     assert json.loads(fed.texts('report')[-1])['delay']['samples'] == 3
     end = fed.finish('identifier/identify_dynamics')
-    assert end['state'] == 'done' and end['message'].startswith('dynamics: na = ')
+    assert end['state'] == 'done' and end['text'].startswith('dynamics: na = ')
     fed.wait(lambda: len(fed.texts('report')) > reports + 1, 'report')
     assert 'order' in json.loads(fed.texts('report')[-1])['dynamics']
     # single steps before the last make no model
@@ -175,7 +175,7 @@ def test_save_writes_model_report_and_pictures(fed, tmp_path):
     assert not ok and 'is a file' in reason
     assert fed.set('identifier', 'output', str(tmp_path / 'out'))[0]
     end = fed.finish('identifier/save')
-    assert end['state'] == 'done' and end['message'].startswith('written: '), end
+    assert end['state'] == 'done' and end['text'].startswith('written: '), end
     assert fed.set('identifier', 'output', '')[0]
     names = {p.name for p in (tmp_path / 'out').iterdir()}
     assert {'model.yaml', 'report.html', 'identification.json', 'loops.png'} <= names
@@ -185,7 +185,7 @@ def cancelled_at(g, step, during):
     """Identify, cancel in a step, and return how long the answer and the end took [s]."""
     begun = len(g.statuses('identifier'))
     assert g.call('identifier/identify')[0]
-    g.wait(lambda: any(s['message'] == step for s in g.statuses('identifier')[begun:]), step)
+    g.wait(lambda: any(s['text'] == step for s in g.statuses('identifier')[begun:]), step)
     during()
     seen = len(g.statuses('identifier'))
     begin = time.monotonic()
@@ -278,7 +278,7 @@ def test_small_faults_are_said_in_model_and_report(empty, blocks):
     again = blocks[k + 2]
     feed(empty, [*blocks[:k], (v0, nan(y0)), (v1, short), again, again, *blocks[k + 3 :]])
     end = made(empty)
-    assert end['level'] == '1' and 'warnings in the report' in end['message']
+    assert end['level'] == '1' and 'warnings in the report' in end['text']
     report = json.loads(empty.texts('report')[-1])
     assert {'not_finite', 'gap', 'unmatched', 'repeated_rows'} <= {
         f['name'] for f in report['data_faults']
@@ -318,8 +318,8 @@ def test_a_fault_that_spoils_the_data_is_a_failure_with_its_reason(empty, blocks
     feed(empty, pairs)
     models = len(empty.texts('model'))
     end = empty.finish('identifier/identify')
-    assert end['state'] == 'failed' and reason in end['message'], end
-    assert '\n' not in end['message']
+    assert end['state'] == 'failed' and reason in end['text'], end
+    assert '\n' not in end['text']
     assert len(empty.texts('model')) == models
     if fault == 'malformed':
         said = '3 messages on displacement are no blocks'
@@ -376,7 +376,7 @@ def test_a_further_channel_is_captured(empty, blocks):
     said = (
         "1 messages on temperature are no blocks (layout says 't,temperature', not 't,x_<name>')"
     )
-    empty.wait(lambda: said in empty.status('identifier')['message'], said)
+    empty.wait(lambda: said in empty.status('identifier')['text'], said)
     assert empty.status('identifier')['level'] == '1'
 
 

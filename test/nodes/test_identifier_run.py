@@ -21,14 +21,14 @@ def course():
 def test_run_without_an_excitation_fails_with_the_reason(course):
     end = course.finish('identifier/run')
     assert end['state'] == 'failed'
-    assert "no excitation offers 'excitation/start' within 1 s" in end['message']
+    assert "no excitation offers 'excitation/start' within 1 s" in end['text']
 
 
 def test_run_without_a_stage_fails_with_the_reason(course):
     course.start('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 2})
     said = 'no publisher of displacement within 1 s'
     # it may take a moment to know of the excitation
-    course.wait(lambda: said in course.finish('identifier/run')['message'], said)
+    course.wait(lambda: said in course.finish('identifier/run')['text'], said)
     assert course.status('identifier')['level'] == '2'
 
 
@@ -37,7 +37,7 @@ def test_run_drives_the_excitation_and_identifies(course):
     assert course.set('identifier', 'excitation_limit', 20.0)[0]
     assert course.set('identifier', 'program', 'nonsense')[0]
     end = course.finish('identifier/run')
-    assert end['state'] == 'failed' and 'the excitation refuses the program' in end['message']
+    assert end['state'] == 'failed' and 'the excitation refuses the program' in end['text']
     assert course.set('identifier', 'program', PROGRAM)[0]
     end = course.finish('identifier/run')
     assert (end['state'], end['level']) == ('done', '0'), end

@@ -83,10 +83,10 @@ def test_without_a_model_it_waits_and_says_so(lab):
     assert not ok and 'no such file' in reason
     # refused texts leave it waiting
     lab.publish_text('model', 'a: [')
-    lab.wait(lambda: 'there is no model' in node.status()['message'], 'refusal')
-    assert node.status()['level'] == '1' and 'not valid YAML' in node.status()['message']
+    lab.wait(lambda: 'there is no model' in node.status()['text'], 'refusal')
+    assert node.status()['level'] == '1' and 'not valid YAML' in node.status()['text']
     lab.publish_text('model', paper(dynamics={'a': [-1.5], 'b': [1.0]}))
-    lab.wait(lambda: 'unstable' in node.status()['message'], 'refusal')
+    lab.wait(lambda: 'unstable' in node.status()['text'], 'refusal')
     # voltage that came before the model counts
     prediction = lab.collect('prediction')
     since = len(lab.diagnoses('model'))
@@ -238,7 +238,7 @@ def test_faults_of_the_stream_are_said_and_survived(fast):
         count += answers
 
         def told(said=said, begin=begin):
-            return any(said in s['message'] for s in fast.statuses('model')[begin - 1 :])
+            return any(said in s['text'] for s in fast.statuses('model')[begin - 1 :])
 
         fast.wait(told, said)
     t, y = heard(fast, 'prediction', since['prediction'], count)
@@ -288,7 +288,7 @@ def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
     heard(fast, 'prediction', since['prediction'], 10)
     fast.publish_text('model', paper(sample_rate=5000.0))
     said = 'the old model is kept: topic model: the stream is sampled at 20000 Hz'
-    fast.wait(lambda: said in fast.status('model')['message'], said)
+    fast.wait(lambda: said in fast.status('model')['text'], said)
     send(fast, blocks(500, 1000))
     _, y = heard(fast, 'prediction', since['prediction'] + 10, 5)
     _, v = sine(1500)
@@ -302,9 +302,9 @@ def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     other.write_text(model_to_yaml(model_of(OTHER)))
     node = lab.start('model', {'model': str(file), 'preview_rate': 100.0})
     lab.wait(lambda: node.status()['state'] == 'predicting', 'the file')
-    assert node.status()['message'] == f'with {file}'
+    assert node.status()['text'] == f'with {file}'
     assert lab.set('model', 'model', str(other)) == (True, '')
-    lab.wait(lambda: node.status()['message'] == f'with {other}', 'the other file')
+    lab.wait(lambda: node.status()['text'] == f'with {other}', 'the other file')
     prediction = lab.collect('prediction')
     lab.matched('prediction')
     send(lab, blocks(1000))

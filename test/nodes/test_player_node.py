@@ -133,7 +133,7 @@ def test_replay(lab, tmp_path):
     lab.wait(lambda: len(voltage) > before + 5, 'the third replay')
     ok, reason = lab.call('b/player/start')
     assert not ok and 'replaying already' in reason
-    assert 'stopped after' in lab.finish('b/player/stop')['message']
+    assert 'stopped after' in lab.finish('b/player/stop')['text']
 
 
 def test_refusals_and_waiting(lab, tmp_path):
@@ -150,7 +150,7 @@ def test_refusals_and_waiting(lab, tmp_path):
     ):
         assert lab.set('c/player', 'bag', str(tmp_path / name))[0]
         assert lab.call('c/player/start')[0]
-        lab.wait(lambda r=reason: r in lab.status('c/player')['message'], reason)
+        lab.wait(lambda r=reason: r in lab.status('c/player')['text'], reason)
         assert lab.status('c/player')['state'] == 'refused'
     ok, reason = lab.set('c/player', 'topics', ['a b'])
     assert not ok
@@ -159,7 +159,7 @@ def test_refusals_and_waiting(lab, tmp_path):
     assert lab.set('c/player', 'topics', ['voltage', 'displacement'])[0]
     # nobody listens
     assert lab.call('c/player/start')[0]
-    assert '/c/voltage (0 of 1)' in lab.until('c/player', 'failed')['message']
+    assert '/c/voltage (0 of 1)' in lab.until('c/player', 'failed')['text']
     # somebody comes while it waits
     assert lab.set('c/player', 'wait_limit', 60.0)[0]
     since = len(lab.statuses('c/player'))

@@ -138,11 +138,11 @@ def test_record_stop_and_refusals(tmp_path):
             assert g.call('a/recorder/start')[0]
             g.wait(
                 lambda p=place: (
-                    (s := g.status('a/recorder'))['state'] == 'failed' and p.name in s['message']
+                    (s := g.status('a/recorder'))['state'] == 'failed' and p.name in s['text']
                 ),
                 'the refusal',
             )
-            assert 'cannot be written' in g.status('a/recorder')['message']
+            assert 'cannot be written' in g.status('a/recorder')['text']
         g.wait(lambda: 'rate' in g.diagnostics('a/recorder'), 'diagnostics')
     got = contents(tmp_path / 'bag')
     assert arrays(got['/a/voltage']) == [v for v, _ in source.messages]
@@ -192,7 +192,7 @@ def test_a_long_recording_is_cut_into_parts_and_loses_nothing(tmp_path):
         status = g.status('recorder')
     parts = sorted(tmp_path.glob('bag*'), key=lambda p: (len(p.name), p.name))
     assert int(status['messages']) == 2 * len(source.sent) and status['lost'] == '0'
-    assert f'and {len(parts) - 1} before it' in status['message']
+    assert f'and {len(parts) - 1} before it' in status['text']
     sizes = [next(p.glob('*.mcap')).stat().st_size for p in parts]
     assert int(status['bytes']) == sum(sizes) and min(sizes[:-1]) >= 500_000
     found = [contents(p) for p in parts]
@@ -222,7 +222,7 @@ def test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said(tmp_path):
         assert flushes[0.5] <= 4.0 < flushes[0.05], flushes
         g.wait(lambda: g.status('recorder')['state'] == 'failed', 'the failure')
         status = g.status('recorder')
-        assert status['level'] == '2' and path in status['message'], status
+        assert status['level'] == '2' and path in status['text'], status
         g.wait(lambda: g.diagnostics('recorder')['level'] == '2', 'the same in diagnostics')
 
 

@@ -53,7 +53,7 @@ def ended(g: Graph, seen: int, state: str) -> str:
     """Wait for the end of a run, and return its message."""
     end = g.until('identifier', *ENDS, since=seen)
     assert end['state'] == state, end
-    return end['message']
+    return end['text']
 
 
 def at_nine_volts(g: Graph) -> None:
@@ -80,7 +80,7 @@ def test_two_excitations_on_one_topic(lab):
     )
     assert lab.call('twin/start')[0]
     lab.wait(lambda: lab.status('other/twin')['state'] == 'failed', 'the twin to give up')
-    said = lab.status('other/twin')['message']
+    said = lab.status('other/twin')['text']
     assert 'another /excitation is playing on /voltage' in said
     assert twin.stop() == 0
     other = lab.start('excitation', {'program': HIGH}, remaps={'__node': 'other'})
@@ -89,7 +89,7 @@ def test_two_excitations_on_one_topic(lab):
     ok, reason = lab.call('other/start')
     assert not ok and '/excitation publishes on /voltage too; end it first' in reason
     warning = 'second publisher /other on voltage'
-    lab.wait(lambda: warning in lab.status('excitation')['message'], warning)
+    lab.wait(lambda: warning in lab.status('excitation')['text'], warning)
     assert lab.status('excitation')['level'] == '1'
     assert other.stop() == 0
     lab.wait(lambda: lab.status('excitation')['level'] == '0', 'the warning to be taken back')
@@ -104,7 +104,7 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     killed.kill()
     lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'the ramp')
     assert lab.status('stage')['level'] == '1'
-    assert 'no voltage for' in lab.status('stage')['message']
+    assert 'no voltage for' in lab.status('stage')['text']
     lab.restart(killed)
     assert 'the excitation ended early (idle)' in ended(lab, seen, 'failed')
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'rest')
@@ -166,7 +166,7 @@ def test_a_stage_that_answers_no_block(graph):
     ok, reason = graph.call('odd/identifier/run')
     assert ok, reason
     graph.wait(lambda: graph.status('odd/identifier')['state'] == 'failed', 'the end of the run')
-    reason = graph.status('odd/identifier')['message']
+    reason = graph.status('odd/identifier')['text']
     assert 'no displacement from the stage for 2 s, none at all' in reason
     assert graph.status('odd/stage')['level'] == '1'
 
@@ -204,7 +204,7 @@ def test_a_bag_that_ends_early(graph, tmp_path):
     assert graph.set('replay/player', 'rate', 4.0)[0]
     end = graph.finish('replay/player/start')
     assert (end['state'], end['level']) == ('done', '1')
-    assert 'the bag ends early: truncated_bag' in end['message']
+    assert 'the bag ends early: truncated_bag' in end['text']
     end = graph.finish('replay/identifier/identify')
     assert (end['state'], end['level']) == ('done', '1'), end
     graph.wait(lambda: graph.texts('replay/model'), 'the model')

@@ -81,7 +81,7 @@ def test_two_graphs_side_by_side(tmp_path):
         np.testing.assert_allclose(found['a/'], found[''], rtol=1e-12)
         for where in WHERE:
             g.wait(
-                lambda w=where: g.status(f'{w}model')['message'] == 'with topic model',
+                lambda w=where: g.status(f'{w}model')['text'] == 'with topic model',
                 'the model to be taken over',
             )
 

@@ -32,9 +32,7 @@ def idle(g):
 def warned(g, text, since=0):
     """Wait for a warning in the status, which is shown for three seconds."""
     g.wait(
-        lambda: any(
-            text in s['message'] and s['level'] == '1' for s in g.statuses('stage')[since:]
-        ),
+        lambda: any(text in s['text'] and s['level'] == '1' for s in g.statuses('stage')[since:]),
         text,
     )
 
@@ -164,7 +162,7 @@ def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab, rest, ramp_slew)
         assert lab.set('stage', 'ramp_slew', 20.0)[0]
     said = lab.statuses('stage')[since:]
     assert next(s['state'] for s in said if s['state'] != 'running') == 'ramping'
-    assert any('ramping to rest' in s['message'] and s['level'] == '1' for s in said)
+    assert any('ramping to rest' in s['text'] and s['level'] == '1' for s in said)
     # t goes on, at 20 V/s at its steepest
     ramp = [b for b in got[applied:] if b.segment == 'ramp:silence']
     t, v = column(got[applied:])

@@ -65,7 +65,7 @@ def test_a_run_through_the_whole_graph(whole):
     report = json.loads(whole.texts('report')[-1])
     assert report['data_faults'] == [] and report['delay']['samples'] == 3
     assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
-    whole.wait(lambda: whole.status('model')['message'] == 'with topic model', 'the model')
+    whole.wait(lambda: whole.status('model')['text'] == 'with topic model', 'the model')
     assert whole.finish('recorder/stop')['state'] == 'done'
     assert whole.set('excitation', 'subscribers', 3)[0]
     record = pi.read(whole.output / 'bag')

@@ -137,7 +137,7 @@ class ExcitationClient:
 
     def _hear(self, message: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in message.values}
-        self._state, self._message = values.get('state', ''), message.message
+        self._state, self._message = values.get('state', ''), values.get('text', message.message)
         if self._phase != 'playing':
             return
         self._sign = time.monotonic()

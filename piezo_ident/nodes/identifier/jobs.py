@@ -10,7 +10,8 @@ the worker adds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 
@@ -79,6 +80,10 @@ class IdentificationOutcome:
     ----------
     message : str
         One line for people.
+    brief : str
+        The same in few words, a number first.
+    figures : mapping of str to str
+        The numbers in the message.
     report : str
         JSON.
     warnings : int
@@ -91,19 +96,20 @@ class IdentificationOutcome:
     """
 
     message: str
+    brief: str = ''
+    figures: Mapping[str, str] = field(default_factory=dict)
     report: str = ''
     warnings: int = 0
     steps: Steps | None = None
     identification: Identification | None = None
     model: str = ''
 
-    @property
-    def sentence(self) -> str:
-        """The message, with the number of warnings."""
-        if not self.warnings:
-            return self.message
+    def with_warnings(self, text: str) -> str:
+        """Return a text with the number of warnings behind it."""
+        if not self.warnings or not text:
+            return text
         plural = 's' * (self.warnings > 1)
-        return f'{self.message.rstrip(".")}; {self.warnings} warning{plural} in the report'
+        return f'{text.rstrip(".")}; {self.warnings} warning{plural} in the report'
 
 
 def settings_of(values: dict[str, object]) -> Settings:
@@ -159,14 +165,19 @@ def identify_capture(
     if which == 'delay' or which == 'dynamics':
         step = first_steps(records, settings, which=which, steps=steps, progress=tick)
         data = steps_to_json(step, record.pieces[0].sample_rate, records)
-        return IdentificationOutcome(_sentence(step), json.dumps(data), len(record.faults), step)
+        return IdentificationOutcome(
+            _sentence(step), report=json.dumps(data), warnings=len(record.faults), steps=step
+        )
     known = (steps or Steps()) if which == 'hysteresis' else None
     result = identify(records, settings, steps=known, progress=tick)
     tick('report', 0.98)
     runs = piece_runs(result.model, records, result.memories)
     tick('report', 0.99)
+    error, static = (f'{x:.3g}' for x in (result.headline.percent, result.headline.static_percent))
     return IdentificationOutcome(
         message=headline(result),
+        brief=f'{error} % of stroke, hysteresis alone {static} %',
+        figures={'error_percent': error, 'static_percent': static},
         report=json_text(result, runs),
         warnings=len(result.warnings),
         steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
@@ -192,14 +203,19 @@ class DiagnosisOutcome:
     ----------
     diagnosis : Diagnosis or None
         None when the capture holds no motion.
-    message, report, model, given : str
-        The sentence, the diagnosis as JSON, the refined model and the given one as YAML.
+    message, brief, report, model, given : str
+        The sentence, the same in few words, the diagnosis as JSON, the refined model and the given
+        one as YAML.
+    figures : mapping of str to str
+        The numbers in the sentence.
     wanted : Experiment or None
         The experiment that would decide what is open.
     """
 
     diagnosis: Diagnosis | None
     message: str = ''
+    brief: str = ''
+    figures: Mapping[str, str] = field(default_factory=dict)
     report: str = ''
     model: str = ''
     given: str = ''
@@ -253,14 +269,22 @@ def diagnose_capture(
     faults = (fault for fault in record.faults if fault.name != 'restart')
     result = replace(result, faults=(*faults, *result.faults))
     tick('report', 0.99)
+    before, after = (f'{e.overall:.3g}' for e in (result.before, result.after))
     return DiagnosisOutcome(
         result,
         message=result.sentence,
+        brief=f'{after} % of stroke, before {before} %: {_verdict(result)}',
+        figures={'verdict': result.verdict, 'before_percent': before, 'after_percent': after},
         report=json_text(result),
         model=model_to_yaml(result.model),
         given=model_to_yaml(given),
         wanted=next_experiment(result, records, asked),
     )
+
+
+def _verdict(result: Diagnosis) -> str:
+    names = ' and '.join(effect.name for effect in result.effects)
+    return f'{result.verdict} {names}'.rstrip()
 
 
 def _is_driven(model: StageModel, record: Record) -> bool:

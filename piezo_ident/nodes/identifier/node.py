@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 import functools
 from pathlib import Path
@@ -19,7 +19,8 @@ from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.model.files import load
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
-from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
+from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
+from piezo_ident.nodes.identifier.inputs import Inputs
 from piezo_ident.nodes.identifier.jobs import (
     DiagnosisOutcome,
     IdentificationOutcome,
@@ -32,17 +33,13 @@ from piezo_ident.nodes.identifier.jobs import (
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
 from piezo_ident.nodes.parameters import NODES
-from piezo_ident.nodes.subscriptions import BlockSubscriptions
-from piezo_ident.nodes.wire import from_message, LATCHED
-from piezo_ident.record.join import APPLIED
-from std_msgs.msg import Float64MultiArray, String
+from piezo_ident.nodes.wire import LATCHED
+from std_msgs.msg import String
 
 __all__ = ['IdentifierNode', 'main']
 
 Result = IdentificationOutcome | DiagnosisOutcome | str
 
-#: quantities that a topic may say it carries, beside its own name
-_CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 #: how often the run of the excitation is looked at [s]
 POLL = 0.05
 #: how often it is told how much was captured [s]
@@ -72,16 +69,12 @@ class IdentifierNode(LabNode):
         if path := self.values['model']:
             self._session.take(load(path), {})
         self._rate = Rate()
-        self._passed: Counter[str] = Counter()
-        self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
-        self._inputs = BlockSubscriptions(self, lambda *block: self._held.append(block))
-        for key in ('voltage', 'displacement', APPLIED):
-            self._inputs.add(key, key)
-        for topic in self.values['channels'].split():
-            self._inputs.add(topic, '')
-        self._excitation = ExcitationClient(self, self._streams, self._unpublished)
+        self._inputs = Inputs(self, self._capture, self.values['channels'].split())
+        self._excitation = ExcitationClient(
+            self, self._inputs.streams, lambda: self._inputs.unpublished
+        )
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
@@ -103,52 +96,16 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        self._inputs.drain()
         # the earlier capture is kept until the excitation has accepted the start
-        if self._excitation.is_starting or not self._held:
-            return
-        while self._held:
-            self._take(*self._held.popleft())
-
-    def _take(
-        self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
-    ) -> None:
-        try:
-            samples = from_message(message)
-            known = (*_CARRIED[key], key) if key else ()
-            quantity = samples.quantity
-            # a further channel names itself
-            if quantity not in known and (key or not quantity.startswith('x_')):
-                wanted = key or 'x_<name>'
-                raise DataError(f"layout says 't,{quantity}', not 't,{wanted}'")
-        except DataError as error:
-            self._capture.unreadable(topic, str(error))
-            return
-        arrival = info.get('received_timestamp') or time.time_ns()
-        self._capture.add(key or samples.quantity, samples, arrival)
-        self._passed[topic] += samples.t.size
-
-    def _streams(self) -> Streams:
-        c = self._capture
-        answered = c.last_time('displacement')
-        if APPLIED in c.keys:
-            # the stage sends both, one after the other: a run ends with the later one
-            answered = min(answered, c.last_time(APPLIED))
-        return Streams(
-            self._passed['voltage'],
-            c.last_time('voltage'),
-            self._passed['displacement'],
-            answered,
-        )
-
-    def _unpublished(self) -> str:  # before it is met, what it sends is lost
-        return ', '.join(t for t in self._inputs.unpublished if t not in ('voltage', APPLIED))
+        self._inputs.drain(hold=self._excitation.is_starting)
 
     # state
 
-    def _set_state(self, state: str, progress: float, message: str, level: bytes = OK) -> None:
+    def _set_state(
+        self, state: str, progress: float, text: str, level: bytes = OK, **more: Any
+    ) -> None:
         self._state = state
-        self.report_status(state, progress, message, level)
+        self.report_status(state, progress, text, level, **more)
 
     def _poll(self) -> None:
         if self._excitation.running:
@@ -157,8 +114,8 @@ class IdentifierNode(LabNode):
             self._excitation.poll()
         if self._excitation.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
-            message = f'{self._task}: {self._capture.seconds:.0f} s captured{segment}'
-            self._report_capture('exciting', self._excitation.progress, message)
+            about = f'{self._capture.seconds:.0f} s captured{segment}: {self._task}'
+            self._report_capture('exciting', self._excitation.progress, about)
         elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
             self._reported_at = time.monotonic()
             kept = f'{self._kept()} captured' if self._capture.keys else 'ready'
@@ -314,8 +271,9 @@ class IdentifierNode(LabNode):
         self._report.publish(String(data=outcome.report))
         if outcome.model != (self._published or outcome.given):
             self._publish_model(outcome.model)
-        message = '; '.join([outcome.message.rstrip('.'), *notes])
-        self._set_state('done', 100.0, message, WARN if notes else OK)
+        text = '; '.join([outcome.message.rstrip('.'), *notes])
+        level, brief = WARN if notes else OK, outcome.brief
+        self._set_state('done', 100.0, text, level, brief=brief, **outcome.figures)
 
     def fail(self, reason: str) -> None:
         """Report why there is no verdict."""
@@ -359,7 +317,9 @@ class IdentifierNode(LabNode):
                 for warning in identified.warnings:
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
-            self._set_state('done', 100.0, result.sentence, level)
+            text, brief = (result.with_warnings(t) for t in (result.message, result.brief))
+            figures = {**result.figures, 'warnings': result.warnings}
+            self._set_state('done', 100.0, text, level, brief=brief, **figures)
         elif isinstance(result, DiagnosisOutcome):
             self._session.take_outcome(result)
         else:
@@ -369,7 +329,7 @@ class IdentifierNode(LabNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""
-        passed, capture = self._passed, self._capture
+        passed, capture = self._inputs.passed, self._capture
         values: dict[str, object] = {
             'state': self._state,
             'rate': f'{self._rate.of(passed["voltage"]):.0f}',

@@ -1,0 +1,97 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the identifier hears: blocks of voltage, displacement and channels, to be captured."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+import time
+from typing import Any
+
+from piezo_ident.common.errors import DataError
+from piezo_ident.live.capture import Capture
+from piezo_ident.nodes.identifier.excitation_client import Streams
+from piezo_ident.nodes.subscriptions import BlockSubscriptions
+from piezo_ident.nodes.wire import from_message
+from piezo_ident.record.join import APPLIED
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+
+__all__ = ['Inputs']
+
+#: quantities that a topic may say it carries, beside its own name
+_CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
+
+
+class Inputs:
+    """
+    The streams of a capture.
+
+    Parameters
+    ----------
+    node : Node
+    capture : Capture
+    channels : sequence of str
+        Topics of further channels.
+
+    Attributes
+    ----------
+    passed : Counter
+        Samples that came on each topic.
+    """
+
+    def __init__(self, node: Node, capture: Capture, channels: Sequence[str]) -> None:
+        self.passed: Counter[str] = Counter()
+        self._capture = capture
+        self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
+        self._subscriptions = BlockSubscriptions(node, lambda *block: self._held.append(block))
+        for key in ('voltage', 'displacement', APPLIED):
+            self._subscriptions.add(key, key)
+        for topic in channels:
+            self._subscriptions.add(topic, '')
+
+    def drain(self, *, hold: bool) -> None:
+        """Capture what has come, or keep it for later."""
+        self._subscriptions.drain()
+        while self._held and not hold:
+            self._take(*self._held.popleft())
+
+    def _take(
+        self, topic: str, key: str, message: Float64MultiArray, info: Mapping[str, Any]
+    ) -> None:
+        try:
+            samples = from_message(message)
+            known = (*_CARRIED[key], key) if key else ()
+            quantity = samples.quantity
+            # a further channel names itself
+            if quantity not in known and (key or not quantity.startswith('x_')):
+                wanted = key or 'x_<name>'
+                raise DataError(f"layout says 't,{quantity}', not 't,{wanted}'")
+        except DataError as error:
+            self._capture.unreadable(topic, str(error))
+            return
+        arrival = info.get('received_timestamp') or time.time_ns()
+        self._capture.add(key or samples.quantity, samples, arrival)
+        self.passed[topic] += samples.t.size
+
+    def streams(self) -> Streams:
+        """Return what the client of the excitation follows."""
+        c = self._capture
+        answered = c.last_time('displacement')
+        if APPLIED in c.keys:
+            # the stage sends both, one after the other: a run ends with the later one
+            answered = min(answered, c.last_time(APPLIED))
+        return Streams(
+            self.passed['voltage'],
+            c.last_time('voltage'),
+            self.passed['displacement'],
+            answered,
+        )
+
+    @property
+    def unpublished(self) -> str:
+        """Topics without a publisher: before it is met, what it sends is lost."""
+        topics = self._subscriptions.unpublished
+        return ', '.join(t for t in topics if t not in ('voltage', APPLIED))
