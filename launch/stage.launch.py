@@ -4,55 +4,103 @@
 """
 One stage in a namespace: excitation, stage (or a DAQ driver of your own), identifier, model.
 
+    ros2 launch piezo_ident stage.launch.py -s
     ros2 launch piezo_ident stage.launch.py namespace:=left use_simulated_stage:=false
 """
 
+from pathlib import Path
+
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
 
+#: name, default, choices, what it means; an empty text leaves a parameter as its YAML file has it
+ARGUMENTS = (
+    ('namespace', '', None, 'where all nodes live'),
+    (
+        'config',
+        str(Path(get_package_share_directory('piezo_ident'), 'config')),
+        None,
+        'folder with one YAML file of parameters for each node',
+    ),
+    (
+        'use_simulated_stage',
+        'true',
+        ['true', 'false'],
+        'false: a driver of your own publishes displacement and applied_voltage',
+    ),
+    ('stage', '', None, 'the stage to simulate: paper, dense, effects, or a file'),
+    (
+        'program',
+        '',
+        None,
+        'what /identifier/run and /excitation/start play: identification, survey, or a file',
+    ),
+    ('rate_factor', '', None, 'how many times faster than real time: 0.1 .. 4'),
+    ('sample_rate', '', None, 'of excitation and recording [Hz]; that of your driver'),
+    ('output', 'identified', None, 'folder into which /identifier/save writes'),
+    ('record', 'false', ['true', 'false'], 'true: record all topics from the start on'),
+    ('bag', '', None, 'bag to record; a number is added when it is there'),
+    (
+        'log_level',
+        'info',
+        ['debug', 'info', 'warn', 'error', 'fatal'],
+        'least level of the log on this console and /rosout',
+    ),
+)
 
-def generate_launch_description():
-    namespace = LaunchConfiguration('namespace')
-    config = LaunchConfiguration('config')
-    output = LaunchConfiguration('output')
 
-    def node(executable, *more, **kwargs):
+def nodes(context):
+    given = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
+
+    def node(executable, **parameters):
+        # a folder or a program may look like a number
+        values = {
+            name: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+            for name, value in parameters.items()
+            if value not in ('', None)
+        }
+        file = str(Path(given['config'], f'{executable}.yaml'))
         return Node(
             package='piezo_ident',
             executable=executable,
             name=executable,
-            namespace=namespace,
-            parameters=[PathJoinSubstitution([config, f'{executable}.yaml']), *more],
+            namespace=given['namespace'],
+            parameters=[file, values] if values else [file],
+            ros_arguments=['--log-level', given['log_level']],
             output='screen',
-            **kwargs,
         )
 
+    rates = {
+        name: float(given[name]) if given[name] else None
+        for name in ('rate_factor', 'sample_rate')
+    }
+    found = [
+        node('excitation', program=given['program'], **rates),
+        node('identifier', program=given['program'], output=given['output']),
+        node('model'),
+    ]
+    if given['use_simulated_stage'] == 'true':
+        found.append(node('stage', stage=given['stage']))
+    if given['record'] == 'true':
+        rate = rates['sample_rate']
+        found.append(node('recorder', output=given['bag'], sample_rate=rate, autostart=True))
+    return found
+
+
+def generate_launch_description():
     return LaunchDescription(
         [
-            DeclareLaunchArgument('namespace', default_value='', description='where it all lives'),
-            DeclareLaunchArgument(
-                'config',
-                default_value=[get_package_share_directory('piezo_ident'), '/config'],
-                description='folder with one YAML file a node',
+            *(
+                DeclareLaunchArgument(
+                    name, default_value=default, choices=choices, description=description
+                )
+                for name, default, choices, description in ARGUMENTS
             ),
-            DeclareLaunchArgument(
-                'use_simulated_stage',
-                default_value='true',
-                description='false: a DAQ driver publishes displacement and applied_voltage',
-            ),
-            DeclareLaunchArgument(
-                'output', default_value='identified', description='folder of ~/save'
-            ),
-            node('excitation'),
-            node('stage', condition=IfCondition(LaunchConfiguration('use_simulated_stage'))),
-            # a folder may look like a number
-            node('identifier', {'output': ParameterValue(output, value_type=str)}),
-            node('model'),
+            OpaqueFunction(function=nodes),
         ]
     )

@@ -34,14 +34,6 @@ class LaunchConfiguration(Substitution):
         return context[self.name]
 
 
-class PathJoinSubstitution(Substitution):
-    def __init__(self, substitutions):
-        self.parts = substitutions
-
-    def perform(self, context):
-        return str(Path(*(perform(part, context) for part in self.parts)))
-
-
 class ParameterValue(Substitution):
     def __init__(self, value, *, value_type=None, description=None):
         self.value, self.type = value, value_type
@@ -58,19 +50,23 @@ def perform(what, context):
 
 class DeclareLaunchArgument:
     def __init__(self, name, *, default_value=None, description=None, choices=None):
-        assert description
-        self.name, self.default = name, default_value
+        assert description and not description.endswith('.')
+        assert choices is None or default_value in choices
+        self.name, self.default, self.choices = name, default_value, choices
 
     def visit(self, context, started):
         context.setdefault(self.name, perform(self.default, context))
+        if self.choices is not None and context[self.name] not in self.choices:
+            raise RuntimeError(f'{self.name}: {context[self.name]} is none of {self.choices}')
 
 
-class IfCondition:
-    def __init__(self, predicate_expression):
-        self.expression = predicate_expression
+class OpaqueFunction:
+    def __init__(self, *, function):
+        self.function = function
 
-    def holds(self, context):
-        return {'true': True, 'false': False}[perform(self.expression, context)]
+    def visit(self, context, started):
+        for entity in self.function(context):
+            entity.visit(context, started)
 
 
 class Node:
@@ -87,24 +83,23 @@ class Node:
         ros_arguments=None,
         arguments=None,
         output=None,
-        condition=None,
     ):
         assert package == 'piezo_ident' and output == 'screen' and name == executable
         self.executable, self.namespace = executable, namespace
-        self.parameters, self.condition = parameters, condition
+        self.parameters, self.arguments = parameters, ros_arguments
 
     def visit(self, context, started):
-        if self.condition is not None and not self.condition.holds(context):
-            return
         values = {}
         for parameters in self.parameters:
             if isinstance(parameters, dict):
+                assert parameters, 'launch_ros wants at least one parameter of a mapping'
                 values.update({k: perform(v, context) for k, v in parameters.items()})
                 continue
             read = yaml.safe_load(Path(perform(parameters, context)).read_text(encoding='utf-8'))
             (block,) = read.values()
             values.update(block['ros__parameters'])
         started[perform(self.namespace, context), self.executable] = values
+        assert self.arguments == ['--log-level', context['log_level']]
 
 
 class PythonLaunchDescriptionSource:
@@ -114,7 +109,7 @@ class PythonLaunchDescriptionSource:
 
 class IncludeLaunchDescription:
     def __init__(self, source, *, launch_arguments=None):
-        self.path, self.arguments = source.location, list(launch_arguments)
+        self.path, self.arguments = source.location, list(launch_arguments or ())
 
     def visit(self, context, started):
         inner = dict(context)
@@ -133,15 +128,12 @@ MODULES = {
     'launch.actions': {
         'DeclareLaunchArgument': DeclareLaunchArgument,
         'IncludeLaunchDescription': IncludeLaunchDescription,
+        'OpaqueFunction': OpaqueFunction,
     },
-    'launch.conditions': {'IfCondition': IfCondition},
     'launch.launch_description_sources': {
         'PythonLaunchDescriptionSource': PythonLaunchDescriptionSource
     },
-    'launch.substitutions': {
-        'LaunchConfiguration': LaunchConfiguration,
-        'PathJoinSubstitution': PathJoinSubstitution,
-    },
+    'launch.substitutions': {'LaunchConfiguration': LaunchConfiguration},
     'launch_ros.actions': {'Node': Node},
     'launch_ros.parameter_descriptions': {'ParameterValue': ParameterValue},
 }
@@ -154,6 +146,10 @@ def carry_out(path, context, started):
     for entity in module.generate_launch_description().entities:
         entity.visit(context, started)
     return started
+
+
+def file_of(name):
+    return ROOT / f'launch/{name}.launch.py'
 
 
 @pytest.fixture(autouse=True)
@@ -169,7 +165,7 @@ def launch(monkeypatch):
 
 
 def test_the_whole_graph_with_a_recorder():
-    started = carry_out(ROOT / 'launch/demo.launch.py', {'output': '42'}, {})
+    started = carry_out(file_of('demo'), {'output': '42'}, {})
     names = {'excitation', 'stage', 'identifier', 'model', 'recorder'}
     assert set(started) == {('', name) for name in names} and names < set(NODES)
     assert started['', 'recorder']['autostart'] is True
@@ -178,12 +174,55 @@ def test_the_whole_graph_with_a_recorder():
         assert set(values) <= {d.name for d in NODES[name]}
 
 
+@pytest.mark.parametrize('file', ['demo', 'stage'])
+def test_a_driver_takes_the_place_of_the_stage(file):
+    context = {'use_simulated_stage': 'false', 'record': 'false'}
+    started = carry_out(file_of(file), context, {})
+    assert set(started) == {('', n) for n in ('excitation', 'identifier', 'model')}
+
+
+@pytest.mark.parametrize('file', ['demo', 'stage'])
+def test_arguments_reach_their_nodes(file):
+    context = {
+        'stage': 'dense',
+        'program': '7',
+        'rate_factor': '0.25',
+        'sample_rate': '10e3',
+        'record': 'true',
+        'bag': 'monday',
+        'log_level': 'warn',
+    }
+    started = {n: v for (_, n), v in carry_out(file_of(file), context, {}).items()}
+    assert started['stage']['stage'] == 'dense'
+    assert started['excitation']['program'] == started['identifier']['program'] == '7'
+    assert started['excitation']['rate_factor'] == 0.25
+    assert started['excitation']['sample_rate'] == started['recorder']['sample_rate'] == 10e3
+    assert started['recorder']['output'] == 'monday'
+    for name, values in started.items():
+        assert set(values) <= {d.name for d in NODES[name]}
+
+
+def test_what_is_not_given_stays_as_the_files_have_it(tmp_path):
+    for name in NODES:
+        text = (ROOT / f'config/{name}.yaml').read_text(encoding='utf-8')
+        text = text.replace('program: identification', 'program: holds')
+        (tmp_path / f'{name}.yaml').write_text(text.replace('stage: paper', 'stage: effects'))
+    started = carry_out(file_of('demo'), {'config': str(tmp_path)}, {})
+    assert started['', 'excitation']['program'] == started['', 'identifier']['program'] == 'holds'
+    assert started['', 'stage']['stage'] == 'effects'
+
+
+def test_a_value_that_is_no_choice_is_refused():
+    with pytest.raises(RuntimeError, match='use_simulated_stage: no'):
+        carry_out(file_of('demo'), {'use_simulated_stage': 'no'}, {})
+
+
 def test_a_stage_in_a_namespace_with_a_driver_and_a_configuration_of_its_own(tmp_path):
     for name in NODES:
         text = (ROOT / f'config/{name}.yaml').read_text(encoding='utf-8')
         (tmp_path / f'{name}.yaml').write_text(text.replace('max_order: 15', 'max_order: 7'))
     context = {'namespace': 'left', 'config': str(tmp_path), 'use_simulated_stage': 'false'}
-    started = carry_out(ROOT / 'launch/stage.launch.py', context, {})
+    started = carry_out(file_of('stage'), context, {})
     assert set(started) == {('left', n) for n in ('excitation', 'identifier', 'model')}
     assert started['left', 'identifier']['max_order'] == 7
     assert started['left', 'identifier']['output'] == 'identified'
@@ -193,5 +232,14 @@ def test_nothing_else_is_imported():
     for path in (ROOT / 'launch').glob('*.py'):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
             assert not isinstance(node, ast.Import)
-            if isinstance(node, ast.ImportFrom):
+            if isinstance(node, ast.ImportFrom) and node.module != 'pathlib':
                 assert {alias.name for alias in node.names} <= set(MODULES[node.module])
+
+
+def test_the_page_lists_the_arguments():
+    page = (ROOT / 'docs/graph.md').read_text(encoding='utf-8')
+    table = page.partition('| argument |')[2].partition('\n\n')[0]
+    rows = [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')]
+    context = {}
+    carry_out(file_of('stage'), context, {})
+    assert rows == list(context)
