@@ -159,6 +159,20 @@ class LabNode(Node):
             return f'{name} must be a number, got NaN'
         return self.refuse(name, value)
 
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters; those that cannot be changed may be set to what they are."""
+        # as a file does that is loaded and holds all
+        wanted = [
+            p
+            for p in parameter_list
+            if p.name not in self._declared
+            or not self._declared[p.name].read_only
+            or (p.type_, p.value) != (self.get_parameter(p.name).type_, self.values[p.name])
+        ]
+        if not wanted:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(wanted)
+
     def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         # two that come at once may each fit what is there, and not each other
         self.wanted = {**self.values, **{p.name: p.value for p in parameters}}

@@ -108,7 +108,7 @@ STAGE = (
 
 IDENTIFIER = (
     Declaration('program', 'identification', 'program that ~/run asks the excitation for'),
-    Declaration('thresholds', 'auto', 'number of plays of H, or auto: by held-out error'),
+    Declaration('thresholds', 0, 'number of plays of H; 0: chosen by held-out error', '1', 0, 400),
     Declaration(
         'solver',
         'least_squares',
@@ -142,8 +142,8 @@ IDENTIFIER = (
     ),
     Declaration(
         'channels',
-        '',
-        'topics of further channels (layout t,x_<name>), with blanks between',
+        ('',),
+        'topics of further channels (layout t,x_<name>); empty names are left out',
         read_only=True,
     ),
     Declaration(

@@ -48,7 +48,7 @@ segments:
   - {signal: hold, level: 9, duration: 120}
 """
 #: parameters of an identifier that is quick
-SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'thresholds': '10', 'solver': 'swarm'}
+SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'thresholds': 10, 'solver': 'swarm'}
 #: the same for one that may take what it can get of the machine
 QUICK = {**SETTINGS, 'nice': 0}
 SIZE = 1000

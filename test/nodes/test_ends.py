@@ -67,7 +67,7 @@ def in_the_middle(record, tmp_path):
             # ramps of their own that are too slow for a node that has to end
             ('excitation', {'program': HIGH, 'ramp_slew': 0.5, 'block_size': 500}, 'slow'),
             ('stage', {'ramp_slew': 1.0, 'silence': 600.0}, 'fed'),
-            ('identifier', {**SETTINGS, 'thresholds': '100', 'swarm_iterations': 10**7}, 'busy'),
+            ('identifier', {**SETTINGS, 'thresholds': 100, 'swarm_iterations': 10**7}, 'busy'),
             (
                 'player',
                 {

@@ -40,7 +40,7 @@ def lab():
     with Graph() as g:
         g.texts('model')
         g.texts('report')
-        g.start('identifier', {**SETTINGS, 'channels': 'temperature', 'nice': 7})
+        g.start('identifier', {**SETTINGS, 'channels': ['temperature'], 'nice': 7})
         yield g
 
 
@@ -110,8 +110,9 @@ def test_what_cannot_be_done_is_refused_with_the_reason(empty):
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('thresholds', 'many', "'auto'"),
-        ('thresholds', '1', '2 to 400'),
+        ('thresholds', 'many', 'type'),
+        ('thresholds', 1, '2'),
+        ('thresholds', 401, 'range'),
         ('program', ' ', 'must not be empty'),
         ('sweeps_program', ' ', 'must not be empty'),
         ('model', '/nowhere.yaml', 'no such file'),
@@ -201,7 +202,7 @@ def cancelled_at(g, step, during):
 
 @pytest.mark.parametrize(
     ('step', 'setting'),
-    [('hysteresis', ('thresholds', '100')), ('dynamics', ('max_order', 50))],
+    [('hysteresis', ('thresholds', 100)), ('dynamics', ('max_order', 50))],
 )
 def test_cancel_answers_at_once_and_no_sample_is_lost(fed, blocks, step, setting):
     # with a hundred weights the swarm is at it for minutes
@@ -336,7 +337,7 @@ def test_settings_reach_the_work(fed):
     assert model.dynamics.a.size <= 3 and model.hysteresis.weights.size == 9
     for name, value in (
         ('solver', 'swarm'),
-        ('thresholds', '6'),
+        ('thresholds', 6),
         ('swarm_size', 3),
         ('swarm_iterations', 10),
     ):

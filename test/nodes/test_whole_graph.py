@@ -11,14 +11,16 @@ import time
 from course import HIGH, model_of, numbers, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, in_time
-from graph_page import DIAGNOSTICS, OPERATOR, rights, SERVICES, STATES, TOPICS
+from graph_page import DIAGNOSTICS, OPERATOR, rights, ROOT, SERVICES, STATES, TOPICS
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED
 import pytest
 from rcl_interfaces.msg import Log
+from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+import yaml
 
 #: what `Graph` keeps beside the values of a diagnosis
 OTHERS = {'message', 'level', 'hardware_id'}
@@ -268,21 +270,39 @@ def test_bad_parameters_are_refused_with_the_reason(whole, node):
         if isinstance(d.default, float):
             bad += [float('nan'), 1]
         bad += ['nonsense'] * bool(d.choices)
-        bad += [value] * d.read_only
+        bad += [not value] * (d.read_only and isinstance(value, bool))
         for wrong in bad:
             taken, reason = whole.set(node, d.name, wrong)
             assert not taken, (d.name, wrong)
             assert d.name in reason or 'parameter type' in reason, (d.name, wrong, reason)
         after = whole.get(node, d.name)
         assert after == value, d.name
-        if not d.read_only:
-            assert whole.set(node, d.name, value) == (True, ''), d.name
+        # what cannot be changed may be set to what it is
+        assert whole.set(node, d.name, value) == (True, ''), d.name
 
 
 def test_what_is_no_parameter_is_refused(whole):
     for node in NODES:
         taken, reason = whole.set(node, 'nonsense', 1)
         assert not taken and 'undeclared parameter' in reason
+
+
+def test_every_yaml_file_loads_into_its_running_node():
+    # as ros2 param load has it: all keys, whether they can be changed or not
+    with Graph() as g:
+        files = {node: ROOT / f'config/{node}.yaml' for node in NODES}
+        values = {
+            node: next(iter(yaml.safe_load(files[node].read_text()).values()))['ros__parameters']
+            for node in NODES
+        }
+        g.start_all(*((node, values[node]) for node in NODES))
+        for node in NODES:
+            found = parameter_dict_from_yaml_file(str(files[node]), True)
+            for name, message in found.items():
+                value = parameter_value_to_python(message.value)
+                assert g.set(node, name, value) == (True, ''), (node, name, value)
+        taken, reason = g.set('identifier', 'nice', 6)
+        assert not taken and 'read-only' in reason
 
 
 def test_a_signal_ends_what_is_at_rest(whole):

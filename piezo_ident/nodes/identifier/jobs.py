@@ -16,7 +16,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
@@ -121,12 +120,9 @@ def settings_of(values: dict[str, object]) -> Settings:
     ConfigError
         When a value is out of range.
     """
-    text = str(values['thresholds']).strip()
-    if text != 'auto' and not text.isdecimal():
-        raise ConfigError(f"thresholds must be a number of 2 to 400, or 'auto', got {text!r}")
     swarm = values['solver'] == 'swarm'
     return Settings(
-        thresholds=None if text == 'auto' else int(text),
+        thresholds=int(str(values['thresholds'])) or None,
         solver=str(values['solver']),  # type: ignore[arg-type]
         polish=swarm and bool(values.get('polish')),
         max_order=int(str(values['max_order'])),

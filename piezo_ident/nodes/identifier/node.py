@@ -71,7 +71,7 @@ class IdentifierNode(LabNode):
         self._rate = Rate()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
-        self._inputs = Inputs(self, self._capture, self.values['channels'].split())
+        self._inputs = Inputs(self, self._capture, list(filter(None, self.values['channels'])))
         self._excitation = ExcitationClient(
             self, self._inputs.streams, lambda: self._inputs.unpublished
         )
