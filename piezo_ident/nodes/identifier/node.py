@@ -114,17 +114,18 @@ class IdentifierNode(LabNode):
             self._excitation.poll()
         if self._excitation.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
-            about = f'{self._capture.seconds:.0f} s captured{segment}: {self._task}'
-            self._report_capture('exciting', self._excitation.progress, about)
+            about = f'{self._capture.seconds:.0f} s captured{segment}'
+            text, brief = f'{self._task}: {about}', f'{about}: {self._task}'
+            self._report_capture('exciting', self._excitation.progress, text, brief)
         elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
             self._reported_at = time.monotonic()
             kept = f'{self._kept()} captured' if self._capture.keys else 'ready'
             self._report_capture('idle', 0.0, kept)
 
-    def _report_capture(self, state: str, progress: float, message: str) -> None:
+    def _report_capture(self, state: str, progress: float, text: str, brief: str = '') -> None:
         problems = self._capture.problems
-        text = '; '.join([message, *problems])
-        self._set_state(state, progress, text, WARN if problems else OK)
+        text, brief = ('; '.join([t, *problems]) if t else '' for t in (text, brief))
+        self._set_state(state, progress, text, WARN if problems else OK, brief=brief)
 
     def _kept(self) -> str:
         keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
