@@ -20,6 +20,7 @@ from typing import Any, cast
 
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output, unwritable
+from piezo_ident.record.bags.jazzy import JazzyWriter
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
 from piezo_ident.record.record import Record
@@ -32,7 +33,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.errors import WriterError
 
 __all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'knows_type', 'write_bag']
@@ -137,7 +138,7 @@ class BagWriter:
         for topic in self._topics:
             self._connect(topic)
 
-    def _opened(self) -> Writer:
+    def _opened(self) -> JazzyWriter:
         path, begin = self._path, self._number + 1 if self.parts else 0
         # from the last one on: a week has more parts than names are tried
         for number in range(begin, begin + NAMES):
@@ -145,7 +146,7 @@ class BagWriter:
             try:
                 if os.path.lexists(place):
                     continue
-                writer = Writer(place, version=9, storage_plugin=STORAGES[self._storage])
+                writer = JazzyWriter(place, version=9, storage_plugin=STORAGES[self._storage])
                 writer.open()
             except WriterError:
                 continue  # another recorder was faster
@@ -332,7 +333,7 @@ def write_bag(
     with temporary_output(path, overwrite=overwrite) as target:
         folder = target.with_name('bag') if suffix else target
         plugin = STORAGES[suffix or storage or 'mcap']
-        with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        with JazzyWriter(folder, version=9, storage_plugin=plugin) as writer:
             for key, value in custom.items():
                 writer.set_custom_data(key, value)
             _write_pieces(writer, record, block_size)
@@ -340,7 +341,7 @@ def write_bag(
             next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
 
 
-def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
+def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
     quantities = ['voltage', 'displacement']
     quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
     senders = {q: _sender(writer, q) for q in quantities}
@@ -365,7 +366,7 @@ def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
                 senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
 
 
-def _sender(writer: Writer, quantity: str) -> Callable[[Samples, int], None]:
+def _sender(writer: JazzyWriter, quantity: str) -> Callable[[Samples, int], None]:
     store = typestore()
     types: Any = store.types
     dimension = types['std_msgs/msg/MultiArrayDimension']
