@@ -38,7 +38,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
-        (f'share/{package_name}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{package_name}/config', sorted(glob('config/*.*'))),
         (f'share/{package_name}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
         (f'share/{package_name}/examples', sorted(glob('examples/*.*'))),

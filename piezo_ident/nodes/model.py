@@ -29,7 +29,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 __all__ = ['ModelNode', 'main']
 
-QUANTITIES = ('displacement', 'prediction', 'residual')
+QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
 #: where a model comes from, and what reads it
 Wish = tuple[str, Callable[[], StageModel]]
 #: how long a problem of the stream stays in the status [s], and how many of them
@@ -166,6 +166,7 @@ class ModelNode(LabNode):
                 min(low, float(samples.values.min())),
                 max(high, float(samples.values.max())),
             )
+            self._publish_preview(self._preview.add('voltage', samples.t, samples.values))
         if predictor.problem:
             self._note_problem(predictor.problem)
         if prediction is not None:

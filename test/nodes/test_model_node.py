@@ -201,7 +201,7 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
     shown, y, subscription = watch(fast, blocks(4000))
     names = [
         f'{quantity}/{what}'
-        for quantity in ('displacement', 'prediction', 'residual')
+        for quantity in ('voltage', 'displacement', 'prediction', 'residual')
         for what in ('mean', 'min', 'max')
     ]
     # the last bin is complete when the next begins; one of before may have come late
@@ -210,7 +210,9 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
     assert len(rows_of(shown)) >= 9
     assert list(shown[-1].name) == names and shown[-1].header.stamp.sec > 0
     rows = rows_of(shown)[-9:]
-    for row, part in zip(rows, np.split(y, 10)[:9], strict=True):
+    command = np.split(sine(4000)[1], 10)[:9]
+    for row, part, v in zip(rows, np.split(y, 10)[:9], command, strict=True):
+        assert row['voltage/max'] == v.max()
         for what, value in (('mean', part.mean()), ('min', part.min()), ('max', part.max())):
             assert row[f'prediction/{what}'] == pytest.approx(value, rel=1e-9)
             assert row[f'displacement/{what}'] == pytest.approx(value + 2e-9, rel=1e-9)

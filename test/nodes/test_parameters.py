@@ -4,6 +4,7 @@
 """The declarations of parameters, the YAML and launch files, and docs/graph.md agree."""
 
 import ast
+import json
 
 from graph_page import ROOT, table
 from piezo_ident.nodes.parameters import NODES
@@ -61,3 +62,14 @@ def test_executables_of_launch_files_are_installed():
                 assert f"'{call.args[0].value} = piezo_ident.nodes." in setup
     for node in NODES:
         assert f"'{node} = piezo_ident.nodes.main:{node}'" in setup
+
+
+def test_foxglove_labels_a_path_by_what_the_preview_holds():
+    layout = json.loads((ROOT / 'config/foxglove.json').read_text(encoding='utf-8'))
+    quantities = ('voltage', 'displacement', 'prediction', 'residual')
+    names = [f'{quantity}/{what}' for quantity in quantities for what in ('mean', 'min', 'max')]
+    paths = [p for panel in layout['configById'].values() for p in panel.get('paths', ())]
+    shown = {p['label']: p['value'] for p in paths if p['value'].startswith('/preview')}
+    assert shown
+    for label, path in shown.items():
+        assert path == f'/preview.position[{names.index(label)}]'

@@ -12,6 +12,12 @@ from course import HIGH, model_of, numbers, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, in_time
 from graph_page import DIAGNOSTICS, OPERATOR, rights, ROOT, SERVICES, STATES, TOPICS
+from layouts import (
+    found_by_foxglove,
+    series_of_plotjuggler,
+    shown_by_foxglove,
+    shown_by_plotjuggler,
+)
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.nodes.parameters import NODES
@@ -68,6 +74,8 @@ def test_a_run_through_the_whole_graph(whole):
     assert report['data_faults'] == [] and report['delay']['samples'] == 3
     assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
     whole.wait(lambda: whole.status('model')['text'] == 'with topic model', 'the model')
+    told = lambda: 'residual_percent' in whole.diagnostics('model')  # noqa: E731
+    whole.wait(told, 'the live error to be recorded')
     assert whole.finish('recorder/stop')['state'] == 'done'
     assert whole.set('excitation', 'subscribers', 3)[0]
     record = pi.read(whole.output / 'bag')
@@ -117,6 +125,14 @@ def test_live_replayed_and_offline_models_are_equal(whole):
     offline = numbers(pi.identify(pi.read(bag), settings).model)
     for text in models:
         np.testing.assert_allclose(numbers(model_of(text)), offline, rtol=1e-12, atol=0)
+
+
+def test_layouts_show_what_was_recorded(whole):
+    recorded = whole.output / 'bag'
+    missing = set(shown_by_plotjuggler()) - set(series_of_plotjuggler(recorded))
+    assert not missing
+    for path in shown_by_foxglove():
+        assert found_by_foxglove(recorded, path), path
 
 
 def test_topics_are_those_of_the_table(whole):
