@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import logging
 import re
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-__all__ = ['Journal', 'one_line', 'shown']
+__all__ = ['FromPackage', 'Journal', 'one_line', 'shown']
 
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
@@ -84,6 +85,18 @@ class Journal:
             self._logger.warning(line)
         else:
             self._logger.error(line)
+
+
+class FromPackage(logging.Handler):
+    """Puts what the package logs, such as that it compiles, into the journal of a node."""
+
+    def __init__(self, journal: Journal) -> None:
+        super().__init__()
+        self._journal = journal
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record."""
+        self._journal.tell(record.getMessage())
 
 
 def one_line(text: str, longest: int = LONGEST) -> str:

@@ -28,7 +28,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.journal import Journal, one_line, shown
+from piezo_ident.nodes.journal import FromPackage, Journal, one_line, shown
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -96,11 +96,11 @@ class LabNode(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
-        logging.getLogger('piezo_ident').addHandler(_ToRos(self))
         self._declared: dict[str, Declaration] = {}
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
         self.journal = Journal(self.get_logger())
+        logging.getLogger('piezo_ident').addHandler(FromPackage(self.journal))
         self.values: dict[str, Any] = {}
         #: all values as they would be with what is just being set
         self.wanted: dict[str, Any] = {}
@@ -316,24 +316,8 @@ class LabNode(Node):
         said = f'; set: {shown(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
 
-    def load_kernels(self, load: Callable[[], object]) -> None:
-        """Call what loads kernels, and write that this may take its time."""
-        self.journal.tell('loads its kernels; the first time they are compiled, up to a minute')
-        load()
-
     def close(self) -> None:
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
-
-
-class _ToRos(logging.Handler):
-    """Puts what the package logs, such as that it compiles, on the log of a node."""
-
-    def __init__(self, node: LabNode) -> None:
-        super().__init__()
-        self._log = node.get_logger()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._log.info(record.getMessage())
 
 
 def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:

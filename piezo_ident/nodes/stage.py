@@ -94,7 +94,7 @@ class StageNode(LabNode):
         seed = self._stage.seed if self.values['seed'] < 0 else self.values['seed']
         self.sample_rate = self._stage.model.sample_rate
         self._guard = Guard(self._settings())
-        self.load_kernels(self._warm_up)
+        self._warm_up()
         self._run = self._stage.run(np.random.default_rng(seed))
         self._sample_clock = SampleClock(self.sample_rate, self._longest_gap())
         # tick of the next sample applied, whatever it comes from

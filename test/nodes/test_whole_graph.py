@@ -86,7 +86,7 @@ def test_a_run_through_the_whole_graph(whole):
     ('node', 'level', 'line'),
     [
         ('recorder', Log.INFO, r'piezo_ident \S+ is up; set: output = .*bag'),
-        ('stage', Log.INFO, 'loads its kernels; '),
+        ('stage', Log.INFO, r'piezo_ident \S+ is up; set: seed = 3'),
         ('identifier', Log.INFO, '~/run: the program is requested'),
         ('excitation', Log.INFO, 'set: program = '),
         ('excitation', Log.INFO, 'running: '),
