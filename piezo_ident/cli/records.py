@@ -17,7 +17,7 @@ from typing import Any
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.record import io as record_io
-from piezo_ident.record.assemble import ReadOptions
+from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
 __all__ = [

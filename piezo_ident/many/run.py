@@ -30,7 +30,7 @@ from piezo_ident.many.table import diagnosed, identified, natural, Row, Value
 from piezo_ident.many.workers import dask, processes
 from piezo_ident.model.files import load
 from piezo_ident.record import io as record_io
-from piezo_ident.record.assemble import ReadOptions
+from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
 __all__ = ['Diagnose', 'Identify', 'Task', 'run_many']

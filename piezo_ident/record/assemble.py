@@ -12,23 +12,22 @@ out.  What would need a guess is refused, and the message says what to do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
+from piezo_ident.record.options import ReadOptions, UNITS
 from piezo_ident.record.ordering import at_times, in_order, OrderedRows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
+from piezo_ident.record.rounded_time import unrounded
 
-__all__ = ['UNITS', 'ReadOptions', 'SegmentStarts', 'assemble', 'label_runs']
+__all__ = ['SegmentStarts', 'assemble', 'label_runs']
 
 #: label of each stretch and the row at which it begins; it lasts until the next begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
-
-#: how many of a displacement unit make a metre
-UNITS: Mapping[str, float] = {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'µm': 1e6, 'μm': 1e6, 'nm': 1e9}
 
 #: higher rates [Hz] are counted in another unit than seconds
 MAX_RATE = 1e9
@@ -48,45 +47,6 @@ LOST = 1e-6
 MAX_NOT_FINITE = 0.01
 #: later times [s] are counted in another unit than seconds
 MAX_TIME = 1e11
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """
-    How records are read; what does not concern a format is not looked at.
-
-    Parameters
-    ----------
-    displacement_unit : {'m', 'mm', 'um', 'nm'}
-        Unit of the displacement in the file.
-    voltage_limits : tuple of float, optional
-        Smallest and largest voltage [V] that may occur.
-    namespace, voltage_topic, displacement_topic : str, optional
-        Which topics of a bag to take, when it holds several stages.
-    recover : bool, optional
-        Read an unfinished bag as far as it goes instead of refusing it.
-    voltage_alone : bool, optional
-        Take a table without displacement, as of a planned scan; the displacement is then NaN.
-
-    Raises
-    ------
-    DataError
-        When the unit is unknown.
-    """
-
-    displacement_unit: str = 'm'
-    voltage_limits: tuple[float, float] | None = None
-    namespace: str | None = None
-    voltage_topic: str | None = None
-    displacement_topic: str | None = None
-    recover: bool = False
-    voltage_alone: bool = False
-
-    def __post_init__(self) -> None:
-        if self.displacement_unit not in UNITS:
-            raise DataError(
-                f'unknown displacement unit {self.displacement_unit!r}; use m, mm, um or nm'
-            )
 
 
 def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
@@ -150,15 +110,18 @@ def assemble(
     options = options or ReadOptions()
     met = list(faults)
     table = _table(t, v, y, segments, channels or {}, name)
+    if sample_rate is None:
+        table = replace(table, t=unrounded(table, met))
     table = _drop_not_finite(table, name, met)
     if not table.t.size:
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
-    if y is not None and UNITS[options.displacement_unit] != 1.0:
-        scaled = table.columns['y'] / UNITS[options.displacement_unit]
+    unit = options.displacement_unit or 'm'
+    if y is not None and unit != 'm':
+        scaled = table.columns['y'] / UNITS['y'][unit]
         table = replace(table, columns={**table.columns, 'y': scaled})
     _check_limits(table, options.voltage_limits, name)
-    _check_ranges(table, options.displacement_unit, name)
+    _check_ranges(table, unit, name)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
 

@@ -26,6 +26,8 @@ __all__ = [
     'Resolution',
     'fit_clock',
     'has_restarted',
+    'nice_rates',
+    'rate_bounds',
     'split_uniform',
     'time_stamps',
 ]
@@ -199,7 +201,7 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     wide = _wide(t, 1.5 * dt)
     if wide:
         return wide
-    low, high = _rates(t, _rounding(resolution, dt))
+    low, high = rate_bounds(t, _rounding(resolution, dt))
     if low <= high:
         return []
     residual = _residual(t)
@@ -238,7 +240,7 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
         With the rate of fewest digits that the stamps allow.
     """
     dt = float(t[-1] - t[0]) / (t.size - 1)
-    low, high = _rates(t, _rounding(resolution, dt))
+    low, high = rate_bounds(t, _rounding(resolution, dt))
     jitter, start = 0.0, float(t[0])
     if low > high:
         residual = _residual(t)
@@ -252,11 +254,11 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
     if not jitter:
         # stamps may be far better than their last decimal: 0.0001 s steps at four decimals
         for half in (_last_bit, lambda x: 8 * np.spacing(np.abs(x))):
-            tight = _rates(t, half)
+            tight = rate_bounds(t, half)
             if tight[0] <= tight[1]:
                 low, high = tight
                 break
-    clocks = [Clock(r, _start(start, r, resolution), jitter) for r in _nice(low, high)]
+    clocks = [Clock(r, _start(start, r, resolution), jitter) for r in nice_rates(low, high)]
     exact = next((c for c in clocks if not jitter and _reproduces(c, t)), None)
     return exact or _settled(clocks[0], t.size)
 
@@ -266,10 +268,10 @@ def _settled(clock: Clock, n: int) -> Clock:
     for _ in range(5):
         t = time_stamps(clock.sample_rate, clock.start_time, 0, n)
         resolution = Resolution.of(t)
-        low, high = _rates(t, _last_bit)
+        low, high = rate_bounds(t, _last_bit)
         if not low <= high:
             return clock
-        again = [Clock(r, _start(float(t[0]), r, resolution), 0.0) for r in _nice(low, high)]
+        again = [Clock(r, _start(float(t[0]), r, resolution), 0.0) for r in nice_rates(low, high)]
         exact = next((c for c in again if _reproduces(c, t)), again[0])
         if exact.sample_rate == clock.sample_rate and exact.start_time == clock.start_time:
             return clock
@@ -287,7 +289,7 @@ def _rounding(resolution: Resolution, dt: float) -> Callable[[Vector], Vector]:
     return lambda t: np.minimum(resolution.half(t), 0.2 * dt) + 8 * np.spacing(np.abs(t))
 
 
-def _rates(t: Vector, half: Callable[[Vector], Vector]) -> tuple[float, float]:
+def rate_bounds(t: Vector, half: Callable[[Vector], Vector]) -> tuple[float, float]:
     """Return the smallest and largest rate through all stamps +- `half`, crossed when none is."""
     low, high = 0.0, np.inf
     first = float(half(t[:1])[0])
@@ -311,7 +313,7 @@ def _residual(t: Vector) -> Vector:
     return residual
 
 
-def _nice(low: float, high: float) -> Iterator[float]:
+def nice_rates(low: float, high: float) -> Iterator[float]:
     """Yield rates between two bounds, those with few digits (or whose period has few) first."""
     middle = 0.5 * (low + high)
     for digits in range(15):

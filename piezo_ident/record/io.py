@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -15,28 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
-from piezo_ident.record.assemble import assemble, ReadOptions
+from piezo_ident.record.arrays import read_hdf5, read_mat, read_npz, read_parquet, read_tdms
+from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
-from piezo_ident.record.csv_table import read_csv, write_csv
+from piezo_ident.record.columns import RecordTable
+from piezo_ident.record.options import ReadOptions, UNITS
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.tables import (
-    Blocks,
-    blocks_of,
-    labels_of,
-    read_mat,
-    read_npz,
-    RecordTable,
-    write_mat,
-    write_npz,
-)
+from piezo_ident.record.tables import Blocks, blocks_of, labels_of, write_mat, write_npz
+from piezo_ident.record.text_table import read_text, write_csv
 
 __all__ = ['READERS', 'WRITERS', 'read', 'write']
 
-READERS: Mapping[str, Callable[[Path], RecordTable]] = {
-    '.csv': read_csv,
+READERS: Mapping[str, Callable[[Path, ReadOptions], RecordTable]] = {
+    **dict.fromkeys(('.csv', '.txt', '.tsv', '.dat', '.lvm', '.asc'), read_text),
     '.npz': read_npz,
     '.mat': read_mat,
+    **dict.fromkeys(('.h5', '.hdf5', '.hdf'), read_hdf5),
+    '.tdms': read_tdms,
+    **dict.fromkeys(('.parquet', '.pq'), read_parquet),
 }
 WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]], None]] = {
     '.csv': write_csv,
@@ -45,6 +42,10 @@ WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]],
 }
 
 _FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
+#: sampling rates [Hz] at which time in another unit than seconds is likelier
+SLOW = 50.0
+#: strokes [m] and spans of a voltage [V] at which another unit is likelier
+LARGE_STROKE, HIGH_VOLTAGE = 1e-3, 2e3
 
 
 def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
@@ -97,23 +98,49 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     if suffix not in READERS:
         raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_FORMATS}')
     try:
-        table = READERS[suffix](path)
+        table = READERS[suffix](path, options)
     except OSError as error:
         reason = error.strerror or str(error)
         raise DataError(f'{path}: cannot be read ({reason}); check the file') from None
     columns = dict(table.columns)
-    if not options.voltage_alone and 'y' not in columns:
-        raise DataError(f'{path}: y missing; name the columns t [s], v [V] and y')
-    return assemble(
-        columns.pop('t'),
-        columns.pop('v'),
+    for role in ('t', 'v'):
+        factor = UNITS[role].get(table.units.get(role, ''), 1.0)
+        if role in columns and factor != 1.0:
+            columns[role] = columns[role] / factor
+    v = columns.pop('v')
+    t = columns.pop('t') if table.rate is None else np.arange(v.size) / table.rate
+    record = assemble(
+        t,
+        v,
         columns.pop('y', None),
         (table.names, table.starts),
         {name[2:]: x for name, x in columns.items()},
         name=str(path),
-        options=options,
-        faults=[Fault('ignored_column', repr(c), 1, 'not read') for c in table.ignored],
+        options=replace(options, displacement_unit=table.units.get('y')),
+        faults=[
+            *table.faults,
+            *(Fault('ignored_column', repr(c), 1, 'not read') for c in table.ignored),
+        ],
     ).renamed(path.name)
+    return replace(record, faults=(*record.faults, *_doubts(record, table)))
+
+
+def _doubts(record: Record, table: RecordTable) -> Iterator[Fault]:
+    """Say where another unit is likelier than the one that nobody named."""
+    rate = min(piece.sample_rate for piece in record)
+    if rate <= SLOW and table.rate is None and 't' not in table.units:
+        where = f'{rate:.6g} Hz with t in seconds'
+        cure = 'read so; if t counts milliseconds, give --time-unit ms'
+        yield Fault('slow_sampling', where, 1, cure)
+    if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:
+        where = f'{1e3 * record.stroke:.3g} mm with y in metres'
+        cure = 'read so; if y counts micrometres, give --displacement-unit um'
+        yield Fault('large_stroke', where, 1, cure)
+    low, high = record.voltage_range
+    if high - low > HIGH_VOLTAGE and 'v' not in table.units:
+        where = f'{low:.4g} .. {high:.4g} V'
+        cure = 'read so; if v counts millivolts, give --voltage-unit mV'
+        yield Fault('high_voltage', where, 1, cure)
 
 
 def write(

@@ -19,8 +19,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.assemble import assemble, ReadOptions
+from piezo_ident.record.assemble import assemble
 from piezo_ident.record.clock import has_restarted
+from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream

@@ -10,6 +10,7 @@ process with SIGSEGV.  So a child process reads the file and hands the arrays ba
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -23,18 +24,24 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.files import UNPACKED_SIZE
 
-__all__ = ['read_variables']
+__all__ = ['flat', 'read_variables']
+
+#: columns of a matrix, and structs of an array of them, at most
+WIDTH = 32
 
 #: name of the list of all variables in what the child writes; MATLAB allows no such name
 _ALL = '*'
 
 
-def read_variables(path: Path, wanted: str) -> tuple[tuple[str, ...], dict[str, NDArray[Any]]]:
+def read_variables(
+    path: Path, wanted: str, needed: Iterable[str] | None
+) -> tuple[tuple[str, ...], dict[str, NDArray[Any]]]:
     """
     Return the names of all variables of a MATLAB file of version 4 to 7, and the wanted ones.
 
     `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
-    arrays of str.
+    arrays of str.  Where the file lacks one of those `needed`, or they are None, all numbers in it
+    are returned, those in structs too (see `flat`), and the names are theirs.
 
     Raises
     ------
@@ -42,10 +49,11 @@ def read_variables(path: Path, wanted: str) -> tuple[tuple[str, ...], dict[str, 
         When the file is damaged or too large, or a wanted variable is no array of numbers or
         texts.
     """
+    asked = '*' if needed is None else ','.join(needed)
     with tempfile.TemporaryDirectory(prefix='piezo_ident_mat_') as folder:
         target = Path(folder) / 'arrays.npz'
         done = subprocess.run(
-            [sys.executable, '-m', __name__, str(path), wanted, str(target)],
+            [sys.executable, '-m', __name__, str(path), wanted, asked, str(target)],
             # what this process imports from, the child does
             env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
             stdin=subprocess.DEVNULL,
@@ -62,7 +70,33 @@ def read_variables(path: Path, wanted: str) -> tuple[tuple[str, ...], dict[str, 
     return tuple(arrays.pop(_ALL).tolist()), arrays
 
 
-def _main(path: str, wanted: str, target: str) -> None:
+def flat(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """
+    Yield the columns of numbers in a variable: fields of structs, columns of narrow matrices.
+
+    >>> import numpy as np
+    >>> [(name, x.size) for name, x in flat('m', np.zeros((100, 2)))]
+    [('m.1', 100), ('m.2', 100)]
+    >>> [name for name, _ in flat('s', np.zeros(9, dtype=[('t', float), ('u', float)]))]
+    ['s.t', 's.u']
+    """
+    x = value if isinstance(value, np.ndarray) else np.asarray(value)
+    for key in x.dtype.names or ():
+        part = x[key]
+        if part.dtype != object:
+            yield from flat(f'{name}.{key}', part)
+        elif part.size <= WIDTH:
+            for i, cell in enumerate(part.ravel(), 1):
+                yield from flat(f'{name}.{key}' if part.size == 1 else f'{name}.{i}.{key}', cell)
+    if x.dtype.kind in 'biufM':
+        if sum(size != 1 for size in x.shape) <= 1:
+            yield name, x.ravel()
+        elif x.ndim == 2 and min(x.shape) <= WIDTH:
+            for i, column in enumerate(x if x.shape[0] < x.shape[1] else x.T, 1):
+                yield f'{name}.{i}', column
+
+
+def _main(path: str, wanted: str, asked: str, target: str) -> None:
     """Do what `read_variables` has the child process do."""
     with suppress(ImportError, OSError, ValueError):
         import resource
@@ -72,11 +106,17 @@ def _main(path: str, wanted: str, target: str) -> None:
     import scipy.io
 
     names = [name for name, *_ in scipy.io.whosmat(path)]
-    used = [name for name in names if re.fullmatch(wanted, name)]
+    whole = {*asked.split(',')} <= {*names}
+    used = [name for name in names if not whole or re.fullmatch(wanted, name)]
     # without names it would read all of them
     read = scipy.io.loadmat(path, variable_names=used) if used else {}
-    arrays: dict[str, Any] = {name: _plain(name, read[name]) for name in used}
-    arrays[_ALL] = np.array(names, dtype=str)
+    arrays: dict[str, Any] = {}
+    for name in used:
+        if whole or name == 'segment_name':
+            arrays[name] = _plain(name, read[name])
+        else:
+            arrays |= flat(name, read[name])
+    arrays[_ALL] = np.array(names if whole else [*arrays], dtype=str)
     np.savez(target, **arrays)
 
 

@@ -128,7 +128,7 @@ def _stretches(
                 at = t[start:overlap][same_time][0]
                 raise DataError(
                     f'{name}: two different samples at t = {at:.9g} s; write t with more '
-                    'decimals, or keep one of them'
+                    'decimals, keep one of them, or give the rate: --rate 20e3'
                 )
             else:
                 raise DataError(

@@ -258,7 +258,8 @@ class Record(Showable):
         >>> record.n, record.duration, round(1e6 * record.stroke)
         (20000, 1.0, 75)
         """
-        from piezo_ident.record.assemble import assemble, ReadOptions
+        from piezo_ident.record.assemble import assemble
+        from piezo_ident.record.options import ReadOptions
 
         if sample_rate is not None and not 0.0 < sample_rate < float('inf'):
             raise DataError(f'{name}: sample_rate must be positive, got {sample_rate} Hz')

@@ -112,7 +112,7 @@ def test_no_right_to_read(tmp_path, record, monkeypatch, capsys):
 
 def test_more_than_a_file_may_hold(tmp_path, record, monkeypatch):
     pi.write(record, tmp_path / 'r.npz')
-    monkeypatch.setattr('piezo_ident.record.tables.UNPACKED_SIZE', 1000)
+    monkeypatch.setattr('piezo_ident.record.arrays.UNPACKED_SIZE', 1000)
     refused(lambda: pi.read(tmp_path / 'r.npz'), 'unpacks to more', kind=DataError)
     assert files.UNPACKED_SIZE > 2**32
 
@@ -142,7 +142,7 @@ def test_other_variables_of_a_workspace_are_left_alone(tmp_path, packed):
     deep = np.empty(1, dtype=object)
     deep[0] = {'a': [1, 'b', {'c': np.eye(3)}]}
     others = {'deep': deep, 'sparse': scipy.sparse.eye(3).tocsc(), 'text': 'abc', 'z': 1j}
-    t = np.arange(9) / 10
+    t = np.arange(9) / 1000
     path = tmp_path / 'r.mat'
     scipy.io.savemat(path, {**others, 't': t, 'v': t, 'y': 1e-6 * t}, do_compression=packed)
     read = pi.read(path)

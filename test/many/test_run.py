@@ -25,7 +25,7 @@ from piezo_ident.many.run import Diagnose, Identify, run_many
 from piezo_ident.many.table import csv_text, Row
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
-from piezo_ident.record.assemble import ReadOptions
+from piezo_ident.record.options import ReadOptions
 from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
 

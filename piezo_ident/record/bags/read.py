@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.record.assemble import ReadOptions
 from piezo_ident.record.bags.recover import (
     Bag,
     damage_as_data_error,
@@ -31,6 +30,7 @@ from piezo_ident.record.bags.recover import (
 )
 from piezo_ident.record.blocks import decode, quantity_of, Samples
 from piezo_ident.record.join import APPLIED, record_of_streams
+from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 from piezo_ident.record.stream import BlockStream
 from rosbags.interfaces import Connection

@@ -1,0 +1,241 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Records in files of named arrays: npz, MATLAB, HDF5, TDMS and Parquet, each by its library.
+
+A file whose arrays are called ``t``, ``v`` and ``y`` is read as it is.  In any other, all columns
+of numbers are looked at, and `piezo_ident.record.columns` tells which is which.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+import importlib
+from pathlib import Path
+import re
+from typing import Any
+import zipfile
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.common.files import UNPACKED_SIZE
+from piezo_ident.record.assemble import label_runs
+from piezo_ident.record.columns import choose, RecordTable
+from piezo_ident.record.mat_read import flat, read_variables
+from piezo_ident.record.options import ReadOptions
+
+__all__ = ['read_hdf5', 'read_mat', 'read_npz', 'read_parquet', 'read_tdms']
+
+_LABELS = ('segment_name', 'segment_start')
+_USED = 't|v|y|x_.+|segment_name|segment_start'
+_HDF5 = b'\x89HDF\r\n\x1a\n'
+
+
+def read_npz(path: Path, options: ReadOptions) -> RecordTable:
+    """Read a NumPy archive; pickled objects are refused, or left alone beside the record."""
+    with _damage(path, 'npz archive', 'save it again with numpy.savez'):
+        with zipfile.ZipFile(path) as archive:
+            _check_size(sum(info.file_size for info in archive.infolist()))
+        with np.load(path, allow_pickle=False) as archive:
+            names = archive.files
+            if _needed(options) <= {*names} and not options.columns:
+                used = {k: archive[k] for k in names if re.fullmatch(_USED, k)}
+                return _table(used, names, path, options)
+            arrays: dict[str, Any] = {}
+            for name in names:
+                try:
+                    arrays |= flat(name, archive[name]) if name not in _LABELS else {}
+                except ValueError as error:
+                    if 'allow_pickle' not in str(error):
+                        raise
+            arrays |= {k: archive[k] for k in _LABELS if k in names}
+    return _table(arrays, arrays, path, options)
+
+
+def read_mat(path: Path, options: ReadOptions) -> RecordTable:
+    """Read a MATLAB file of any version."""
+    with path.open('rb') as file:
+        head = file.read(1024)
+    if _HDF5 in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
+        return read_hdf5(path, options)
+    with _damage(path, 'MATLAB file', 'save it again with save -v7'):
+        needed = None if options.columns else sorted(_needed(options))
+        names, arrays = read_variables(path, _USED, needed)
+    return _table(arrays, names, path, options)
+
+
+def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
+    """Read an HDF5 file, MATLAB's version 7.3 among them."""
+    h5py = _library('h5py', path)
+    arrays: dict[str, Any] = {}
+    size = 0
+
+    def visit(name: str, node: Any) -> None:
+        nonlocal size
+        # what MATLAB's cells refer to, and texts as it stores them
+        if not isinstance(node, h5py.Dataset) or name.startswith('#'):
+            return
+        key, kind = name.replace('/', '.'), node.attrs.get('MATLAB_class', b'')
+        unit = node.attrs.get('unit', node.attrs.get('units', ''))
+        text = unit.decode(errors='replace') if isinstance(unit, bytes) else unit
+        if key == 'segment_name':
+            arrays[key] = _texts(node, kind)
+        elif kind != b'char' and (node.dtype.kind in 'biuf' or node.dtype.names):
+            size += node.nbytes
+            _check_size(size)
+            if isinstance(text, str) and text:
+                key = f'{key} [{text}]'
+            arrays.update({key: node[()]} if key in _LABELS else flat(key, node[()]))
+
+    with (
+        _damage(path, 'HDF5 file', 'save it again; MATLAB: save -v7'),
+        h5py.File(path, 'r') as file,
+    ):
+        file.visititems(visit)
+    return _table(arrays, arrays, path, options)
+
+
+def _texts(node: Any, kind: bytes) -> Any:
+    if kind == b'cell':
+        return np.array([''.join(map(chr, node.file[r][()].ravel())) for r in node[()].ravel()])
+    return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in np.ravel(node[()])])
+
+
+def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
+    """Read a file of LabVIEW's TDMS."""
+    tdms = _library('nptdms', path, 'npTDMS')
+    arrays: dict[str, Any] = {}
+    with (
+        _damage(path, 'TDMS file', 'write it again'),
+        tdms.TdmsFile.open(path) as file,
+    ):
+        channels = [channel for group in file.groups() for channel in group.channels()]
+        counts = Counter(channel.name for channel in channels)
+        _check_size(8 * sum(map(len, channels)))
+        for channel in channels:
+            name = channel.name
+            if counts[name] > 1:
+                name = f'{channel.group_name}.{name}'
+            unit = str(channel.properties.get('unit_string', ''))
+            arrays[f'{name} [{unit}]' if unit else name] = channel[:]
+            if 'wf_increment' in channel.properties:
+                arrays['wf_increment'] = np.array([channel.properties['wf_increment']])
+    return _table(arrays, arrays, path, options)
+
+
+def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
+    """Read a file of Apache Parquet."""
+    parquet = _library('pyarrow.parquet', path, 'pyarrow')
+    with (
+        _damage(path, 'Parquet file', 'write it again'),
+        parquet.ParquetFile(path) as file,
+    ):
+        _check_size(8 * file.metadata.num_rows * file.metadata.num_columns)
+        table = file.read()
+        arrays = {
+            name: column.to_numpy()
+            for name, column in zip(table.column_names, table.columns, strict=True)
+        }
+    return _table(arrays, arrays, path, options)
+
+
+# --- what they share ------------------------------------------------------------------------
+
+
+def _needed(options: ReadOptions) -> set[str]:
+    """Return the names that a file must have to be read as it is."""
+    return {'v', *('t' if options.rate is None else ''), *('' if options.voltage_alone else 'y')}
+
+
+def _library(module: str, path: Path, package: str = '') -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = package or module
+        raise DataError(
+            f'{path}: {package} reads {path.suffix} files, and cannot be imported ({error}): '
+            f'pip install {package}'
+        ) from None
+
+
+def _check_size(size: int) -> None:
+    if size > UNPACKED_SIZE:
+        raise ValueError(f'it unpacks to more than {UNPACKED_SIZE >> 30} GiB')
+
+
+def _table(
+    arrays: Mapping[str, Any], everything: Iterable[str], path: Path, options: ReadOptions
+) -> RecordTable:
+    """Choose the columns among some arrays, and check them."""
+    numbers = {k: np.asarray(x) for k, x in arrays.items() if k not in _LABELS}
+    own = _needed(options) <= {*numbers}
+    candidates = [k for k, x in numbers.items() if own or _may_be_column(k, x)]
+    scalars = {
+        k: float(x.ravel()[0]) for k, x in numbers.items() if x.size == 1 and x.dtype.kind in 'iuf'
+    }
+    choice = choose(candidates, options, path, scalars=scalars)
+    places = {role: candidates[place] for role, place in choice.places.items()}
+    columns = {}
+    for role, name in places.items():
+        if role != 'segment':
+            columns[role] = _column(name, numbers[name], path)
+    lengths = {places[role]: x.size for role, x in columns.items()}
+    if len(set(lengths.values())) > 1:
+        text = ', '.join(f'{k} {n}' for k, n in lengths.items())
+        raise DataError(f'{path}: columns differ in length ({text}); give one value a sample')
+    names: list[str] = []
+    starts: Any = ()
+    if 'segment' in places:
+        names, starts = label_runs(str(x).strip() for x in numbers[places['segment']])
+    elif any(k in arrays for k in _LABELS):
+        names, starts = _segments(arrays, path)
+    used = {*places.values(), *_LABELS, *scalars}
+    ignored = tuple(k for k in everything if k not in used)
+    return replace(choice.table(columns, names, starts), ignored=ignored)
+
+
+def _may_be_column(name: str, x: Any) -> bool:
+    return x.ndim == 1 and x.size > 1 and (x.dtype.kind in 'biufM' or name == 'segment')
+
+
+def _column(name: str, x: Any, path: Path) -> Any:
+    if x.dtype.kind == 'M':
+        # dates: seconds from the first one
+        return (x - x[0]) / np.timedelta64(1, 's')
+    if x.dtype.kind not in 'fiu':
+        raise DataError(f'{path}: {name} holds {x.dtype}, no real numbers; save plain numbers')
+    if x.ndim != 1 and sum(s != 1 for s in x.shape) > 1:
+        shape = ' x '.join(map(str, x.shape))
+        raise DataError(f'{path}: {name} is {shape}; give one column of samples')
+    return x.astype(np.float64).reshape(-1)
+
+
+def _segments(arrays: Mapping[str, Any], path: Path) -> tuple[list[str], Any]:
+    if not all(k in arrays for k in _LABELS):
+        raise DataError(f'{path}: segment_name and segment_start need each other; save both')
+    starts = np.asarray(arrays['segment_start'])
+    if starts.dtype.kind not in 'fiu':
+        raise DataError(f'{path}: segment_start holds no numbers; save sample indices from 0')
+    names = np.ravel(arrays['segment_name'])
+    if names.dtype.kind != 'U':
+        raise DataError(f'{path}: segment_name holds no text; save it as text (MATLAB: a cellstr)')
+    return [name.strip() for name in names.tolist()], starts.ravel()
+
+
+@contextmanager
+def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
+    """Turn whatever a parser throws at damaged bytes into one line."""
+    try:
+        yield
+    except DataError:
+        raise
+    # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the file's
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None

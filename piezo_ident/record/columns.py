@@ -1,0 +1,311 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Which column of a file is which.
+
+The names ``t``, ``v``, ``y``, ``segment`` and ``x_<name>`` mean what they say.  For other names
+the words and the unit of a header decide, and only where one column fits; what was decided is
+reported.  Where none or several fit, the option that decides is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+import re
+import shlex
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
+from piezo_ident.record.record import Fault
+
+__all__ = ['Choice', 'RecordTable', 'choose', 'is_wanted', 'listed']
+
+Vector = NDArray[np.float64]
+
+_QUANTITIES = {'t': 'time', 'v': 'voltage', 'y': 'displacement'}
+_WORDS = {
+    't': 't time times zeit timestamp elapsed temps tiempo',
+    'v': 'v u voltage volt volts spannung command drive input vin uin tension',
+    'y': 'y displacement disp position pos weg auslenkung verschiebung deflection elongation '
+    'stroke output',
+}
+#: names of a number beside the columns: the sampling rate, or its inverse
+_RATES = ('fs', 'rate', 'samplerate', 'samplingrate', 'samplefrequency', 'samplingfrequency')
+_PERIODS = ('dt', 'ts', 'deltax', 'deltat', 'sampletime', 'samplingtime', 'sampleperiod')
+_UNIT = re.compile(
+    r'(?P<name>.*?)\s*(?:\[(?P<a>[^][]*)\]|\((?P<b>[^()]*)\)|/\s*(?P<c>[^\W\d]+))'
+    r'|(?P<bare>.*?)(?:[_\s.]+|\bin\s+)(?P<d>[^\W\d_]+)'
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordTable:
+    """
+    Raw columns of a file.
+
+    Attributes
+    ----------
+    columns : dict of str to array, shape (n,)
+        By quantity: ``v``, ``y``, ``x_<name>``, and ``t`` unless `rate` is known.
+    names, starts : list of str, array_like
+        Label of each stretch and the row at which it begins.
+    ignored : tuple of str
+        Columns that are not read.
+    units : mapping of str to str
+        Units of ``t``, ``v`` and ``y`` where the file or an option names them.
+    rate : float, optional
+        Samples a second, of a file without time.
+    faults : tuple of Fault
+        What was guessed.
+    """
+
+    columns: dict[str, Vector]
+    names: list[str] = field(default_factory=list)
+    starts: ArrayLike = ()
+    ignored: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    rate: float | None = None
+    faults: tuple[Fault, ...] = ()
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The place of each quantity among the columns, and what else `RecordTable` wants to know."""
+
+    places: dict[str, int]
+    ignored: tuple[str, ...]
+    units: Mapping[str, str]
+    rate: float | None
+    faults: tuple[Fault, ...]
+
+    def table(
+        self, columns: dict[str, Vector], names: Sequence[str] = (), starts: ArrayLike = ()
+    ) -> RecordTable:
+        """Return the columns that were chosen as a table."""
+        return RecordTable(
+            columns, [*names], starts, self.ignored, self.units, self.rate, self.faults
+        )
+
+
+def is_wanted(name: str) -> bool:
+    """Return whether a column of this name is read without asking."""
+    return re.fullmatch('t|v|y|x_.+', name) is not None
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names for a message, in one short line."""
+    shown = ', '.join(n if n.isprintable() else ascii(n) for n in names if n)
+    return shown if len(shown) <= 200 else f'{shown[:200]}...'
+
+
+def choose(
+    names: Sequence[str],
+    options: ReadOptions,
+    path: Path,
+    *,
+    scalars: Mapping[str, float] | None = None,
+    empty: Iterable[int] = (),
+) -> Choice:
+    """
+    Decide which column is which.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As they stand in the file, some of them perhaps empty or twice.
+    options : ReadOptions
+    path : path
+        For messages.
+    scalars : mapping of str to float, optional
+        Numbers beside the columns, among which a sampling rate may be.
+    empty : iterable of int
+        Places of columns that hold nothing.
+
+    Raises
+    ------
+    DataError
+        When a quantity is missing or ambiguous; the message shows the option to give.
+    """
+    given = {role: _place(role, name, names, path) for role, name in options.named.items()}
+    places = dict(given)
+    rate, origin = options.rate, '--rate'
+    if rate is not None:
+        if 't' in given:
+            raise DataError(f'{path}: --rate and a column of time do not go together; drop one')
+    barred = {*given.values(), *empty}
+    for role in ('t', 'v', 'y', 'segment'):
+        if role not in places and (rate is None or role != 't'):
+            here = [i for i, name in enumerate(names) if name == role and i not in barred]
+            if len(here) > 1:
+                raise DataError(
+                    f'{path}: column {role} stands there twice; keep one of them, or say which by '
+                    f'its number: --columns {role}={here[0] + 1}'
+                )
+            places |= dict.fromkeys([role][: len(here)], *here)
+    free = [i for i in range(len(names)) if i not in {*places.values(), *empty}]
+    guessed: dict[str, int] = {}
+    for role in 'tvy':
+        if role in places or (role == 't' and rate is not None):
+            continue
+        fitting = _fitting(role, [(i, names[i]) for i in free])
+        if len(fitting) > 1:
+            raise DataError(_ambiguous(role, [names[i] for i in fitting], fitting, path))
+        if fitting:
+            guessed[role] = fitting[0]
+            free.remove(fitting[0])
+    if rate is None and 't' not in {*places, *guessed}:
+        rate, origin = _rate_of(scalars or {})
+    needed = ['t'] * (rate is None) + ['v'] + ['y'] * (not options.voltage_alone)
+    missing = [role for role in needed if role not in {*places, *guessed}]
+    if missing:
+        raise DataError(_missing(missing, names, free, path))
+    places |= guessed
+    for i in [i for i in free if names[i].startswith('x_') and len(names[i]) > 2]:
+        if names[i] in places:
+            raise DataError(f'{path}: column {names[i]} stands there twice; keep one of them')
+        places[names[i]] = i
+    units = {role: _unit_of(role, places, names, options, path) for role in 'tvy'}
+    used = set(places.values())
+    faults = []
+    if guessed or given or (rate is not None and options.rate is None):
+        parts = [
+            f'{role} = {listed([names[places[role]]]) or places[role] + 1} '
+            f'[{units[role] or f"{next(iter(UNITS[role]))}, no unit named"}]'
+            for role in 'tvy'
+            if role in places
+        ]
+        if rate is not None:
+            parts.insert(0, f't = k / {rate:.9g} Hz by {origin}')
+        action = 'guessed, --columns names others' if guessed else 'as named'
+        faults.append(Fault('columns', ', '.join(parts), len(parts), action))
+    return Choice(
+        places,
+        tuple(n for i, n in enumerate(names) if n and i not in used),
+        {role: unit for role, unit in units.items() if unit},
+        rate,
+        tuple(faults),
+    )
+
+
+def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
+    """Return the place of a column that is given by name, by name without unit, or by number."""
+    low = wanted.strip().casefold()
+    for ways, one in (
+        ([*names], wanted),
+        ([name.strip().casefold() for name in names], low),
+        ([_parts(name)[0].casefold() for name in names], low),
+    ):
+        here = [i for i, way in enumerate(ways) if way == one]
+        if len(here) > 1:
+            raise DataError(
+                f'{path}: column {listed([wanted])} stands there twice; say which by its number: '
+                f'--columns {role}={here[0] + 1} or {role}={here[1] + 1}'
+            )
+        if here:
+            return here[0]
+    if wanted.isdecimal() and 1 <= int(wanted) <= len(names):
+        return int(wanted) - 1
+    raise DataError(
+        f'{path}: no column {listed([wanted])!r}; --columns {role}=NAME takes one of: '
+        f'{listed(names) or f"1 to {len(names)}"}'
+    )
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """
+    Return a column's name without its unit, and the unit.
+
+    >>> [_parts(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive voltage')]
+    [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive voltage', '')]
+    """
+    # of a field of a struct, or a channel of a group, its own name
+    name = re.sub(r'^(\w+\.)+(?=\S)', '', name.strip())
+    found = _UNIT.fullmatch(name)
+    if not found:
+        return name, ''
+    unit = plain_unit(next((found[k] for k in 'abcd' if found[k] is not None), ''))
+    known = any(unit in units for units in UNITS.values())
+    if found['bare'] is not None:
+        # v_min is no time
+        return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
+    # what stands in square brackets is a unit, known or not
+    return (found['name'], unit) if known or found['a'] is not None else (name, '')
+
+
+def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
+    """Return the places of the columns that fit best by their words and units."""
+    by_word, by_unit = [], []
+    for i, name in columns:
+        base, unit = _parts(name)
+        measured = next((r for r, units in UNITS.items() if unit in units), None)
+        if measured not in (None, role):
+            continue
+        words = set(re.findall(r'[^\W\d_]+', re.sub(r'([a-z])([A-Z])', r'\1 \2', base).casefold()))
+        said = {r for r, known in _WORDS.items() if words & set(known.split())}
+        if role in said and (measured or len(said) == 1):
+            by_word.append(i)
+        elif measured and name:
+            by_unit.append(i)
+    return by_word or by_unit
+
+
+def _rate_of(scalars: Mapping[str, float]) -> tuple[float | None, str]:
+    """Return the sampling rate among some numbers, and its name."""
+    for name, value in scalars.items():
+        base, unit = _parts(name)
+        base = re.sub(r'[^a-z]', '', base.casefold())
+        if not (value > 0 and np.isfinite(value)):
+            continue
+        if base in _RATES and unit in ('', 'Hz', 'kHz'):
+            return value * (1e3 if unit == 'kHz' else 1.0), name
+        if base in _PERIODS and unit in ('', *UNITS['t']):
+            return UNITS['t'][unit or 's'] / value, name
+    return None, ''
+
+
+def _unit_of(
+    role: str, places: Mapping[str, int], names: Sequence[str], options: ReadOptions, path: Path
+) -> str:
+    given = options.unit(role)
+    if given or role not in places or names[places[role]] == role:
+        return given or ''
+    name = names[places[role]]
+    _, unit = _parts(name)
+    if unit and unit not in UNITS[role]:
+        quantity = _QUANTITIES[role]
+        kind = next((q for r, q in _QUANTITIES.items() if unit in UNITS[r]), None)
+        raise DataError(
+            f'{path}: {listed([name])} is to be the {quantity}, '
+            + (f'but its unit is of a {kind}' if kind else f'whose unit {unit!r} is unknown')
+            + f'; name another column, or its unit: --{quantity}-unit {[*UNITS[role]][-2]}'
+        )
+    return unit
+
+
+def _option(role: str, name: str) -> str:
+    return f'--columns {shlex.quote(f"{role}={name}")}'
+
+
+def _ambiguous(role: str, names: Sequence[str], places: Sequence[int], path: Path) -> str:
+    # equal names are told apart by their numbers
+    ways = names if len(set(names)) == len(names) else [str(i + 1) for i in places]
+    return (
+        f'{path}: {len(names)} columns may be the {_QUANTITIES[role]} ({listed(names)}); say '
+        f'which: {_option(role, ways[0])} or {_option(role, ways[1])}'
+    )
+
+
+def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> str:
+    ways = [names[i] if names[i] else str(i + 1) for i in free]
+    # an example that can be typed, where there is one
+    pairs = [f'{role}={name}' for role, name in zip(missing, [*ways, *['NAME'] * 3], strict=False)]
+    rate = '; or without a column of time, give the rate: --rate 20e3' if 't' in missing else ''
+    return (
+        f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"}); name the '
+        f'columns, as in --columns {shlex.quote(",".join(pairs))}{rate}'
+    )

@@ -1,0 +1,161 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""How a record is read: what a file does not say by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import csv
+from dataclasses import dataclass
+import math
+import re
+import unicodedata
+
+from piezo_ident.common.errors import DataError
+
+__all__ = ['UNITS', 'ReadOptions', 'parse_columns', 'plain_unit']
+
+#: how many of a unit make a second, a volt and a metre
+UNITS: Mapping[str, Mapping[str, float]] = {
+    't': {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9, 'min': 1 / 60},
+    'v': {'V': 1.0, 'mV': 1e3, 'uV': 1e6, 'kV': 1e-3},
+    'y': {'m': 1.0, 'mm': 1e3, 'um': 1e6, 'nm': 1e9},
+}
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """
+    How records are read; what does not concern a format is not looked at.
+
+    Parameters
+    ----------
+    displacement_unit : {'m', 'mm', 'um', 'nm'}, optional
+        Unit of the displacement in the file; by default what the header says, else m.
+    voltage_limits : tuple of float, optional
+        Smallest and largest voltage [V] that may occur.
+    namespace, voltage_topic, displacement_topic : str, optional
+        Which topics of a bag to take, when it holds several stages.
+    recover : bool, optional
+        Read an unfinished bag as far as it goes instead of refusing it.
+    voltage_alone : bool, optional
+        Take a table without displacement, as of a planned scan; the displacement is then NaN.
+    columns : mapping of str to str, or str, optional
+        Name or number (from 1) of the columns ``t``, ``v``, ``y``, ``segment`` and ``x_<name>``;
+        those left out are taken by the header.  Also as text, ``'t=time_s,v=voltage'``.
+    rate : float, optional
+        Samples a second [Hz]; the time of sample k is then k / rate, and no column is read.
+    time_unit : {'s', 'ms', 'us', 'ns', 'min'}, optional
+        Unit of the time in the file; by default what the header says, else s.
+    voltage_unit : {'V', 'mV', 'uV', 'kV'}, optional
+        Unit of the voltage in the file; by default what the header says, else V.
+
+    Raises
+    ------
+    DataError
+        When a unit is unknown, the rate is no positive number, or `columns` names something else.
+    """
+
+    displacement_unit: str | None = None
+    voltage_limits: tuple[float, float] | None = None
+    namespace: str | None = None
+    voltage_topic: str | None = None
+    displacement_topic: str | None = None
+    recover: bool = False
+    voltage_alone: bool = False
+    columns: Mapping[str, str] | str = ''
+    rate: float | None = None
+    time_unit: str | None = None
+    voltage_unit: str | None = None
+
+    def __post_init__(self) -> None:
+        for role, quantity in (('t', 'time'), ('v', 'voltage'), ('y', 'displacement')):
+            given = getattr(self, f'{quantity}_unit')
+            if given is None:
+                continue
+            known = [*UNITS[role]]
+            unit = plain_unit(given) if isinstance(given, str) else ''
+            if unit not in known:
+                raise DataError(
+                    f'unknown {quantity} unit {given!r}; use {", ".join(known[:-1])} or '
+                    f'{known[-1]}'
+                )
+            object.__setattr__(self, f'{quantity}_unit', unit)
+        if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
+            raise DataError(f'a rate of {self.rate:g} Hz; give the samples a second, as in 20e3')
+        for role, name in self.named.items():
+            if not re.fullmatch(r't|v|y|segment|x_\w{1,60}', role, re.ASCII):
+                raise DataError(
+                    f'columns: {role!r} is no quantity; use t, v, y, segment or x_NAME, as in '
+                    '--columns t=time_s,v=voltage,y=position_um'
+                )
+            if not name.strip():
+                raise DataError(f'columns: {role} needs the name of a column, or its number')
+
+    @property
+    def named(self) -> dict[str, str]:
+        """`columns` as a mapping."""
+        if isinstance(self.columns, str):
+            return parse_columns(self.columns)
+        return {role: str(name) for role, name in (self.columns or {}).items()}
+
+    def unit(self, role: str) -> str | None:
+        """Return the unit that is given for ``t``, ``v`` or ``y``."""
+        return {'t': self.time_unit, 'v': self.voltage_unit, 'y': self.displacement_unit}[role]
+
+
+def plain_unit(text: str) -> str:
+    """
+    Return a unit with the letters of `UNITS`: either micro sign becomes u.
+
+    >>> [plain_unit(x) for x in ('\u00b5m', '\u03bcm', 'Volts', 'sec', 'MS', 'furlong')]
+    ['um', 'um', 'V', 's', 'ms', 'furlong']
+    """
+    # NFKC turns the micro sign into the Greek letter
+    text = unicodedata.normalize('NFKC', text).strip().replace('\u03bc', 'u')
+    for units in UNITS.values():
+        for unit in units:
+            if text.lower() == unit.lower():
+                return unit
+    return _SPELT.get(text.lower(), text)
+
+
+_SPELT = {
+    **dict.fromkeys(('sec', 'secs', 'second', 'seconds', 'sekunden'), 's'),
+    **dict.fromkeys(('msec', 'millisecond', 'milliseconds'), 'ms'),
+    **dict.fromkeys(('usec', 'microsecond', 'microseconds'), 'us'),
+    **dict.fromkeys(('minute', 'minutes'), 'min'),
+    **dict.fromkeys(('volt', 'volts'), 'V'),
+    **dict.fromkeys(('millivolt', 'millivolts'), 'mV'),
+    **dict.fromkeys(('meter', 'metre', 'meters', 'metres'), 'm'),
+    **dict.fromkeys(('millimeter', 'millimetre', 'millimeters', 'millimetres'), 'mm'),
+    **dict.fromkeys(('micron', 'microns', 'micrometer', 'micrometre'), 'um'),
+    **dict.fromkeys(('micrometers', 'micrometres', 'mikrometer'), 'um'),
+    **dict.fromkeys(('nanometer', 'nanometre', 'nanometers', 'nanometres'), 'nm'),
+}
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """
+    Return which column carries what; a part with a comma in it stands in double quotes.
+
+    >>> parse_columns('t=time_s, v=U [V],"y=x, filtered"')
+    {'t': 'time_s', 'v': 'U [V]', 'y': 'x, filtered'}
+
+    Raises
+    ------
+    DataError
+        When a part is no pair, or a quantity comes twice.
+    """
+    columns: dict[str, str] = {}
+    for part in next(csv.reader([text], skipinitialspace=True), []):
+        role, sign, name = (x.strip() for x in part.partition('='))
+        if not sign or not role or not name or role in columns:
+            fault = f'{role} comes twice' if role in columns else f'{part[:60]!r} is no pair'
+            raise DataError(
+                f'--columns {text[:200]!r}: {fault}; '
+                'write it as in --columns t=time_s,v=voltage,y=position_um'
+            )
+        columns[role] = name
+    return columns

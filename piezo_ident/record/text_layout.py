@@ -1,0 +1,160 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+How a text file is laid out: separator, header and first row.
+
+Instruments write anything above their table.  The table begins where rows of numbers begin, and
+its header is the last line above them; a line of units may stand between the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import csv
+from dataclasses import dataclass, field
+import re
+
+from piezo_ident.record.options import plain_unit, UNITS
+
+__all__ = ['COMMENT', 'Layout', 'cells_of', 'find_layout', 'is_number']
+
+#: how comments begin, in the field's programs
+COMMENT = ('#', '%', '//', '!')
+
+_DIGITS = r'[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][-+]?\d+)?'
+_NUMBER = re.compile(rf'{_DIGITS}|[-+]?(nan|inf)', re.IGNORECASE | re.ASCII)
+#: a number that stands alone behind its name
+_ALONE = re.compile(
+    rf'\W*(?P<name>.+?)\s*[:=,;\t]+\s*(?P<value>{_DIGITS})(\s*(?P<unit>[^\W\d]+))?(\W.*)?'
+)
+#: None: blanks
+_SEPARATORS = ('\t', ';', ',', None)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Separator, names of the columns, and number of lines above the rows.
+
+    `names` is empty where no line names the columns; `numbers` are those that stand alone behind
+    a name above the table; `empty` are the places of columns that hold nothing in the first row.
+    """
+
+    separator: str | None
+    names: tuple[str, ...]
+    above: int
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    empty: tuple[int, ...] = ()
+    width: int = 0
+
+
+def is_number(text: str, comma: bool = False) -> bool:
+    """Return whether a cell is a number, with a decimal comma where that is told."""
+    text = text.strip()
+    return _NUMBER.fullmatch(text) is not None and (comma or ',' not in text)
+
+
+def cells_of(line: str, separator: str | None) -> list[str]:
+    """Return the cells of a line."""
+    if separator is None:
+        return line.split()
+    row = next(csv.reader([line], delimiter=separator), [])
+    return [cell.strip() for cell in row]
+
+
+def find_layout(lines: Sequence[str]) -> Layout | None:
+    """Return the layout of the first lines of a file, None where there is no table in them."""
+    filled = [i for i, line in enumerate(lines) if line.strip()]
+    own = _own(lines, filled)
+    if own is not None:
+        return own
+    for k, i in enumerate(filled):
+        following = [lines[j] for j in filled[k : k + 3]]
+        for separator in _SEPARATORS:
+            if _is_table([cells_of(line, separator) for line in following], separator):
+                return _above(lines, filled[:k], i, separator)
+    return None
+
+
+def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
+    """Return the layout of a file whose first line, but for comments, names t, v or y."""
+    first = next((i for i in filled if not lines[i].lstrip().startswith(COMMENT)), None)
+    if first is None:
+        return None
+    for separator in (',', ';', '\t', None):
+        cells = cells_of(lines[first], separator)
+        # between blanks, prose has a lone v too
+        if {'t', 'v', 'y'}.intersection(cells) and (separator or {'t', 'v'}.issubset(cells)):
+            return Layout(separator, tuple(cells), first + 1)
+    return None
+
+
+def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
+    """Return whether some rows, one behind the other, are the first ones of a table."""
+    numeric = [[j for j, x in enumerate(row) if is_number(x, separator != ',')] for row in rows]
+    if len(numeric[0]) < 2:
+        return False
+    if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
+        return False  # decimal commas between blanks
+    if not rows[0][0] or 0 in numeric[0]:
+        # numbers above a table have names before them; a spoiled row is met later
+        return all(
+            len(n) > 1 and (not r[0] or 0 in n) for n, r in zip(numeric[:2], rows, strict=False)
+        )
+    # a table with text in front
+    return len(numeric) == 3 and numeric[0] == numeric[1] == numeric[2]
+
+
+def _above(
+    lines: Sequence[str], filled: Sequence[int], first: int, separator: str | None
+) -> Layout:
+    row = cells_of(lines[first], separator)
+    need = 1 + max(j for j, cell in enumerate(row) if is_number(cell, separator != ','))
+    names: list[str] = []
+    units: list[str] = []
+    for i in reversed(filled[-2:]):
+        line = lines[i].strip('\r\n')
+        for mark in COMMENT:
+            if line.lstrip().startswith(mark):
+                line = line.strip().lstrip('#%/!').strip()
+        cells = _named(line, separator, need)
+        if not cells:
+            break
+        if not units and all(_is_unit(cell) for cell in cells if cell):
+            units = cells
+            continue
+        names = cells
+        break
+    if not names and units:
+        names, units = units, []
+    names = [
+        f'{name} [{unit.strip("[]()")}]' if unit and name else name
+        for name, unit in zip(names, [*units, *[''] * len(names)], strict=False)
+    ]
+    numbers = {}
+    for i in filled:
+        found = _ALONE.fullmatch(lines[i].strip())
+        if found:
+            name = f'{found["name"]} [{found["unit"]}]' if found['unit'] else found['name']
+            numbers[name] = float(found['value'].replace(',', '.'))
+    # a column that is empty, as LabVIEW writes time that it does not know
+    empty = tuple(j for j, cell in enumerate(row[:need]) if not cell)
+    return Layout(separator, tuple(names), first, numbers, empty, len(row))
+
+
+def _named(line: str, separator: str | None, need: int) -> list[str]:
+    """Return the cells of a header, nothing where a line has too few of them to be one."""
+    cells = cells_of(line, separator)
+    # decimal commas make more of a row
+    if separator and len(cells) >= (2 if separator == ',' else need):
+        return cells
+    # a header may be separated otherwise than its rows
+    others = [cells_of(line, other) for other in ('\t', ';', ',')]
+    others += [re.split(way, line.strip()) for way in (r'\s{2,}', r'\s+(?![\[(])')]
+    return next((x for x in others if len(x) == need), [])
+
+
+def _is_unit(text: str) -> bool:
+    unit = plain_unit(text.strip().strip('[]()'))
+    return unit in ('', '-', 'Hz', 'N', 'A', 'K') or any(unit in units for units in UNITS.values())

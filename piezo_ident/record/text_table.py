@@ -1,0 +1,207 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Records in text: CSV as spreadsheets of any country write it, and what LabVIEW and others write.
+
+`piezo_ident.record.text_layout` finds the table; NumPy reads its numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+import csv
+import io
+import itertools
+from pathlib import Path
+import re
+from typing import Any, BinaryIO
+
+import numpy as np
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.assemble import label_runs
+from piezo_ident.record.columns import choose, RecordTable
+from piezo_ident.record.options import ReadOptions
+from piezo_ident.record.tables import Blocks, ROWS
+from piezo_ident.record.text_layout import COMMENT, find_layout, is_number, Layout
+
+__all__ = ['read_text', 'write_csv']
+
+#: lines in which the table begins
+HEAD = 1000
+_POINTS = (
+    'these look like decimal commas: save it with decimal points, or with semicolons between '
+    'the columns'
+)
+
+
+def read_text(path: Path, options: ReadOptions) -> RecordTable:
+    """Read a table in text, with anything above it."""
+    with path.open('rb') as file:
+        marked = file.read(2) in (b'\xff\xfe', b'\xfe\xff')
+    # utf-8-sig drops a byte order mark; cp1252 is what Windows writes in the west
+    for encoding in ['utf-16'] if marked else ['utf-8-sig', 'cp1252']:
+        try:
+            with path.open(encoding=encoding) as file:
+                return _parse(file, path, options)
+        except UnicodeError:
+            continue
+        except csv.Error as error:
+            raise DataError(f'{path}: no CSV file ({error}); save it as CSV again') from None
+    raise DataError(f'{path}: no text in UTF-8, UTF-16 or cp1252; save it as CSV in UTF-8')
+
+
+def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTable:
+    head = list(itertools.islice(lines, HEAD))
+    layout = find_layout(head)
+    if layout is None:
+        if not any(x.strip() and not x.lstrip().startswith(COMMENT) for x in head):
+            raise DataError(
+                f'{path}: empty file; write a header line t,v,y and the samples below it'
+            )
+        raise DataError(
+            f'{path}: no rows of numbers in the first {len(head)} lines; save it as a table with '
+            'a header line t,v,y'
+        )
+    names = layout.names
+    if not names and not options.columns:
+        raise DataError(
+            f'{path}: no header line; say which column is which by their numbers: '
+            f'--columns t=1,v=2,y=3 (of {layout.width})'
+        )
+    choice = choose(
+        names or [''] * layout.width, options, path, scalars=layout.numbers, empty=layout.empty
+    )
+    columns, labels, starts = _rows(
+        itertools.chain(head[layout.above :], lines), layout, choice.places, path
+    )
+    return choice.table(columns, labels, starts)
+
+
+def _rows(
+    lines: Iterator[str], layout: Layout, places: dict[str, int], path: Path
+) -> tuple[dict[str, Any], list[str], list[int]]:
+    wanted = {name: i for name, i in places.items() if name != 'segment'}
+    # commas tear decimal commas apart: there, every cell has to be accounted for
+    width = len(layout.names) or layout.width
+    use = range(width) if layout.separator == ',' else sorted({*places.values()})
+    number = {*wanted.values()}
+    dtype = np.dtype([(f'{i}', float if i in number else object) for i in use])
+    options: dict[str, Any] = {
+        'delimiter': layout.separator,
+        'comments': None,
+        'quotechar': '"',
+        'ndmin': 1,
+        'usecols': None if layout.separator == ',' else [*use],
+        'encoding': 'utf-8',
+    }
+    parts: list[Any] = []
+    names: list[str] = []
+    starts: list[int] = []
+    n, line = 0, layout.above
+    commas: Any = None
+    while chunk := _whole_rows(lines):
+        if any(map(str.strip, chunk)):
+            try:
+                part = np.loadtxt(chunk, dtype, converters=commas, **options)
+            except ValueError:
+                try:
+                    commas = dict.fromkeys(number, _with_comma)
+                    part = np.loadtxt(chunk, dtype, converters=commas, **options)
+                except ValueError:
+                    raise _culprit(chunk, line + 1, layout, wanted, path) from None
+            if 'segment' in places:
+                new, at = label_runs(map(str.strip, part[f'{places["segment"]}']))
+                names += new
+                starts += [n + i for i in at]
+            parts.append({name: part[f'{i}'].copy() for name, i in wanted.items()})
+            n += part.size
+        line += len(chunk)
+    if not n:
+        raise DataError(f'{path}: no rows below the header; record some samples')
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+    return columns, names, starts
+
+
+def _with_comma(text: str) -> float:
+    if '.' in text or '_' in text:
+        raise ValueError  # commas between thousands, or no number
+    return float(text.replace(',', '.'))
+
+
+def _whole_rows(lines: Iterator[str]) -> list[str]:
+    """Return the next lines, up to the end of a quoted cell; csv.Error where that never comes."""
+    chunk = list(itertools.islice(lines, ROWS))
+
+    def further() -> Iterator[str]:
+        for line in lines:
+            chunk.append(line)
+            yield line
+
+    # numpy takes all up to the end for a cell whose quote is missing
+    if any('"' in line for line in chunk):
+        n = len(chunk)
+        reader = csv.reader(itertools.chain(chunk[:], further()), strict=True)
+        while reader.line_num < n and next(reader, None) is not None:
+            pass
+    return chunk
+
+
+def _culprit(
+    chunk: list[str], line: int, layout: Layout, wanted: dict[str, int], path: Path
+) -> DataError:
+    """Return the error for the first of some lines that cannot be read."""
+    width = len(layout.names) or layout.width
+    separator = layout.separator
+    reader: Any = csv.reader(chunk, delimiter=separator, strict=True) if separator else None
+    rows = filter(None, reader or map(str.split, chunk))
+    marks: set[str] = set()
+    for number, row in enumerate(rows, line):
+        at = f'{path}: line {line + reader.line_num - 1 if reader else number}'
+        if len(row) <= max(wanted.values()) or (separator == ',' and len(row) != width):
+            return DataError(
+                f'{at} has {len(row)} columns, the header has {width}; '
+                + (_POINTS if _torn_at_commas(row, width, wanted) else 'mend or delete the line')
+            )
+        for name, place in wanted.items():
+            text = row[place].strip()
+            title = layout.names[place] if layout.names else name
+            if not is_number(text, comma=True):
+                return DataError(
+                    f'{at}, column {title}: {text[:40]!r} is no number; mend or delete the line'
+                )
+            marks |= {*text} & {',', '.'}
+            if len(marks) > 1:
+                return DataError(
+                    f'{at}, column {title}: {text[:40]!r}, but there are both decimal commas '
+                    'and points above it; save it with one of them'
+                )
+    return DataError(f'{path}: unreadable rows from line {line}; save it again')
+
+
+def _torn_at_commas(row: list[str], width: int, wanted: dict[str, int]) -> bool:
+    """Return whether a row looks as if its decimal commas were taken for separators."""
+    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
+    return width < len(row) <= 2 * width and len(row) - whole <= width - len(wanted)
+
+
+def write_csv(
+    file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
+) -> None:
+    """Write a CSV file whose numbers read back exactly."""
+    labels, n = [_quoted(name) for name in names], 0
+    for block in blocks():
+        if not n:
+            file.write((','.join([*block, *(['segment'] if labels else [])]) + '\n').encode())
+        texts: list[Iterable[str]] = [map(repr, x.tolist()) for x in block.values()]
+        rows = np.arange(n, n + block['t'].size)
+        if labels:
+            texts.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
+        file.write(('\n'.join(map(','.join, zip(*texts, strict=True))) + '\n').encode())
+        n += rows.size
+
+
+def _quoted(text: str) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator='').writerow([text, ''])
+    return line.getvalue()[:-1]
