@@ -24,6 +24,12 @@ docs = [
     'sphinx-design>=0.6,<1',
 ]
 
+# formats of files whose readers no ROS key brings
+files = [
+    'npTDMS>=1.7,<2',
+    'pyarrow>=14',
+]
+
 lint = [
     'mypy>=2.4,<3',
     'ruff>=0.17,<0.18',
@@ -47,6 +53,7 @@ setup(
     install_requires=[
         'PyYAML>=6,<7',
         'click>=8.1,<9',
+        'h5py>=3.10,<4',
         'jinja2>=3.1,<4',
         'matplotlib>=3.6,<4',
         # for bags of a killed recorder; package.xml cannot name it, and it need not be there
@@ -67,9 +74,11 @@ setup(
         ],
         'cluster': cluster,
         'docs': docs,
+        'files': files,
         'test': [
             *cluster,
             *docs,
+            *files,
             *lint,
             'hypothesis>=6,<7',
             'ipykernel>=6,<8',

@@ -46,6 +46,7 @@ ROOMS = (
 # Import names whose rosdep keys read otherwise; a ROS package is its own key.
 ROSDEP_KEYS = {
     'click': 'python3-click',
+    'h5py': 'python3-h5py',
     'jinja2': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib',
     'numba': 'python3-numba',

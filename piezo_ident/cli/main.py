@@ -181,6 +181,8 @@ cli = Verbs(
             [options.IN, options.OUT],
             {'Output': options.OUTPUT, 'How to read records': options.READING},
             'convert --displacement-unit um record.csv record.npz',
+            'convert scope.csv record.csv --columns "t=Zeit [ms],v=Kanal A,y=Kanal B"',
+            'convert samples.txt record.csv --rate 20e3 --columns v=1,y=2 --displacement-unit um',
             'convert recorded_bag/ record.csv',
         ),
         Verb(

@@ -17,8 +17,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 from piezo_ident.common.config import shipped_names
-
-UNITS = ('m', 'mm', 'um', 'nm')
+from piezo_ident.record.options import parse_columns, plain_unit, UNITS
 
 
 def _name(text: str) -> str:
@@ -32,14 +31,6 @@ def _name(text: str) -> str:
 
 def _file(text: str) -> Path:
     return Path(_name(text))
-
-
-def _unit(text: str) -> str:
-    # both characters that look like a micro
-    unit = text.replace('\u00b5', 'u').replace('\u03bc', 'u')
-    if unit not in UNITS:
-        raise click.BadParameter(f'{text!r} is no unit; give {", ".join(UNITS)}')
-    return unit
 
 
 def _whole(text: str) -> int:
@@ -87,6 +78,18 @@ def _option(name: str, kind: Any, metavar: str | None, text: str, **more: Any) -
     return click.Option([name], type=kind, metavar=metavar, help=text, **more)
 
 
+def _unit_of(quantity: str, role: str) -> click.Option:
+    known = UNITS[role]
+
+    def unit(text: str) -> str:
+        if plain_unit(text) not in known:
+            raise click.BadParameter(f'{text!r} is no unit; give {", ".join(known)}')
+        return plain_unit(text)
+
+    text = f'Of {role} in the files (default: by the header, else {next(iter(known))}).'
+    return _option(f'--{quantity}-unit', unit, '|'.join(known), text)
+
+
 def _flag(name: str, text: str) -> click.Option:
     return click.Option([name], is_flag=True, help=text)
 
@@ -108,7 +111,14 @@ EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effec
 
 #: how records are read: fields of `ReadOptions`, whose defaults hold where an option is absent
 READING = [
-    _option('--displacement-unit', _unit, 'm|mm|um|nm', 'Of y in the files (default: m).'),
+    _option(
+        *('--columns', parse_columns, 't=NAME,...'),
+        'Name or number of the columns t, v, y (default: by the header).',
+    ),
+    _option('--rate', float, 'HZ', 'Samples a second of files without time, as in 20e3.'),
+    _unit_of('time', 't'),
+    _unit_of('voltage', 'v'),
+    _unit_of('displacement', 'y'),
     _option('--voltage-limits', float, 'LO HI', 'Refuse others [V].', nargs=2, callback=_limits),
     _option('--namespace', _name, 'NAME', 'Of the topics of a bag.'),
     _option('--voltage-topic', _name, 'TOPIC', 'Topic of a bag with the voltage.'),

@@ -17,6 +17,7 @@ from typing import Any
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.record import io as record_io
+from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
@@ -37,7 +38,8 @@ __all__ = [
 
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
-RECORD_FILES = ('.csv', '.npz', '.mat', *BAG_FILES)
+#: what a folder is searched for: .txt and .dat are often something else
+RECORD_FILES = (*(x for x in READERS if x not in ('.txt', '.dat', '.asc')), *BAG_FILES)
 
 
 @contextmanager
@@ -113,12 +115,19 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
-    """Refuse options that choose topics where no record is a bag."""
+    """Refuse options that choose topics where no record is a bag, or columns where all are."""
     tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
         if tables and getattr(args, option) is not None:
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
+            )
+    bags = all(p.is_dir() or p.suffix.lower() in BAG_FILES for p in paths)
+    for option in ('columns', 'rate', 'time_unit', 'voltage_unit'):
+        if bags and getattr(args, option) is not None:
+            raise ConfigError(
+                f'--{option.replace("_", "-")} is for tables, and {paths[0]} is a bag; leave it '
+                'out'
             )
 
 

@@ -215,9 +215,11 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     if stroke is not None and stroke == 0.0 and not idle:
         raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
     if stroke is not None and (stroke > STROKE[1] or (stroke < STROKE[0] and not idle)):
+        others = {u: stroke * UNITS['y'][unit] / factor for u, factor in UNITS['y'].items()}
+        fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
-            '(1 nm .. 10 mm); name the unit of y with --displacement-unit m, mm, um or nm'
+            f'(1 nm .. 10 mm); name the unit of y with --displacement-unit {" or ".join(fitting)}'
         )
     for key, span in moved.items():
         offset = max(map(abs, ranges[key]))

@@ -36,7 +36,7 @@ _WORDS = {
 }
 #: names of a number beside the columns: the sampling rate, or its inverse
 _RATES = ('fs', 'rate', 'samplerate', 'samplingrate', 'samplefrequency', 'samplingfrequency')
-_PERIODS = ('dt', 'ts', 'deltax', 'deltat', 'sampletime', 'samplingtime', 'sampleperiod')
+_PERIODS = ('dt', 'ts', 'deltax', 'deltat', 'sampletime', 'samplingtime', 'wfincrement')
 _UNIT = re.compile(
     r'(?P<name>.*?)\s*(?:\[(?P<a>[^][]*)\]|\((?P<b>[^()]*)\)|/\s*(?P<c>[^\W\d]+))'
     r'|(?P<bare>.*?)(?:[_\s.]+|\bin\s+)(?P<d>[^\W\d_]+)'

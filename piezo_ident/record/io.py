@@ -41,7 +41,8 @@ WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]],
     '.mat': write_mat,
 }
 
-_FORMATS = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
+_WRITTEN = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
+_READ = f'a bag folder, .mcap, .db3, {", ".join(READERS)}'
 #: sampling rates [Hz] at which time in another unit than seconds is likelier
 SLOW = 50.0
 #: strokes [m] and spans of a voltage [V] at which another unit is likelier
@@ -55,13 +56,16 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     Parameters
     ----------
     path : path
-        A bag folder, .mcap, .db3, .csv, .npz or .mat.
+        A bag folder, .mcap, .db3, or a table: .csv and other text, .lvm, .npz, .mat, .h5, .tdms,
+        .parquet.
     options : ReadOptions, optional
     **choices
-        Fields of `ReadOptions`, in place of those of `options`: ``displacement_unit='um'``,
-        ``voltage_limits=(0, 10)``; for bags ``namespace``, ``voltage_topic``,
-        ``displacement_topic``, and ``recover=True`` for an unfinished one; ``voltage_alone=True``
-        for a table without displacement, which is then NaN.
+        Fields of `ReadOptions`, in place of those of `options`.  For tables
+        ``columns={'t': 'time_s', 'v': 'voltage', 'y': 'position_um'}``, guessed by the header when
+        absent; ``rate=20e3`` where there is no time; ``time_unit='ms'``, ``voltage_unit``,
+        ``displacement_unit='um'``; ``voltage_limits=(0, 10)``; ``voltage_alone=True`` for a table
+        without displacement, which is then NaN.  For bags ``namespace``, ``voltage_topic``,
+        ``displacement_topic``, and ``recover=True`` for an unfinished one.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         raise DataError(f'{path}: does not exist; check the name')
     check_regular(path)
     if suffix not in READERS:
-        raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_FORMATS}')
+        raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_READ}')
     try:
         table = READERS[suffix](path, options)
     except OSError as error:
@@ -192,7 +196,7 @@ def write(
     _check_labels(record, path)
     is_bag = suffix in ('', '.mcap', '.db3') or (path / 'metadata.yaml').is_file()
     if not is_bag and suffix not in WRITERS:
-        raise DataError(f'{path}: unknown format {suffix}; give {_FORMATS}')
+        raise DataError(f'{path}: unknown format {suffix}; give {_WRITTEN}')
     if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
     if is_bag:

@@ -49,10 +49,9 @@ class Layout:
     width: int = 0
 
 
-def is_number(text: str, comma: bool = False) -> bool:
-    """Return whether a cell is a number, with a decimal comma where that is told."""
-    text = text.strip()
-    return _NUMBER.fullmatch(text) is not None and (comma or ',' not in text)
+def is_number(text: str) -> bool:
+    """Return whether a cell is a number, with a decimal point or comma."""
+    return _NUMBER.fullmatch(text.strip()) is not None
 
 
 def cells_of(line: str, separator: str | None) -> list[str]:
@@ -92,7 +91,7 @@ def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
 
 def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
     """Return whether some rows, one behind the other, are the first ones of a table."""
-    numeric = [[j for j, x in enumerate(row) if is_number(x, separator != ',')] for row in rows]
+    numeric = [[j for j, x in enumerate(row) if is_number(x)] for row in rows]
     if len(numeric[0]) < 2:
         return False
     if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
@@ -110,7 +109,7 @@ def _above(
     lines: Sequence[str], filled: Sequence[int], first: int, separator: str | None
 ) -> Layout:
     row = cells_of(lines[first], separator)
-    need = 1 + max(j for j, cell in enumerate(row) if is_number(cell, separator != ','))
+    need = 1 + max(j for j, cell in enumerate(row) if is_number(cell))
     names: list[str] = []
     units: list[str] = []
     for i in reversed(filled[-2:]):

@@ -166,7 +166,7 @@ def _culprit(
         for name, place in wanted.items():
             text = row[place].strip()
             title = layout.names[place] if layout.names else name
-            if not is_number(text, comma=True):
+            if not is_number(text):
                 return DataError(
                     f'{at}, column {title}: {text[:40]!r} is no number; mend or delete the line'
                 )

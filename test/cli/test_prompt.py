@@ -15,7 +15,7 @@ from command_line import refuse, run, succeed
 import piezo_ident as pi
 from piezo_ident.cli import options
 from piezo_ident.cli.main import cli
-from piezo_ident.record.assemble import ReadOptions
+from piezo_ident.record.options import ReadOptions
 import pytest
 
 VERBS = sorted(cli.commands)

@@ -1,0 +1,286 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A lab's own files are read as they are; what cannot be known is asked for in one line."""
+
+from pathlib import Path
+import shlex
+import sys
+
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.cli import main
+from piezo_ident.common.errors import DataError
+import pytest
+import scipy.io
+
+RATE = 5000.0
+N = 2000
+K = np.arange(N)
+V = np.round(5 + 4 * np.sin(K / 40) * K / N, 4)
+UM = np.round(7.5 * V, 3)
+LVM = """\
+LabVIEW Measurement\t
+Writer_Version\t2
+Reader_Version\t2
+Separator\tTab
+Decimal_Separator\t,
+X_Columns\tOne
+Time_Pref\tRelative
+Date\t2024/05/06
+Time\t10:11:12,345
+***End_of_Header***\t
+\t
+Channels\t2\t\t\t
+Samples\t2000\t2000\t\t
+Date\t2024/05/06\t2024/05/06\t\t
+Time\t10:11:12,345\t10:11:12,345\t\t
+X_Dimension\tTime\tTime\t\t
+X0\t0,0E+0\t0,0E+0\t\t
+Delta_X\t0,000200\t0,000200\t\t
+***End_of_Header***\t\t\t\t
+"""
+
+
+def rows(*columns, separator=',', comma=False) -> str:
+    lines = (
+        separator.join(map(str, row)) for row in zip(*(c.tolist() for c in columns), strict=True)
+    )
+    text = '\n'.join(lines) + '\n'
+    return text.replace('.', ',') if comma else text
+
+
+def names_csv(path: Path) -> None:
+    path.write_text('time_s,voltage,position_um,note\n' + rows(K / RATE, V, UM, K))
+
+
+def german_csv(path: Path) -> None:
+    table = rows(np.round(K / 5, 1), V, UM, separator=';', comma=True)
+    path.write_bytes(f'sep=;\r\nZeit [ms];Spannung [V];Weg [\u00b5m]\r\n{table}'.encode('cp1252'))
+
+
+def unicode_txt(path: Path) -> None:
+    table = rows(K / RATE, V, UM * 1e-6, separator='\t')
+    path.write_text(f'T\tV\tY\n{table}', encoding='utf-16')
+
+
+def quoted_csv(path: Path) -> None:
+    table = rows(K / RATE, V, UM, separator=';', comma=True)
+    text = table.replace(';', '","').replace('\n', '"\n"')[:-1]
+    path.write_text(f'"t [s]","v [V]","y [\u03bcm]"\n"{text}', encoding='utf-8-sig')
+
+
+def labview_lvm(path: Path) -> None:
+    table = rows(K / RATE, V, UM, separator='\t', comma=True).replace('\n', '\tstarted\n', 1)
+    path.write_text(f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n{table}')
+
+
+def without_time_lvm(path: Path) -> None:
+    table = rows(V, UM, separator='\t', comma=True).replace('\n', '\n\t')[:-1]
+    path.write_text(f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n\t{table}')
+
+
+def without_time_txt(path: Path) -> None:
+    path.write_text(
+        f'DAQ log\n10 May\n\nVoltage (V)\tPosition (um)\n{rows(V, UM, separator=chr(9))}'
+    )
+
+
+def scope_csv(path: Path) -> None:
+    path.write_text(f'Time,Drive,Position\n(ms),(V),(\u00b5m)\n\n{rows(K / 5, V, UM)}')
+
+
+def microseconds_csv(path: Path) -> None:
+    path.write_text('t_us,u,pos_nm\n' + rows(K * 200, V, np.round(1e3 * UM)))
+
+
+def rounded_csv(path: Path) -> None:
+    path.write_text('t,v,y\n' + rows(np.round(K / RATE, 3), V, 1e-6 * UM))
+
+
+def blanks_dat(path: Path) -> None:
+    header = 'made by hand\ntime [s]  voltage [V]  displacement [um]'
+    np.savetxt(path, np.column_stack([K / RATE, V, UM]), header=header, comments='% ')
+
+
+def headless_csv(path: Path) -> None:
+    path.write_text(rows(V, UM))
+
+
+def struct_mat(path: Path) -> None:
+    scipy.io.savemat(path, {'run1': {'time': K / RATE, 'U': V, 'pos_um': UM}, 'note': 'hello'})
+
+
+def matrix_mat(path: Path) -> None:
+    scipy.io.savemat(path, {'data': np.column_stack([V, UM]), 'fs': RATE})
+
+
+def any_npz(path: Path) -> None:
+    np.savez(path, time_ms=K / 5, voltage=V, displacement_um=UM, meta=np.array([{}]))
+
+
+def v73_mat(path: Path) -> None:
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(path, 'w', userblock_size=512) as file:
+        for name, x in (('Time', K / RATE), ('Voltage', V), ('Position_um', UM)):
+            file[f'scan/{name}'] = x[None]
+        file['#refs#/a'] = np.arange(4)
+    with path.open('r+b') as file:
+        file.write(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(124) + b'\x00\x02IM')
+
+
+def daq_h5(path: Path) -> None:
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(path, 'w') as file:
+        file['daq/drive'], file['daq/sensor'] = V, UM
+        file['daq/drive'].attrs['units'] = 'V'
+        file['daq/sensor'].attrs['units'] = '\u00b5m'
+        file['daq/sample_rate'] = RATE
+
+
+def daq_tdms(path: Path) -> None:
+    tdms = pytest.importorskip('nptdms')
+    with tdms.TdmsWriter(path) as writer:
+        for name, unit, x in (('Command', 'Volts', V), ('Strain gauge', 'um', UM)):
+            wave = {'wf_increment': 1 / RATE, 'wf_start_offset': 0.0, 'unit_string': unit}
+            writer.write_segment([tdms.ChannelObject('Log', name, x, wave)])
+
+
+def daq_parquet(path: Path) -> None:
+    arrow = pytest.importorskip('pyarrow')
+    parquet = pytest.importorskip('pyarrow.parquet')
+    when = np.datetime64('2024-05-06T10:11:12') + K * np.timedelta64(200, 'us')
+    table = {'time': when, 'voltage [mV]': 1e3 * V, 'position_um': UM}
+    parquet.write_table(arrow.table(table), path)
+
+
+FILES = {
+    names_csv: '',
+    german_csv: '',
+    unicode_txt: '',
+    quoted_csv: '',
+    labview_lvm: '',
+    without_time_lvm: '',
+    without_time_txt: '--rate 5e3',
+    scope_csv: '',
+    microseconds_csv: '',
+    rounded_csv: '',
+    blanks_dat: '',
+    headless_csv: '--columns v=1,y=2 --rate 5000 --displacement-unit um',
+    struct_mat: '',
+    matrix_mat: '--columns v=data.1,y=data.2 --displacement-unit \u00b5m',
+    any_npz: '',
+    v73_mat: '',
+    daq_h5: '',
+    daq_tdms: '',
+    daq_parquet: '',
+}
+
+
+def made(maker, folder: Path) -> Path:
+    name, _, suffix = maker.__name__.rpartition('_')
+    path = folder / f'{name}.{suffix}'
+    maker(path)
+    return path
+
+
+@pytest.mark.parametrize('maker', FILES, ids=lambda f: f.__name__)
+def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
+    path, out = made(maker, tmp_path), tmp_path / 'out.npz'
+    argv = ['convert', str(path), str(out), *shlex.split(FILES[maker])]
+    assert main(argv) == 0, capsys.readouterr().err
+    (piece,) = pi.read(out).pieces
+    assert (piece.n, piece.sample_rate, piece.start_time) == (N, RATE, 0.0)
+    np.testing.assert_allclose(piece.v, V, rtol=1e-12)
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+    # what was guessed is printed
+    text = capsys.readouterr().out
+    assert ('met: columns' in text) is (maker is not rounded_csv)
+
+
+@pytest.mark.parametrize(
+    ('header', 'words'),
+    [
+        (
+            'time,out,volt_a,volt_b',
+            ['2 columns may be the voltage', '--columns v=volt_a', 'volt_b'],
+        ),
+        ('time,U,U,pos', ['2 columns may be the voltage (U, U)', '--columns v=2 or', 'v=3']),
+        ('t,v,y,v', ['column v stands there twice', '--columns v=2']),
+        ('time,voltage,ai0,ai1', ['y missing', '--columns y=ai0']),
+        ('time,ai0,ai1,ai2', ['v, y missing', '--columns v=ai0,y=ai1']),
+        ('a,b,c,d', ['t, v, y missing', '--columns t=a,v=b,y=c', '--rate 20e3']),
+        ('time,voltage,Weg [inch],d', ["unit 'inch' is unknown", '--displacement-unit um']),
+        ('time [h],voltage,pos,d', ["unit 'h' is unknown", '--time-unit']),
+        ('0.1,1,2,3', ['no header line', '--columns t=1,v=2,y=3']),
+    ],
+)
+def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'{header}\n{rows(K / RATE, V, 1e-6 * UM, V)}')
+    with pytest.raises(DataError) as caught:
+        pi.read(path)
+    message = str(caught.value)
+    assert message.isprintable() and all(word in message for word in (str(path), *words)), message
+
+
+@pytest.mark.parametrize(
+    ('choices', 'words'),
+    [
+        ({'columns': 't=1,v=2,y=5'}, ["no column '5'", 'a, b']),
+        ({'columns': 't=1,v=2,z=3'}, ["'z' is no quantity", '--columns']),
+        ({'columns': 't=1,v'}, ["'v' is no pair", '--columns']),
+        ({'columns': 't=a,t=b'}, ['t comes twice', '--columns']),
+        ({'columns': {'t': 'a', 'v': 'b', 'y': 'c'}, 'rate': 5e3}, ['--rate', 'drop one']),
+        ({'columns': {'t': 'a', 'v': 'b', 'y': 'c'}}, ['113 m', '--displacement-unit um or nm']),
+        ({'columns': 't=a,v=b,y=c', 'rate': -1.0}, ['a rate of -1 Hz']),
+        ({'time_unit': 'h'}, ["unknown time unit 'h'", 'ms']),
+    ],
+)
+def test_options_that_do_not_fit_the_file(tmp_path, choices, words):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'a,b,c\n{rows(K / RATE, V, 2 * UM)}')
+    with pytest.raises(DataError) as caught:
+        pi.read(path, **choices)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text(f't,v,y\n{rows(K / 5, 1e3 * V, 1e-4 * UM)}')
+    doubts = {f.name: f.action for f in pi.read(path).faults}
+    assert doubts.keys() == {'slow_sampling', 'large_stroke', 'high_voltage'}
+    assert '--time-unit ms' in doubts['slow_sampling']
+    assert '--displacement-unit' in doubts['large_stroke']
+    assert '--voltage-unit mV' in doubts['high_voltage']
+    named = pi.read(path, time_unit='ms', voltage_unit='mV', displacement_unit='mm')
+    assert (named.pieces[0].sample_rate, named.faults) == (RATE, ())
+
+
+def test_time_that_is_rounded_is_not_guessed_where_two_rates_fit(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text('t,v,y\n' + rows(np.round(K / 4967.3, 3), V, 1e-6 * UM))
+    with pytest.raises(DataError, match=r'two different samples.*--rate 20e3'):
+        pi.read(path)
+    assert pi.read(path, rate=4967.3).pieces[0].sample_rate == 4967.3
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    for suffix, package in (('h5', 'h5py'), ('tdms', 'npTDMS'), ('parquet', 'pyarrow')):
+        path = tmp_path / f'r.{suffix}'
+        path.touch()
+        monkeypatch.setitem(sys.modules, {'npTDMS': 'nptdms'}.get(package, package), None)
+        monkeypatch.delitem(sys.modules, 'pyarrow.parquet', raising=False)
+        with pytest.raises(DataError, match=f'pip install {package}'):
+            pi.read(path)
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize('suffix', ['txt', 'lvm', 'h5', 'tdms', 'parquet'])
+def test_damaged_files(tmp_path, suffix):
+    path = tmp_path / f'r.{suffix}'
+    for data in (b'', b'\x89HDF\r\n\x1a\n', np.random.default_rng(0).bytes(3000)):
+        path.write_bytes(data)
+        with pytest.raises(DataError) as caught:
+            pi.read(path)
+        assert str(caught.value).isprintable()
