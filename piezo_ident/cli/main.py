@@ -10,7 +10,7 @@ Nothing heavy is imported before the arguments are parsed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import difflib
 import importlib
 import json
@@ -39,6 +39,11 @@ OUT_HELP = 'OUT is a .csv, .npz, .mat, .mcap or .db3 file, or a folder for a ros
 def _examples(lines: Sequence[str]) -> str:
     # \b keeps the lines apart
     return '\n'.join(['\b', 'Examples:', *(f'  piezo_ident {line}' for line in lines)])
+
+
+def _guess(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f'did you mean {close[0]}?' if close else ''
 
 
 class Verb(click.Command):
@@ -94,8 +99,7 @@ class Verbs(click.Group):
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """Return the verb and what follows it."""
         if not ctx.resilient_parsing and args[0] not in self.commands:
-            close = difflib.get_close_matches(args[0], self.commands, n=1)
-            guess = f'did you mean {close[0]}?' if close else f'give {", ".join(self.commands)}'
+            guess = _guess(args[0], self.commands) or f'give {", ".join(self.commands)}'
             ctx.fail(f'no such verb: {args[0]}; {guess}')
         return super().resolve_command(ctx, args)
 
@@ -253,8 +257,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # the reader has read enough; the interpreter's own flush must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except click.UsageError as error:
-        place = error.ctx.command_path if error.ctx else 'piezo_ident'
-        return stop(BAD_INPUT, f'{error.format_message()} (see {place} --help)', 'UsageError')
+        text, place = (
+            error.format_message(),
+            error.ctx.command_path if error.ctx else 'piezo_ident',
+        )
+        if isinstance(error, click.NoSuchOption):
+            guess = _guess(error.option_name, error.possibilities or ())
+            text = f'no such option: {error.option_name}{guess and "; "}{guess}'
+        return stop(BAD_INPUT, f'{text} (see {place} --help)', 'UsageError')
     except PiezoIdentError as error:
         return stop(BAD_INPUT, str(error), type(error).__name__)
     except OSError as error:

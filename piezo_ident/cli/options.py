@@ -47,7 +47,9 @@ def _order(text: str) -> tuple[int, ...]:
 
 
 def _thresholds(text: str) -> int | None:
-    return None if text == 'auto' else _whole(text)
+    if text != 'auto' and not text.isdecimal():
+        raise click.BadParameter(f'{text!r}: give a number, or auto')
+    return None if text == 'auto' else int(text)
 
 
 def _limits(ctx: Any, param: Any, limits: tuple[float, float] | None) -> Any:

@@ -60,7 +60,8 @@ def play_columns(
     ndarray, shape (m, n)
     """
     x = np.ascontiguousarray(v, dtype=np.float64)
-    r = np.ascontiguousarray(thresholds, dtype=np.float64)
+    # a frozen array would be another type to the compiler
+    r = np.array(thresholds, dtype=np.float64)
     start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
     out = np.empty((r.size, x.size))
     plays(x, r, start, out)
@@ -105,5 +106,6 @@ def weighted_plays(
     x = np.ascontiguousarray(v)
     end = memory.copy()
     out = np.empty(x.size)
-    hysteresis(x, thresholds, weights, p1, p2, end, out)
+    # frozen arrays would be other types to the compiler
+    hysteresis(x, np.array(thresholds), np.array(weights), p1, p2, end, out)
     return out, end

@@ -47,9 +47,9 @@ def test_every_help_has_examples_that_are_understood(capsys, verb):
         ('predcit m.yaml r.csv', 'did you mean predict?'),
         ('identfy r.csv', 'did you mean identify?'),
         ('xyzzy', 'give simulate, identify, predict'),
-        ('identify r.csv --mdoel m.yaml', '--model'),
-        ('convert a b --overwirte', '--overwrite'),
-        ('--verison', '--version'),
+        ('identify r.csv --mdoel m.yaml', 'did you mean --model?'),
+        ('convert a b --overwirte', 'did you mean --overwrite?'),
+        ('--verison', 'did you mean --version?'),
         ('identify r.csv --model --report x', 'a name is missing before it'),
     ],
 )

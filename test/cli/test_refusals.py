@@ -77,6 +77,7 @@ COMMANDS = (
     ('identify R --namespace other', 'is for bags', 'record.npz'),
     ('predict M R --voltage-topic v', 'is for bags', 'record.npz'),
     ('convert R T/r.csv --displacement-topic y', 'is for bags', 'record.npz'),
+    ('identify R --each T/out --overwrite', 'does not go with --each'),
     ('identify R --each T/out --namespace other', 'is for bags', 'record.npz'),
     # models and records that do not go together
     ('predict R M', 'MODEL comes first: piezo_ident predict'),
