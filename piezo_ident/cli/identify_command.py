@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -120,13 +120,20 @@ def prompt_of(args: SimpleNamespace, records: Sequence[Record], paths: Sequence[
     given = getattr(args, 'model_file', '')
     written = args.report and args.report / 'model.yaml'
     read = {x.opts[0]: getattr(args, str(x.name)) for x in READING}
-    words = [[name, *np.atleast_1d(x)] for name, x in read.items() if x is not None]
+    words = [[name, *_words(x)] for name, x in read.items() if x is not None]
     return Prompt(
         model=str(args.model or written or ('refined.yaml' if given else 'model.yaml')),
         given=str(given),
         records={x.name: str(path) for x, path in zip(records, paths, strict=True)},
-        reading=tuple(map(str, chain(*words))),
+        reading=tuple(chain(*words)),
     )
+
+
+def _words(value: Any) -> list[str]:
+    """Return the value of an option as it is typed."""
+    if isinstance(value, Mapping):
+        return [','.join(f'{key}={x}' for key, x in value.items())]
+    return [f'{x:g}' if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist()]
 
 
 def print_next(

@@ -10,10 +10,12 @@ import os
 import shlex
 import subprocess
 import sys
+from types import SimpleNamespace
 
 from command_line import refuse, run, succeed
 import piezo_ident as pi
 from piezo_ident.cli import options
+from piezo_ident.cli.identify_command import prompt_of
 from piezo_ident.cli.main import cli
 from piezo_ident.record.options import ReadOptions
 import pytest
@@ -67,6 +69,14 @@ def test_validation_takes_all_words_up_to_the_next_option():
 def test_reading_options_are_fields_of_read_options():
     names = {option.name for option in options.READING}
     assert names < {field.name for field in fields(ReadOptions)}
+
+
+def test_commands_that_are_suggested_read_records_in_the_same_way():
+    line = 'identify a.csv --voltage-limits -5 5.5 --displacement-unit um --rate 20e3'
+    first = parsed(f"{line} --columns 't=time s,v=voltage,y=position'")
+    reading = prompt_of(SimpleNamespace(**first), [], []).reading
+    again = parsed(f'identify a.csv {shlex.join(reading)}')
+    assert again == first
 
 
 @pytest.mark.parametrize(
