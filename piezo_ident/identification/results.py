@@ -174,7 +174,8 @@ class DynamicsResult:
     covariance : ndarray, shape (na + nb, na + nb)
         Of (a, b).
     response : FrequencyResponse or None
-        Measured, from voltage to displacement, normalised.
+        Measured, normalised: from voltage to displacement on a noise segment, else on any
+        broadband motion from behind H.
     bias : float
         Voltage around which it was measured, normalised.
     slope_measured, slope_model : float

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy import fft, signal
 
 __all__ = [
     'FrequencyResponse',
+    'broadband_response',
     'cross_spectra',
     'excited_band',
     'frequency_response',
@@ -21,6 +23,12 @@ __all__ = [
 
 #: samples whose segments are transformed at once
 TOGETHER = 1 << 18
+#: longest segment of a frequency response [samples]
+SEGMENT = 8192
+#: a response of any motion keeps points of at most this relative standard deviation
+TRUSTED = 0.1
+#: fewer points are no response, but that of a few sines
+POINTS = 20
 
 
 def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3) -> float:
@@ -119,6 +127,11 @@ class FrequencyResponse:
     std: NDArray[np.float64]
     averages: int
 
+    def at(self, kept: NDArray[np.bool_]) -> FrequencyResponse:
+        """Return the response at some of its frequencies."""
+        names = ('frequency', 'response', 'coherence', 'std')
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+
 
 def frequency_response(
     u: NDArray[np.float64], y: NDArray[np.float64], sample_rate: float, band: float | None = None
@@ -139,21 +152,64 @@ def frequency_response(
     -----
     Bendat and Piersol, Random Data, 4th ed. (2010), table 9.6, doi:10.1002/9781118032428.
     """
-    segment = int(2 ** np.floor(np.log2(max(u.size // 16, 16))))
-    segment = min(segment, 8192)
-    f = fft.rfftfreq(segment, 1.0 / sample_rate)
-    s_uu, s_yy, s_uy = cross_spectra(u, y, segment)
-    averages = max(1, 2 * u.size // segment - 1)
+    response = _response([(u, y)], min(_power_of_two(u.size // 16), SEGMENT), sample_rate)
+    f = response.frequency
+    return response.at((f > 0.0) & (f <= (np.inf if band is None else band)))
+
+
+def broadband_response(
+    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]],
+    sample_rate: float,
+) -> FrequencyResponse | None:
+    """
+    Estimate the response of what follows a hysteresis from any motion.
+
+    Parameters
+    ----------
+    parts : sequence of tuple of ndarray
+        Unbroken stretches, of any lengths: voltage, the same behind the hysteresis, displacement.
+    sample_rate : float
+        [Hz]
+
+    Returns
+    -------
+    FrequencyResponse or None
+        From behind the hysteresis, at the frequencies at which voltage and displacement tell it;
+        None where these are hardly any, as with a single sine.
+    """
+    longest = max((v.size for v, _, _ in parts), default=0)
+    segment = min(_power_of_two(longest // 16), SEGMENT)
+    parts = [part for part in parts if part[0].size >= segment]
+    if not parts:
+        return None
+    driven = _response([(v, y) for v, _, y in parts], segment, sample_rate)
+    response = _response([(w, y) for _, w, y in parts], segment, sample_rate)
+    # what a hysteresis adds where the voltage has nothing tells of its model alone
+    told = np.maximum(driven.std, response.std) <= TRUSTED
+    # a Hann window blurs what lies within two bins of the trend that was taken out
+    told[:3] = False
+    return response.at(told) if told.sum() >= POINTS else None
+
+
+def _power_of_two(n: int) -> int:
+    return int(2 ** np.floor(np.log2(max(n, 16))))
+
+
+def _response(
+    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    segment: int,
+    sample_rate: float,
+) -> FrequencyResponse:
+    sums = [cross_spectra(u, y, segment) for u, y in parts]
+    s_uu, s_yy = (np.sum([each[i] for each in sums], axis=0) for i in (0, 1))
+    s_uy = np.sum([each[2] for each in sums], axis=0)
+    averages = sum(max(1, 2 * u.size // segment - 1) for u, _ in parts)
     tiny = np.finfo(float).tiny
     coherence = np.clip(np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, tiny), 0.0, 1.0)
-    std = np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages))
-    keep = f > 0.0
-    if band is not None:
-        keep &= f <= band
     return FrequencyResponse(
-        frequency=f[keep],
-        response=(s_uy / np.maximum(s_uu, tiny))[keep],
-        coherence=coherence[keep],
-        std=std[keep],
+        frequency=fft.rfftfreq(segment, 1.0 / sample_rate),
+        response=s_uy / np.maximum(s_uu, tiny),
+        coherence=coherence,
+        std=np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages)),
         averages=averages,
     )

@@ -34,7 +34,7 @@ from piezo_ident.identification.results import (
     Settings,
     silent,
 )
-from piezo_ident.identification.spectra import excited_band
+from piezo_ident.identification.spectra import broadband_response, excited_band
 from piezo_ident.identification.starts import fit_starts, lag_of
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
 from piezo_ident.identification.step3_choice import third_step
@@ -174,6 +174,15 @@ def joint_fit(
         for e in excerpts
         if e.use.sum() > 1
     )
+    response = broadband_response(
+        [
+            (e.u[a:b], H(e.u, e.start(H.thresholds))[a:b], e.x[a:b])
+            for e, run, mask in zip(excerpts, runs, fitted, strict=True)
+            # a rest before a jump belongs to it
+            for a, b in true_runs(run.use & mask)
+        ],
+        rate,
+    )
     found = _delay_result(delay, step, linear, settings, rate, band)
     progress('dynamics', 1.0)
     fit = None if linear is None else linear.fit
@@ -184,6 +193,7 @@ def joint_fit(
             None,
             {} if linear is None else linear.methods,
             np.zeros((1, 1)) if fit is None else fit.normalised_covariance,
+            response,
             band=band,
         ),
         G=G,
@@ -387,6 +397,6 @@ def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]
         joint,
         G=unit,
         delay=replace(joint.delay, samples=0, fraction=0.0, std=float('inf'), source='none'),
-        dynamics=DynamicsResult((0, 1), None, {}, np.zeros((1, 1)), band=joint.dynamics.band),
+        dynamics=replace(joint.dynamics, order=(0, 1), methods={}, covariance=np.zeros((1, 1))),
         not_identified=(*joint.not_identified, ('delay', reason), ('dynamics', reason)),
     )

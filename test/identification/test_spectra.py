@@ -6,6 +6,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 from piezo_ident.identification.spectra import (
+    broadband_response,
     cross_spectra,
     excited_band,
     frequency_response,
@@ -80,6 +81,29 @@ def test_drift_of_both_is_taken_away():
     t = np.linspace(0, 1, u.size)
     est = frequency_response(u, 0.5 * u + 1000 * t, FS)
     assert np.abs(est.response - 0.5).max() < 0.01
+
+
+def test_any_motion_tells_where_it_is_fast():
+    t = np.arange(40_000) / FS
+    slow = np.sin(2 * np.pi * t)
+    jump = np.where(t > 0.7, slow, -0.5)
+    rich = signal.chirp(t, 5.0, 2.0, 500.0)
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(t.size)
+    found = {}
+    for name, u in (('sine', slow), ('jump', jump), ('chirp', rich)):
+        y = filter_arx(RESONANT.a, RESONANT.b, u, at_rest=False) + noise
+        # a hysteresis makes harmonics that the voltage has not; they tell nothing of G
+        w = u if name == 'jump' else u + 0.01 * u**3
+        # a piece too short for a segment does no harm
+        found[name] = broadband_response([(u, w, y), (u[:30], w[:30], y[:30])], FS)
+    assert found['sine'] is None
+    assert broadband_response([], FS) is None
+    for name, least, most in (('jump', 2100, FS), ('chirp', 480, 600)):
+        f = found[name].frequency
+        assert least < f[-1] < most
+        error = np.abs(found[name].response / RESONANT.response(f, FS) - 1.0)
+        assert np.quantile(error[np.abs(f - 2000) > 100], 0.9) < 0.15
+    assert np.abs(found['jump'].frequency - 2000).min() < 20
 
 
 @pytest.mark.filterwarnings('error')

@@ -140,6 +140,9 @@ def test_a_multisine_does_not_only_jump():
     result = identify(Record((Piece(v, STAGE.simulate(v), FS),), 'multisine'))
     assert 'hysteresis' not in dict(result.not_identified)
     assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    # the frequency response is measured without a segment called noise
+    measured = result.dynamics.response
+    assert 600 < measured.frequency[np.argmax(np.abs(measured.response))] < 800
 
 
 def test_the_only_chirp_is_not_held_out():

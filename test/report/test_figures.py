@@ -4,16 +4,19 @@
 """Pictures: they hold the data of the result, and say why they cannot be drawn."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 from diagnosis_examples import example, HOSTILE
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.sines import sines_of
+from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report import save_plot
+from piezo_ident.report.figures.delay_and_dynamics import response_figure
 from piezo_ident.report.figures.diagnosis import draw_diagnosis, errors_figure
 from piezo_ident.report.figures.free_run import loops_figure, overview_figure, sines_figure
 from piezo_ident.report.figures.identification import draw_identification
@@ -119,6 +122,53 @@ def test_a_refit_is_drawn_as_one_model_beside_the_given_one():
     assert len(residual_figure(result.residuals[0]).axes) == 3
     captions = [p.caption for p in draw_diagnosis(result).pictures]
     assert sum('after: H refitted, nothing added' in text for text in captions) >= 2
+
+
+def boxes_of(figure):
+    """Return text and box [pixels] of every label, name, title and legend that is drawn."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = []
+    for axes in (x for each in figure.axes for x in (each, *each.child_axes) if x.axison):
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            ticks = zip(axis.get_majorticklocs(), axis.get_majorticklabels(), strict=True)
+            drawn += [label for at, label in ticks if low <= at <= high]
+            drawn.append(axis.label)
+        drawn += [axes.title, *axes.texts]
+    legends = [axes.get_legend() for axes in figure.axes]
+    texts = [(x.get_text(), x) for x in drawn if x.get_visible() and x.get_text().strip()]
+    texts += [('legend', x) for x in legends if x is not None]
+    return [(name, x.get_window_extent(canvas.get_renderer())) for name, x in texts]
+
+
+def assert_legible(figure):
+    """Let no label cover another, or lie outside of the picture."""
+    boxes = boxes_of(figure)
+    for (one, a), (other, b) in combinations(boxes, 2):
+        across = min(a.x1, b.x1) - max(a.x0, b.x0)
+        assert min(across, min(a.y1, b.y1) - max(a.y0, b.y0)) <= 1.0, (one, other)
+    for name, box in boxes:
+        assert min(box.x0, box.y0) >= -1.0, name
+        assert box.x1 <= figure.bbox.x1 + 1.0, name
+        assert box.y1 <= figure.bbox.y1 + 1.0, name
+
+
+def test_modes_close_together_are_named_apart(identified):
+    def mode(frequency, damping):
+        pole = np.exp(2 * np.pi * frequency / 20e3 * (-damping + 1j))
+        return np.real(np.poly([pole, np.conj(pole)]))
+
+    a = np.polymul(np.polymul(mode(2000, 0.02), mode(2050, 0.03)), mode(700, 0.05))
+    G = Dynamics(a[1:], [a.sum()])
+    found = replace(
+        identified,
+        model=replace(identified.model, dynamics=G),
+        dynamics=replace(identified.dynamics, covariance=np.zeros((0, 0))),
+    )
+    figure = response_figure(found)
+    assert_legible(figure)
+    assert {text.get_text() for text in figure.axes[0].texts} == {'700 Hz', '2000 Hz'}
 
 
 def test_names_of_short_segments_keep_apart():

@@ -28,8 +28,11 @@ __all__ = ['delay_figure', 'orders_figure', 'response_figure']
 BEFORE, AFTER = 10, 15
 #: an error this many times the best ends the colour scale of the orders
 WORST = 10.0
-#: at most so many modes are named in a frequency response, the least damped ones
-MODES = 4
+#: the axis of magnitudes spans this factor at least
+LEAST_RANGE = 4.0
+#: a mode is named in a frequency response up to this damping ratio and relative uncertainty,
+#: and this far from other names, as a share of the width
+DAMPED, UNSURE, APART = 0.5, 0.1, 0.09
 
 
 def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) -> Figure:
@@ -130,64 +133,85 @@ def _time(seconds: float) -> str:
 
 def response_figure(identification: Identification) -> Figure:
     """
-    Draw the frequency response, measured and modelled, with its coherence.
+    Draw the frequency response, measured and modelled.
 
     Raises
     ------
     NothingToDraw
-        When G = 1 and no noise was measured.
+        When G = 1 and no response was measured.
     """
     model, dynamics = identification.model, identification.dynamics
     measured = dynamics.response
     static = model.dynamics.a.size == 0 and model.dynamics.b.size == 1
     if measured is None and static:
-        raise NothingToDraw('no noise segment, and no dynamics were identified')
+        raise NothingToDraw('no broadband motion, and no dynamics were identified')
     rate = model.sample_rate
     top = 0.5 * rate if measured is None else float(measured.frequency[-1])
     low = top / 300.0 if measured is None else float(measured.frequency[0])
     f = np.geomspace(low, top, 800)
-    slope, unit = 1.0, '/ static'
-    if measured is not None:
-        slope = dynamics.slope_model
-        if not np.isfinite(slope):
-            slope = dynamics.slope_measured
-        slope *= 1e6 * abs(model.scaling.Y) / model.scaling.V
-        unit = '/ µm V$^{-1}$'
+    # without a slope what was measured is G itself, behind the hysteresis
+    slope = dynamics.slope_model
+    if not np.isfinite(slope):
+        slope = dynamics.slope_measured
+    scale, unit = 1.0, 'static gain'
+    if np.isfinite(slope):
+        scale, unit = 1e6 * abs(model.scaling.Y) / model.scaling.V, 'µm V$^{-1}$'
+    else:
+        slope = 1.0
 
     def modelled(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         lag = np.exp(-2j * np.pi * frequency * model.delay.total / rate)
-        return np.asarray(slope * model.dynamics.response(frequency, rate) * lag)
+        return np.asarray(scale * slope * model.dynamics.response(frequency, rate) * lag)
 
     G = modelled(f)
     phase = np.degrees(np.unwrap(np.angle(G)))
-    heights = [2.0, 1.5] if measured is None else [2.0, 1.5, 0.9]
-    fig = style.figure(1.1 * sum(heights))
-    ratios = {'height_ratios': heights}
-    axes: list[Axes] = list(fig.subplots(len(heights), 1, sharex=True, gridspec_kw=ratios))
-    axes[0].loglog(f, np.abs(G), color=COLOURS['model'], linewidth=1.4, label='model', zorder=3)
-    axes[1].plot(f, phase, color=COLOURS['model'], linewidth=1.4, zorder=3)
-    tidy(axes[0], '', f'magnitude {unit}')
-    tidy(axes[1], '', 'phase / °')
+    fig = style.figure(4.2)
+    axes: list[Axes] = list(fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [4, 3]}))
+    tidy(axes[0], '', f'magnitude / {unit}')
+    tidy(axes[1], 'frequency / Hz', 'phase / °')
+    axes[0].set_yscale('log')
     if measured is not None:
-        scale = 1e6 * abs(model.scaling.Y) / model.scaling.V
         x, R = measured.frequency, scale * measured.response
         # the turn that lies nearest to the model: noise cannot make it slip by a whole one
         turns = np.degrees(np.angle(R / modelled(x))) + np.interp(x, f, phase)
         _draw_measured(axes, measured, R, turns)
-    style.plain_log(axes[0].yaxis, *axes[0].get_ylim())
-    style.plain_log(axes[-1].xaxis, low, top)
-    axes[-1].set_xlabel('frequency / Hz', fontsize=style.NORMAL)
-    axes[-1].set_xlim(0.9 * low, 1.05 * top)
+    driven = f <= (top if measured is not None else dynamics.band)
+    for part, dashes, name in ((driven, '-', 'model'), (~driven, ':', 'model, not driven')):
+        if part.any():
+            look: dict[str, Any] = {'color': COLOURS['model'], 'linewidth': 1.4, 'zorder': 3}
+            look |= {'linestyle': dashes}
+            axes[0].plot(f[part], np.abs(G[part]), label=name, **look)
+            axes[1].plot(f[part], phase[part], **look)
+    style.log_range(axes[0], LEAST_RANGE)
+    axes[1].set_xscale('log')
+    style.plain_log(axes[1].xaxis, low, top)
+    axes[1].set_xlim(0.95 * low, 1.05 * top)
     style.legend(axes[0], loc='lower left')
-    for mode in sorted(model.dynamics.modes(rate), key=lambda mode: mode.damping)[:MODES]:
-        if low < mode.frequency < top and mode.damping <= 0.5:
-            for each in axes:
-                dotted: dict[str, Any] = {'linewidth': 0.8, 'linestyle': ':', 'zorder': 1}
-                each.axvline(mode.frequency, color=COLOURS['mark'], **dotted)
-            name = f'{mode.frequency:.0f} Hz'
-            style.name_above(axes[0], name, mode.frequency, color=COLOURS['mark'])
+    _name_modes(axes, identification, low, top)
     fig.align_ylabels(axes)
     return fig
+
+
+def _name_modes(
+    axes: Sequence[Axes], identification: Identification, low: float, top: float
+) -> None:
+    """Mark the least damped modes that are known, and have room for their names."""
+    model = identification.model
+    modes = model.dynamics.modes(model.sample_rate, identification.dynamics.covariance)
+    named: list[float] = []
+    for mode in sorted(modes, key=lambda mode: mode.damping):
+        known = not mode.frequency_std > UNSURE * mode.frequency
+        if not (low < mode.frequency < top and mode.damping <= DAMPED and known):
+            continue
+        place = float(np.log(mode.frequency / low) / np.log(top / low))
+        if all(abs(place - other) >= APART for other in named):
+            for each in axes:
+                each.axvline(
+                    mode.frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1
+                )
+            text = f'{mode.frequency:.0f} Hz'
+            style.name_above(axes[0], text, mode.frequency, 0.0, color=COLOURS['mark'])
+            named.append(place)
 
 
 def _draw_measured(
@@ -197,16 +221,11 @@ def _draw_measured(
     turns: NDArray[np.float64],
 ) -> None:
     x, size, std = measured.frequency, np.abs(R), np.minimum(measured.std, 0.99)
-    band: dict[str, Any] = {'color': COLOURS['band'], 'linewidth': 0, 'zorder': 1}
-    axes[0].fill_between(x, size * (1 - std), size * (1 + std), label='± 1 standard dev.', **band)
-    axes[1].fill_between(x, turns - np.degrees(std), turns + np.degrees(std), **band)
-    dots: dict[str, Any] = {'color': COLOURS['measured'], 'markersize': 1.8, 'zorder': 2}
-    axes[0].plot(x, size, 'o', label='measured', **dots)
-    axes[1].plot(x, turns, 'o', **dots)
-    axes[2].plot(x, measured.coherence, color=COLOURS['measured'], linewidth=0.9)
-    axes[2].set_ylim(-0.02, 1.05)
-    tidy(axes[2], '', 'coherence')
-    axes[2].yaxis.set_major_locator(MaxNLocator(3))
+    spread = np.degrees(std)
+    dots: dict[str, Any] = {'color': COLOURS['under'], 'fmt': 'o', 'markersize': 3.0}
+    dots |= {'elinewidth': 1.0, 'zorder': 2}
+    axes[0].errorbar(x, size, size * std, label='measured', **dots)
+    axes[1].errorbar(x, turns, spread, **dots)
 
 
 def orders_figure(identification: Identification) -> Figure:

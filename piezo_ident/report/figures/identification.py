@@ -42,12 +42,23 @@ def draw_identification(
         text = f'{row.data} {row.percent:.2g} %'
         texts.setdefault((row.record, row.segment), []).append(text)
     errors = {key: ', '.join(parts) for key, parts in texts.items()}
-    response = (
-        'G(z) z^-d of the model; without a noise segment none was measured. Dotted: modes.'
-        if identification.dynamics.response is None
-        else 'Welch estimate from the noise segment with its standard deviation, and the slope of '
-        'H at the bias times G(z) z^-d. Dotted: modes of G.'
-    )
+    dynamics = identification.dynamics
+    if dynamics.response is None:
+        response = (
+            'G(z) z^-d of the model. Nothing that the voltage does has the breadth to measure it: '
+            'add steps, noise or a multisine.'
+        )
+    elif np.isfinite(dynamics.slope_measured):
+        response = (
+            'Measured on the noise segment, bars of one standard deviation, and the slope of H at '
+            'the bias times G(z) z^-d.'
+        )
+    else:
+        response = (
+            'Measured on all fast motion (Welch) from the voltage behind H to the displacement, '
+            'where it errs by less than 10 %, and G(z) z^-d of the model.'
+        )
+    response += ' Where the two part, G lacks something. Dotted: modes of G.'
     wanted: list[Wanted] = [
         (
             'sines',

@@ -36,6 +36,7 @@ __all__ = [
     'legend_above',
     'length_unit',
     'line',
+    'log_range',
     'name_above',
     'note',
     'percent_axis',
@@ -218,6 +219,14 @@ def plain_log(axis: Axis, low: float, high: float, most: float = 3.0) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axis.set_minor_locator(LogLocator(subs=tuple(float(k) for k in range(1, 10)), numticks=20))
     axis.set_minor_formatter(NullFormatter())
+
+
+def log_range(axes: Axes, least: float) -> None:
+    """Widen a logarithmic y axis that spans less than a factor, and write plain numbers on it."""
+    low, high = axes.get_ylim()
+    wider = max(1.0, float(np.sqrt(least * low / high)))
+    axes.set_ylim(low / wider, high * wider)
+    plain_log(axes.yaxis, *axes.get_ylim())
 
 
 def percent_axis(axes: Axes, stroke: float) -> None:
