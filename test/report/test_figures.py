@@ -132,8 +132,9 @@ def boxes_of(figure):
     for axes in (x for each in figure.axes for x in (each, *each.child_axes) if x.axison):
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
-            ticks = zip(axis.get_majorticklocs(), axis.get_majorticklabels(), strict=True)
-            drawn += [label for at, label in ticks if low <= at <= high]
+            for tick in axis.get_major_ticks():
+                if low <= tick.get_loc() <= high:
+                    drawn += [tick.label1, tick.label2]
             drawn.append(axis.label)
         drawn += [axes.title, *axes.texts]
     legends = [axes.get_legend() for axes in figure.axes]
