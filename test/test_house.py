@@ -246,6 +246,13 @@ def test_manifest_and_setup_require_the_same_libraries():
     assert keys == {name for name in dependencies('exec_depend') if name.startswith('python3-')}
 
 
+def test_manifest_says_where_to_go_and_colcon_what_to_run():
+    assert ElementTree.parse(ROOT / 'package.xml').findtext('url')
+    chosen = json.loads((ROOT / 'colcon.pkg').read_text(encoding='utf-8'))['pytest-args']
+    places = [ROOT / place for place in chosen if place.startswith('test/')]
+    assert places and all(place.exists() and place.name != 'nodes' for place in places)
+
+
 def test_changelog_has_a_forthcoming_section():
     # REP-132, which catkin_prepare_release reads
     lines = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8').splitlines()
