@@ -33,6 +33,11 @@ def _file(text: str) -> Path:
     return Path(_name(text))
 
 
+def _columns(text: str) -> str:
+    parse_columns(text)  # refused before any work
+    return text
+
+
 def _whole(text: str) -> int:
     if not text.isdecimal():
         raise click.BadParameter(f'{text!r} is no whole number; give 0 or more')
@@ -114,7 +119,7 @@ EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effec
 #: how records are read: fields of `ReadOptions`, whose defaults hold where an option is absent
 READING = [
     _option(
-        *('--columns', parse_columns, 't=NAME,...'),
+        *('--columns', _columns, 't=NAME,...'),
         'Name or number of the columns t, v, y (default: by the header).',
     ),
     _option('--rate', float, 'HZ', 'Samples a second of files without time, as in 20e3.'),

@@ -76,6 +76,9 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
 
     def visit(name: str, node: Any) -> None:
         nonlocal size
+        for key, value in node.attrs.items():
+            if np.ndim(value) == 0 and isinstance(value, (int, float, np.number)):
+                arrays[f'{name}.{key}'] = np.array([value])  # a sampling rate, perhaps
         # what MATLAB's cells refer to, and texts as it stores them
         if not isinstance(node, h5py.Dataset) or name.startswith('#'):
             return
@@ -95,6 +98,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
         _damage(path, 'HDF5 file', 'save it again; MATLAB: save -v7'),
         h5py.File(path, 'r') as file,
     ):
+        visit('', file)
         file.visititems(visit)
     return _table(arrays, arrays, path, options)
 

@@ -173,14 +173,9 @@ def choose(
     used = set(places.values())
     faults = []
     if guessed or given or (rate is not None and options.rate is None):
-        parts = [
-            f'{role} = {listed([names[places[role]]]) or places[role] + 1} '
-            f'[{units[role] or f"{next(iter(UNITS[role]))}, no unit named"}]'
-            for role in 'tvy'
-            if role in places
-        ]
+        parts = [_said(role, places[role], names, units[role]) for role in 'tvy' if role in places]
         if rate is not None:
-            parts.insert(0, f't = k / {rate:.9g} Hz by {origin}')
+            parts.insert(0, f't is k / {rate:.9g} Hz by {origin}')
         action = 'guessed, --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
     return Choice(
@@ -300,12 +295,28 @@ def _ambiguous(role: str, names: Sequence[str], places: Sequence[int], path: Pat
     )
 
 
+def _said(role: str, place: int, names: Sequence[str], unit: str) -> str:
+    """Return which column is which, for people."""
+    name = repr(names[place]) if names[place] else f'column {place + 1}'
+    known = f'in {unit}' if unit else f'in {next(iter(UNITS[role]))} as no unit is named'
+    return f'{role} is {name} {known}'
+
+
 def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> str:
-    ways = [names[i] if names[i] else str(i + 1) for i in free]
-    # an example that can be typed, where there is one
-    pairs = [f'{role}={name}' for role, name in zip(missing, [*ways, *['NAME'] * 3], strict=False)]
-    rate = '; or without a column of time, give the rate: --rate 20e3' if 't' in missing else ''
-    return (
-        f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"}); name the '
-        f'columns, as in --columns {shlex.quote(",".join(pairs))}{rate}'
-    )
+    ways = [names[i] or str(i + 1) for i in free]
+    found = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
+    rate = ' --rate 20e3'
+    if len(ways) < len(missing) and missing[0] == 't':
+        # not enough columns for time too
+        missing = missing[1:]
+    elif 't' in missing:
+        rate = ', or without a column of time --rate 20e3'
+    else:
+        rate = ''
+    if len(ways) < len(missing):
+        return f'{found}; add a column named {missing[-1]} to the file'
+    # an example that can be typed
+    pairs = ','.join(f'{role}={name}' for role, name in zip(missing, ways, strict=False))
+    columns = f' --columns {shlex.quote(pairs)}' if pairs else ''
+    what = 'name the columns' if pairs else 'give the sampling rate'
+    return f'{found}; {what}, as in{columns}{rate}'

@@ -68,11 +68,14 @@ def find_layout(lines: Sequence[str]) -> Layout | None:
     own = _own(lines, filled)
     if own is not None:
         return own
-    for k, i in enumerate(filled):
-        following = [lines[j] for j in filled[k : k + 3]]
-        for separator in _SEPARATORS:
-            if _is_table([cells_of(line, separator) for line in following], separator):
-                return _above(lines, filled[:k], i, separator)
+    # one with text in front only where there is no other: LabVIEW lists the properties of channels
+    for is_table in (_is_table, _is_table_behind_text):
+        for k, i in enumerate(filled):
+            following = [lines[j] for j in filled[k : k + 3]]
+            for separator in _SEPARATORS:
+                rows = [cells_of(line, separator) for line in following]
+                if is_table(rows, separator):
+                    return _above(lines, filled[:k], i, separator)
     return None
 
 
@@ -90,19 +93,19 @@ def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
 
 
 def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
-    """Return whether some rows, one behind the other, are the first ones of a table."""
-    numeric = [[j for j, x in enumerate(row) if is_number(x)] for row in rows]
-    if len(numeric[0]) < 2:
-        return False
+    """Return whether rows, one behind the other, are the first of a table of numbers."""
     if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
         return False  # decimal commas between blanks
-    if not rows[0][0] or 0 in numeric[0]:
-        # numbers above a table have names before them; a spoiled row is met later
-        return all(
-            len(n) > 1 and (not r[0] or 0 in n) for n, r in zip(numeric[:2], rows, strict=False)
-        )
-    # a table with text in front
-    return len(numeric) == 3 and numeric[0] == numeric[1] == numeric[2]
+    # a spoiled second row is met later; LabVIEW leaves time empty that it does not know
+    return all(
+        sum(map(is_number, row)) > 1 and (not row[0] or is_number(row[0])) for row in rows[:2]
+    )
+
+
+def _is_table_behind_text(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
+    """Return whether rows are the first of a table whose first column is text."""
+    places = [[j for j, cell in enumerate(row) if is_number(cell)] for row in rows]
+    return len(places[0]) > 1 and len(rows) == 3 and places[0] == places[1] == places[2]
 
 
 def _above(

@@ -10,6 +10,8 @@ import sys
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main
+from piezo_ident.cli.identify_command import prompt_of
+from piezo_ident.cli.main import cli
 from piezo_ident.common.errors import DataError
 import pytest
 import scipy.io
@@ -33,6 +35,8 @@ Time\t10:11:12,345
 \t
 Channels\t2\t\t\t
 Samples\t2000\t2000\t\t
+X_Start\t1\t1\t\t
+X_Stop\t2\t2\t\t
 Date\t2024/05/06\t2024/05/06\t\t
 Time\t10:11:12,345\t10:11:12,345\t\t
 X_Dimension\tTime\tTime\t\t
@@ -135,7 +139,7 @@ def daq_h5(path: Path) -> None:
         file['daq/drive'], file['daq/sensor'] = V, UM
         file['daq/drive'].attrs['units'] = 'V'
         file['daq/sensor'].attrs['units'] = '\u00b5m'
-        file['daq/sample_rate'] = RATE
+        file['daq'].attrs['sample_rate'] = RATE
 
 
 def daq_tdms(path: Path) -> None:
@@ -211,13 +215,17 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
         ('time,ai0,ai1,ai2', ['v, y missing', '--columns v=ai0,y=ai1']),
         ('a,b,c,d', ['t, v, y missing', '--columns t=a,v=b,y=c', '--rate 20e3']),
         ('time,voltage,Weg [inch],d', ["unit 'inch' is unknown", '--displacement-unit um']),
+        ('time,voltage', ['y missing', 'add a column named y']),
+        ('ai0,ai1', ['t, v, y missing', '--columns v=ai0,y=ai1 --rate 20e3']),
+        ('voltage,position', ['t missing', 'give the sampling rate, as in --rate 20e3']),
         ('time [h],voltage,pos,d', ["unit 'h' is unknown", '--time-unit']),
         ('0.1,1,2,3', ['no header line', '--columns t=1,v=2,y=3']),
     ],
 )
 def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
     path = tmp_path / 'r.csv'
-    path.write_text(f'{header}\n{rows(K / RATE, V, 1e-6 * UM, V)}')
+    columns = (K / RATE, V, 1e-6 * UM, V)[: header.count(',') + 1]
+    path.write_text(f'{header}\n{rows(*columns)}')
     with pytest.raises(DataError) as caught:
         pi.read(path)
     message = str(caught.value)
@@ -243,6 +251,15 @@ def test_options_that_do_not_fit_the_file(tmp_path, choices, words):
     with pytest.raises(DataError) as caught:
         pi.read(path, **choices)
     assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_commands_that_are_suggested_read_the_same_way():
+    options = ('--columns', 't=Zeit [s],v=2', '--rate', '5000.0', '--time-unit', 'ms')
+    args = cli.main(['identify', 'r.csv', *options], standalone_mode=False)
+    prompt = prompt_of(args, [], [])
+    assert prompt.reading == options
+    again = shlex.split(prompt.command('identify', 'r.csv'))[1:]
+    assert cli.main(again, standalone_mode=False) == args
 
 
 def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
