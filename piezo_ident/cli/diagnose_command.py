@@ -46,7 +46,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
         return
     paths, further = checked(args, Diagnosis, console, args.model_file)
     given = load(args.model_file)
-    records, validation = read_both(paths, further, args)
+    records, validation = read_both(paths, further, args, console)
     for record in validation:
         # they are predicted in the end, and must not fail there
         with naming(record.name):

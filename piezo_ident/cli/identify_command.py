@@ -52,7 +52,7 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
     from piezo_ident import report
 
     paths, further = checked(args, Identification, console)
-    records, validation = read_both(paths, further, args)
+    records, validation = read_both(paths, further, args, console)
     with naming(*(record.name for record in records)), console.progress() as progress:
         result = identify(records, settings, validation=validation, progress=progress)
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
@@ -106,10 +106,10 @@ def checked(
 
 
 def read_both(
-    paths: Sequence[Path], further: Sequence[Path], args: SimpleNamespace
+    paths: Sequence[Path], further: Sequence[Path], args: SimpleNamespace, console: Console
 ) -> tuple[list[Record], list[Record]]:
     """Read records and those for validation as the records of one call."""
-    everything = read_all([*paths, *further], args)
+    everything = read_all([*paths, *further], args, console)
     return everything[: len(paths)], everything[len(paths) :]
 
 

@@ -42,7 +42,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
             check_file(path, overwrite=args.overwrite)
     check_order(args.model, args.record, 'predict')
     model = load(args.model)
-    (record,) = read_all([args.record], args, voltage_alone=True)
+    (record,) = read_all([args.record], args, console, voltage_alone=True)
     data: dict[str, Any] = {'model': str(args.model)}
     if record.is_measured:
         with naming(str(args.model)):

@@ -67,7 +67,7 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
     check_apart(args.out, args.record)
     _check_record_output(args)
     # of an unfinished bag, what is whole
-    (record,) = read_all([args.record], args, recover=True)
+    (record,) = read_all([args.record], args, console, recover=True)
     with deferred_interrupts():
         losses = record_io.write(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(

@@ -36,6 +36,8 @@ __all__ = [
     'read_all',
 ]
 
+#: faults that are told when a record has been read
+TOLD = ('columns', 'slow_sampling', 'large_stroke', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
 #: what a folder is searched for: .txt and .dat are often something else
@@ -142,8 +144,14 @@ def options_of(args: SimpleNamespace) -> ReadOptions:
     return ReadOptions(**fields_of(args, ReadOptions))
 
 
-def read_all(paths: Sequence[Path], args: SimpleNamespace, **further: Any) -> list[Record]:
-    """Read the records of one call; files of one name keep their folders in their names."""
+def read_all(
+    paths: Sequence[Path], args: SimpleNamespace, console: Console, **further: Any
+) -> list[Record]:
+    """
+    Read the records of one call, and say how columns and units were taken.
+
+    Files of one name keep their folders in their names.
+    """
     check_bag_options(paths, args)
     options = replace(options_of(args), **further)
     names = Counter(path.name for path in {path.resolve(): path for path in paths}.values())
@@ -159,13 +167,22 @@ def read_all(paths: Sequence[Path], args: SimpleNamespace, **further: Any) -> li
                 'piezo_ident convert --displacement-unit um IN OUT.npz'
             ) from None
         records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
+    # before the work: a wrong unit may be what it fails of
+    said: dict[str, list[str]] = {}
+    for record in records:
+        for fault in record.faults:
+            if fault.name in TOLD:
+                said.setdefault(f'{fault.where} ({fault.action})', []).append(record.name)
+    for text, of in said.items():
+        console.note(f'{of[0]}{f" and {len(of) - 1} more" if of[1:] else ""}: {text}')
     return records
 
 
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
     """Print the faults of a record, and what the file it was written to cannot keep."""
     for fault in record.faults:
-        console.say(f'met: {fault}')
+        if fault.name not in TOLD:
+            console.say(f'met: {fault}')
     for loss in losses:
         console.say(f'not kept: {loss}')
 

@@ -217,7 +217,12 @@ def prepare(records: Sequence[Record]) -> Prepared:
         refuse_closed_loop(record)
     pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
     scaling = scaling_of(pieces)
-    faults = [f'{record.name}: {fault}' for record in records for fault in record.faults]
+    faults = [
+        f'{record.name}: {fault}'
+        for record in records
+        for fault in record.faults
+        if not fault.is_note
+    ]
     for record in records:
         parts = bridged(record)
         gaps, filled = sum(p.gaps for p in parts), sum(p.filled for p in parts)

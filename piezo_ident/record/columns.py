@@ -176,7 +176,7 @@ def choose(
         parts = [_said(role, places[role], names, units[role]) for role in 'tvy' if role in places]
         if rate is not None:
             parts.insert(0, f't is k / {rate:.9g} Hz by {origin}')
-        action = 'guessed, --columns names others' if guessed else 'as named'
+        action = 'guessed; --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
     return Choice(
         places,
@@ -240,6 +240,8 @@ def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
         measured = next((r for r, units in UNITS.items() if unit in units), None)
         if measured not in (None, role):
             continue
+        # LabVIEW's name for time
+        base = 'time' if base.casefold() == 'x_value' else base
         words = set(re.findall(r'[^\W\d_]+', re.sub(r'([a-z])([A-Z])', r'\1 \2', base).casefold()))
         said = {r for r, known in _WORDS.items() if words & set(known.split())}
         if role in said and (measured or len(said) == 1):

@@ -133,17 +133,17 @@ def _doubts(record: Record, table: RecordTable) -> Iterator[Fault]:
     """Say where another unit is likelier than the one that nobody named."""
     rate = min(piece.sample_rate for piece in record)
     if rate <= SLOW and table.rate is None and 't' not in table.units:
-        where = f'{rate:.6g} Hz with t in seconds'
-        cure = 'read so; if t counts milliseconds, give --time-unit ms'
+        where = f'sampled at {rate:.6g} Hz with t in seconds'
+        cure = 'if t counts milliseconds, add --time-unit ms'
         yield Fault('slow_sampling', where, 1, cure)
     if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:
-        where = f'{1e3 * record.stroke:.3g} mm with y in metres'
-        cure = 'read so; if y counts micrometres, give --displacement-unit um'
+        where = f'a stroke of {1e3 * record.stroke:.3g} mm with y in metres'
+        cure = 'if y counts micrometres, add --displacement-unit um'
         yield Fault('large_stroke', where, 1, cure)
     low, high = record.voltage_range
     if high - low > HIGH_VOLTAGE and 'v' not in table.units:
-        where = f'{low:.4g} .. {high:.4g} V'
-        cure = 'read so; if v counts millivolts, give --voltage-unit mV'
+        where = f'a voltage from {low:.4g} to {high:.4g} V'
+        cure = 'if v counts millivolts, add --voltage-unit mV'
         yield Fault('high_voltage', where, 1, cure)
 
 

@@ -67,6 +67,11 @@ class Fault:
     count: int
     action: str
 
+    @property
+    def is_note(self) -> bool:
+        """Whether nothing was wrong, as where columns were told by their names."""
+        return self.name == 'columns'
+
     def __str__(self) -> str:
         """Return one line for people."""
         return f'{self.name} ({self.count}) {self.where}: {self.action}'

@@ -297,8 +297,9 @@ def identification_page(
     # a fault stands in its own table; a second time would hide the other warnings
     shown = {f'{record.name}: {fault}' for record in result.records for fault in record.faults}
     warnings = [text for text in result.warnings if text not in shown]
-    if faults:
-        warnings.append(f'the data had {len(faults)} kinds of faults, see below')
+    count = sum(not fault.is_note for record in result.records for fault in record.faults)
+    if count:
+        warnings.append(f'the data had {count} kinds of faults, see below')
     origin = result.model.identification
     settings = {'method': origin.get('method', '–'), **asdict(result.settings)}
     versions = {'piezo_ident': __version__, **dict(origin.get('versions', {}))}

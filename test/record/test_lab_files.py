@@ -198,8 +198,10 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
     np.testing.assert_allclose(piece.v, V, rtol=1e-12)
     np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
     # what was guessed is printed
-    text = capsys.readouterr().out
-    assert ('met: columns' in text) is (maker is not rounded_csv)
+    said = capsys.readouterr().err
+    assert (' v is ' in said) is (maker is not rounded_csv)
+    assert said.count('\n') == (maker is not rounded_csv)
+    assert ("t is 'X_Value' in s" in said) is (maker is labview_lvm)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +256,7 @@ def test_options_that_do_not_fit_the_file(tmp_path, choices, words):
 
 
 def test_commands_that_are_suggested_read_the_same_way():
-    options = ('--columns', 't=Zeit [s],v=2', '--rate', '5000.0', '--time-unit', 'ms')
+    options = ('--columns', 't=Zeit [s],v=2', '--rate', '5000', '--time-unit', 'ms')
     args = cli.main(['identify', 'r.csv', *options], standalone_mode=False)
     prompt = prompt_of(args, [], [])
     assert prompt.reading == options
