@@ -32,7 +32,7 @@ _WORDS = {
     't': 't time times zeit timestamp elapsed temps tiempo',
     'v': 'v u voltage volt volts spannung command drive input vin uin tension',
     'y': 'y displacement disp position pos weg auslenkung verschiebung deflection elongation '
-    'stroke output',
+    'stroke sensor gauge feedback measured',
 }
 #: names of a number beside the columns: the sampling rate, or its inverse
 _RATES = ('fs', 'rate', 'samplerate', 'samplingrate', 'samplefrequency', 'samplingfrequency')
@@ -244,9 +244,10 @@ def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
         base = 'time' if base.casefold() == 'x_value' else base
         words = set(re.findall(r'[^\W\d_]+', re.sub(r'([a-z])([A-Z])', r'\1 \2', base).casefold()))
         said = {r for r, known in _WORDS.items() if words & set(known.split())}
-        if role in said and (measured or len(said) == 1):
+        # the voltage of a sensor is neither a command nor a displacement
+        if said == {role}:
             by_word.append(i)
-        elif measured and name:
+        elif measured and not said:
             by_unit.append(i)
     return by_word or by_unit
 

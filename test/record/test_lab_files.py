@@ -217,6 +217,7 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
         ('time,ai0,ai1,ai2', ['v, y missing', '--columns v=ai0,y=ai1']),
         ('a,b,c,d', ['t, v, y missing', '--columns t=a,v=b,y=c', '--rate 20e3']),
         ('time,voltage,Weg [inch],d', ["unit 'inch' is unknown", '--displacement-unit um']),
+        ('time,n,Sensor voltage [V],position', ['v missing', '--columns v=n']),
         ('time,voltage', ['y missing', 'add a column named y']),
         ('ai0,ai1', ['t, v, y missing', '--columns v=ai0,y=ai1 --rate 20e3']),
         ('voltage,position', ['t missing', 'give the sampling rate, as in --rate 20e3']),
@@ -262,6 +263,15 @@ def test_commands_that_are_suggested_read_the_same_way():
     assert prompt.reading == options
     again = shlex.split(prompt.command('identify', 'r.csv'))[1:]
     assert cli.main(again, standalone_mode=False) == args
+
+
+def test_segments_and_channels_of_other_names(tmp_path):
+    path = tmp_path / 'r.csv'
+    lines = [f'{k / RATE},{V[k]},{UM[k]},20.5,{"noise" if k > 99 else ""}' for k in range(N)]
+    path.write_text('\n'.join(['Time [s],U,s [um],T1,phase', *lines]))
+    (piece,) = pi.read(path, columns='segment=phase,x_temperature=T1').pieces
+    assert [(s.label, s.start) for s in piece.segments] == [('noise', 100)]
+    assert [*piece.channels] == ['temperature']
 
 
 def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
