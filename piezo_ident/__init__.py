@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         PiezoIdentError,
     )
     from piezo_ident.control.inverse import Inverse, invert
+    from piezo_ident.control.learning import Learning
     from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
@@ -59,6 +60,7 @@ _HOMES = {
     'Identification': 'identification.results',
     'IdentificationError': 'common.errors',
     'Inverse': 'control.inverse',
+    'Learning': 'control.learning',
     'ModelError': 'common.errors',
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
@@ -90,6 +92,7 @@ __all__ = [
     'Identification',
     'IdentificationError',
     'Inverse',
+    'Learning',
     'ModelError',
     'PiezoIdentError',
     'Program',

@@ -1,0 +1,169 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Iterative learning: the same motion again, corrected by what was measured before.
+
+    r <- r + F (y_wanted - y),        u = inverse model of r
+
+F is a low-pass without phase: where the model is not known, above the lowest mode that rings, a
+correction may do harm.  What repeats from run to run falls by the share to which the model is
+right; noise does not, so the best run is kept and learning ends where the error falls no more.
+D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
+Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.control.inverse import Inverse, invert
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.stage_model import StageModel
+from scipy.ndimage import gaussian_filter1d
+
+__all__ = ['Learning', 'Repetition']
+
+Array = NDArray[np.float64]
+
+#: share of the error that a run must leave at most for another one
+WORTH = 0.95
+#: corner of F, in parts of the lowest mode that rings, and of the sampling rate
+OF_MODE, OF_RATE = 0.7, 0.1
+#: damping below which a mode rings
+RINGS = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Repetition:
+    """
+    One run of a motion.
+
+    Attributes
+    ----------
+    drive : Inverse
+    measured : ndarray, shape (n,)
+        Displacement under it [m].
+    error : float
+        100 rms(wanted - measured) / (max wanted - min wanted).
+    """
+
+    drive: Inverse
+    measured: Array
+    error: float
+
+
+class Learning:
+    """
+    A motion that is repeated and learned.
+
+    Parameters
+    ----------
+    model : StageModel
+    wanted : array_like, shape (n,)
+        Displacement [m].
+    limits : tuple of float, optional
+        Lowest and highest voltage [V]; the identified range when absent.
+    slew : float, optional
+        Largest speed of the voltage [V/s].
+    corner : float, optional
+        Of F [Hz]; below the lowest mode of the model when absent.
+
+    Attributes
+    ----------
+    drive : Inverse
+        What to play next.
+    repetitions : list of Repetition
+        So far.
+
+    Raises
+    ------
+    DataError
+        When the motion is out of reach, see `piezo_ident.invert`.
+
+    Examples
+    --------
+    A stage that creeps, which its model does not know:
+
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('effects').model
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> t = np.arange(4000) / model.sample_rate
+    >>> learning = pi.Learning(model, 35e-6 - 20e-6 * np.cos(2 * np.pi * 20 * t))
+    >>> for _ in range(3):
+    ...     error = learning.take(stage.simulate(learning.drive.v))
+    >>> learning.best.error < 0.1 * learning.repetitions[0].error
+    True
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        wanted: ArrayLike,
+        *,
+        limits: tuple[float, float] | None = None,
+        slew: float = np.inf,
+        corner: float | None = None,
+    ) -> None:
+        self._model, self._limits, self._slew = model, limits, slew
+        self._wanted = self._reference = np.asarray(wanted, dtype=np.float64)
+        self.drive = invert(model, wanted, limits=limits, slew=slew)
+        self.repetitions: list[Repetition] = []
+        modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
+        lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
+        self.corner = min(lowest, OF_RATE * model.sample_rate) if corner is None else corner
+        # the gain is a half at the corner
+        self._width = math.sqrt(2.0 * math.log(2.0)) * model.sample_rate / (2 * math.pi)
+        self._width /= self.corner
+
+    @property
+    def best(self) -> Repetition:
+        """The repetition with the smallest error."""
+        if not self.repetitions:
+            raise DataError('learning: nothing was measured yet')
+        return min(self.repetitions, key=lambda r: r.error)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the error falls no more."""
+        errors = [r.error for r in self.repetitions]
+        return len(errors) > 1 and errors[-1] > WORTH * min(errors[:-1])
+
+    def take(self, measured: ArrayLike) -> float:
+        """
+        Take what was measured under `drive`, correct it, and return the error [% of stroke].
+
+        Parameters
+        ----------
+        measured : array_like, shape (n,)
+            Displacement [m], a sample for each of `drive.v`.
+
+        Raises
+        ------
+        DataError
+            When there are more or fewer samples, or one is not finite.
+        """
+        y, drive = np.asarray(measured, dtype=np.float64), self.drive
+        if y.shape != drive.v.shape or not np.all(np.isfinite(y)):
+            raise DataError(
+                f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '
+                'finite number each'
+            )
+        e = self._wanted - y[drive.lead :]
+        error = percent_of_stroke(self._wanted, y[drive.lead :])
+        self.repetitions.append(Repetition(drive, y, error))
+        if error <= self.best.error:
+            correction = gaussian_filter1d(e, self._width, mode='nearest')
+            self._reference = self._reference + correction
+            # near a limit the correction may reach beyond
+            self.drive = invert(
+                self._model, self._reference, limits=self._limits, slew=self._slew, clip=True
+            )
+        else:
+            self.drive = self.best.drive
+        return error
