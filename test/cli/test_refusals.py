@@ -16,7 +16,7 @@ import yaml
 
 #: content of a table, and what is said of it
 BAD_FILES: dict[str, tuple[Callable[[], str], str]] = {
-    'missing column': (lambda: csv_text('y'), 'name the columns'),
+    'missing column': (lambda: csv_text('y'), 'add a column named y'),
     'text in numbers': (lambda: with_values('v', range(40, 41), 'off'), 'line 42'),
     'many NaN': (lambda: with_values('y', range(0, 1000, 50), 'nan'), 'cut the bad stretch'),
     'constant input': (
