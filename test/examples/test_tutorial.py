@@ -1,0 +1,66 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The tutorial: its Python runs as a notebook, and its commands run."""
+
+import importlib.util
+from pathlib import Path
+import shlex
+import zipfile
+
+from command_line import succeed
+import pytest
+
+nbformat = pytest.importorskip('nbformat')
+nbclient = pytest.importorskip('nbclient')
+pytest.importorskip('markdown_it')
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope='module')
+def tutorial():
+    path = ROOT / 'docs/refresh_tutorial.py'
+    spec = importlib.util.spec_from_file_location('refresh_tutorial', path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_notebook_is_the_page(tutorial):
+    stored = nbformat.read(tutorial.NOTEBOOK, as_version=4)
+    page = tutorial.notebook(tutorial.PAGE.read_text(encoding='utf-8'))
+    assert stored.cells == page.cells, 'run python docs/refresh_tutorial.py'
+
+
+def test_the_data_are_small(tutorial):
+    assert tutorial.DATA.stat().st_size < 300_000
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tutorial, tmp_path):
+    (tmp_path / tutorial.DATA.name).symlink_to(tutorial.DATA)
+    notebook = nbformat.read(tutorial.NOTEBOOK, as_version=4)
+    nbclient.NotebookClient(
+        notebook, timeout=None, resources={'metadata': {'path': str(tmp_path)}}
+    ).execute()
+    outputs = [o for cell in notebook.cells for o in cell.get('outputs', ())]
+    shown = [output.get('data', {}) for output in outputs]
+    # results and pictures show themselves, and the story is that of the page
+    assert sum('image/png' in data for data in shown) >= 5
+    (verdict,) = (d['text/plain'] for d in shown if 'verdict' in d.get('text/plain', ''))
+    assert verdict.startswith('Creep explains')
+    (printed,) = (o['text'] for o in outputs if ' before, ' in o.get('text', ''))
+    before, after = float(printed.split()[0]), float(printed.split()[5])
+    assert before > 0.5 and after < 0.1
+
+
+def test_the_first_commands_of_the_page_run(tutorial, tmp_path, monkeypatch, capsys):
+    (block,) = tutorial.code_blocks(tutorial.PAGE.read_text(encoding='utf-8'), 'console')
+    unpack, *commands = block.replace('$ ', '').splitlines()
+    assert unpack == 'python -m zipfile -e examples/tutorial_data.zip .'
+    monkeypatch.chdir(tmp_path)
+    zipfile.ZipFile(tutorial.DATA).extractall()
+    # the others have diagnosed before
+    for command in commands[:2]:
+        succeed(capsys, *shlex.split(command)[1:])
