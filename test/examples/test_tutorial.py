@@ -8,7 +8,7 @@ from pathlib import Path
 import shlex
 import zipfile
 
-from command_line import succeed
+from command_line import run
 import pytest
 
 nbformat = pytest.importorskip('nbformat')
@@ -63,4 +63,5 @@ def test_the_first_commands_of_the_page_run(tutorial, tmp_path, monkeypatch, cap
     zipfile.ZipFile(tutorial.DATA).extractall()
     # the others have diagnosed before
     for command in commands[:2]:
-        succeed(capsys, *shlex.split(command)[1:])
+        code, _, said = run(capsys, *shlex.split(command)[1:])
+        assert code == 0 and all('guessed' in line for line in said.splitlines()), said
