@@ -157,7 +157,7 @@ def assert_legible(figure):
 
 def test_modes_close_together_are_named_apart(identified):
     def mode(frequency, damping):
-        pole = np.exp(2 * np.pi * frequency / 20e3 * (-damping + 1j))
+        pole = np.exp(2 * np.pi * frequency / 20e3 * (-damping + 1j * np.sqrt(1 - damping**2)))
         return np.real(np.poly([pole, np.conj(pole)]))
 
     a = np.polymul(np.polymul(mode(2000, 0.02), mode(2050, 0.03)), mode(700, 0.05))
