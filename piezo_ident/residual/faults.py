@@ -53,9 +53,9 @@ class FaultSearch:
     Faults found.
 
     `bad` are for each part the samples that are missed, outliers or clipped, `out` the clipped
-    and those of a sensor that hangs among them, which no bridge can replace, `stuck` the latter;
-    `jitter` is the rms of the sampling instants [s]
-    and `quantum` the step of the readings [m], each 0 when there is none.
+    and those of a sensor that hangs among them, which no bridge can replace; `jitter` is the rms
+    of the sampling instants [s] and `quantum` the step of the readings [m], each 0 when there is
+    none.
     """
 
     faults: tuple[Fault, ...]
@@ -63,13 +63,12 @@ class FaultSearch:
     out: tuple[Mask, ...]
     jitter: float = 0.0
     quantum: float = 0.0
-    stuck: tuple[Mask, ...] = ()
 
     def left_out(self, share: float) -> list[Mask | None]:
-        """Return for each part the samples to leave out: all bad ones up to a share of it."""
+        """Return for each part the samples to leave out: `out`, and all bad ones up to a share."""
         found = []
-        for bad, stuck in zip(self.bad, self.stuck, strict=True):
-            mask = bad if (bad & ~stuck).mean() < share else stuck
+        for bad, out in zip(self.bad, self.out, strict=True):
+            mask = bad if (bad & ~out).mean() < share else out
             found.append(mask if mask.any() else None)
         return found
 
@@ -79,7 +78,6 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     faults: list[Fault] = []
     bad: list[Mask] = []
     out: list[Mask] = []
-    hung: list[Mask] = []
     largest_jitter = largest_quantum = 0.0
     strokes = strokes_of(parts)
     for part in parts:
@@ -106,10 +104,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             faults += _knocks(part, stroke, noise, missed | outliers | clipped)
         bad.append(missed | outliers | clipped)
         out.append(clipped | stuck)
-        hung.append(stuck)
-    return FaultSearch(
-        tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum, tuple(hung)
-    )
+    return FaultSearch(tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum)
 
 
 def _masked(

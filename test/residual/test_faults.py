@@ -101,12 +101,12 @@ def test_a_sensor_that_hangs_while_the_drive_moves(truth):
     # a model of a wrong size is no excuse
     named, found = faults(v, z, 0.98 * y)
     assert 'stretches in which the sensor hangs' in named['missed_samples'].action
-    assert not np.any(found.stuck[0] & ~hung)
+    assert not np.any(found.out[0] & ~hung)
     # in a rest nobody can tell
-    assert np.mean(found.stuck[0][hung & (np.abs(np.gradient(v)) > 1e-5)]) > 0.9
+    assert np.mean(found.out[0][hung & (np.abs(np.gradient(v)) > 1e-5)]) > 0.9
     # however many there are: nothing can be learnt from them
     (left_out,) = found.left_out(0.001)
-    assert np.all(left_out[found.stuck[0]])
+    assert np.all(left_out[found.out[0]])
 
 
 def test_steps_in_coarse_readings_with_a_sensor_that_hangs_are_still_known():
@@ -195,6 +195,7 @@ def test_clipping(truth):
     assert set(named) == {'clipping'}
     # no model can fill in what was not read
     np.testing.assert_array_equal(found.out[0], found.bad[0])
+    np.testing.assert_array_equal(found.left_out(0.0)[0], found.bad[0])
     assert found.bad[0].sum() > 0.5 * np.sum(read > end)
 
 
