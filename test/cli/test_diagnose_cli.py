@@ -274,13 +274,3 @@ def test_a_plug_in_is_listed_with_its_package(capsys, monkeypatch):
     assert 'share k' in text
     assert effects_command.effect_name('soft_stop') == 'soft_stop'
     sys.modules.pop('example_effect', None)
-
-
-def test_the_example_in_the_documentation_is_the_one_that_is_tested():
-    root = Path(__file__).resolve().parents[2]
-    code = (root / 'test' / 'example_effect' / 'example_effect.py').read_text(encoding='utf-8')
-    text = (root / 'docs' / 'effect.md').read_text(encoding='utf-8')
-    # behind the licence header
-    assert f'```python\n{code[code.index(chr(34) * 3) :]}```\n' in text
-    setup = (root / 'test' / 'example_effect' / 'setup.cfg').read_text(encoding='utf-8')
-    assert setup[setup.index('[options.entry_points]') :].rstrip() in text
