@@ -75,7 +75,7 @@ class SlewLimit(Effect):
         fastest = float(speeds[-1])
         # jumps are too few to show in the quantiles; a limit that never acts changes nothing
         jump = max(fastest, 0.5 * view.span * view.sample_rate)
-        limits = [*speeds[speeds.size // 2 : -1].tolist(), 0.9 * fastest]
+        limits = [*speeds[speeds.size // 2 : -1].tolist(), *(np.array([0.7, 0.8, 0.9]) * fastest)]
         limits += ladder(fastest, jump, 6)[1:]
         return tuple(cls.trial({'limit': limit}) for limit in limits)
 
