@@ -51,6 +51,9 @@ Vector = NDArray[np.float64]
 SLOWEST = 40.0
 #: at low sampling rates, as a share of the rate
 SLOWEST_SHARE = 0.01
+#: a real pole and a real zero whose frequencies differ by less than this factor are what H lacks
+#: of small motion, below this share of the frequency of the lowest mode that rings (its damping)
+PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 #: delays [samples] that the scan tries, and its na and nb
 MAX_DELAY, SCAN_ORDER = 30, 8
 #: held-out errors within this share count as equal; the smaller order goes first
@@ -61,6 +64,8 @@ NEGLIGIBLE = 0.3
 GAIN = 0.1
 #: coherence that a mode needs at its frequency, once it stands out by this share of the gain
 COHERENT, TALL = 0.5, 0.05
+#: the coherence is seen in windows of so many time constants of the mode, so many at least
+RING_TIMES, FEWEST = 8.0, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +164,33 @@ def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128],
 
 def fast_part(G: Dynamics, rate: float) -> Dynamics:
     """Return G with G(1) = 1, without its slow real poles where it can do without them."""
+    G = _without_pairs(G, rate)
     return without_slow_part(G, rate) or G.normalised()
+
+
+def _without_pairs(G: Dynamics, rate: float) -> Dynamics:
+    """Return G without pairs of a real pole and a near real zero far below its modes."""
+    rings = [mode.frequency for mode in G.modes(rate) if mode.damping < RINGS]
+    poles, zeros = np.asarray(G.poles, dtype=complex), np.asarray(np.roots(G.b), dtype=complex)
+    highest = BELOW_MODES * min(rings, default=0.0)
+    for pole in sorted(poles[_between(poles, 0.0, highest, rate)].real, reverse=True):
+        size = -np.log(pole) * rate / (2.0 * np.pi)
+        near = zeros[_between(zeros, size / PAIR, size * PAIR, rate)]
+        if near.size:
+            zeros = np.delete(zeros, np.argmin(np.abs(zeros - near[np.argmin(abs(near - pole))])))
+            poles = np.delete(poles, np.argmin(np.abs(poles - pole)))
+    if poles.size == G.a.size:
+        return G
+    a, b = (np.atleast_1d(np.real(np.poly(roots))) for roots in (poles, zeros))
+    return Dynamics(a[1:], b * G.gain * a.sum() / b.sum())
+
+
+def _between(
+    roots: NDArray[np.complex128], low: float, high: float, rate: float
+) -> NDArray[np.bool_]:
+    """Return the real roots that decay, with frequencies between two [Hz]."""
+    ends = np.exp(-2.0 * np.pi * np.array([high, low]) / rate)
+    return np.asarray((roots.imag == 0.0) & (roots.real > ends[0]) & (roots.real < ends[1]))
 
 
 def _supported(G: Dynamics, motion: FastMotion) -> bool:
@@ -168,17 +199,20 @@ def _supported(G: Dynamics, motion: FastMotion) -> bool:
     height = np.abs(residues) / np.maximum(1.0 - np.abs(poles), 1e-12)
     f = np.abs(np.angle(poles)) * motion.rate / (2.0 * np.pi)
     ringing = (poles.imag > 0.0) & (np.abs(poles) ** 20 > 0.1) & (height > TALL * abs(G.gain))
-    if not ringing.any():
-        return True
-    size = 512 * max(1, round(motion.rate / 20_000.0))
-    sums = [cross_spectra(e.u, e.x, size) for e in motion.whole if e.u.size >= size]
-    if not sums:
-        return True
-    s_uu, s_yy, s_uy = (sum(parts) for parts in zip(*sums, strict=True))
-    tiny = np.finfo(float).tiny
-    coherence = np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, tiny)
-    places = (f[ringing] * size / motion.rate).astype(int)
-    return all((coherence[max(0, k - 1) : k + 3] > COHERENT).any() for k in places)
+    least = 512 * max(1, round(motion.rate / 20_000.0))
+    longest = max(e.u.size for e in motion.whole)
+    for pole, frequency in zip(poles[ringing], f[ringing], strict=True):
+        # a window that is shorter than the ring sees the answer to what came before it
+        size = max(least, min(int(RING_TIMES / (1.0 - np.abs(pole))), longest // FEWEST))
+        sums = [cross_spectra(e.u, e.x, size) for e in motion.whole if e.u.size >= size]
+        if not sums:
+            continue
+        s_uu, s_yy, s_uy = (sum(parts) for parts in zip(*sums, strict=True))
+        coherence = np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, np.finfo(float).tiny)
+        k = int(frequency * size / motion.rate)
+        if not (coherence[max(0, k - 1) : k + 3] > COHERENT).any():
+            return False
+    return True
 
 
 def _smaller(G: Dynamics, motion: FastMotion, error: float) -> Dynamics | None:

@@ -5,7 +5,11 @@
 
 import numpy as np
 from piezo_ident.identification.fast_motion import FastMotion, moving, Samples
-from piezo_ident.identification.linear_part import find_linear_part, without_slow_part
+from piezo_ident.identification.linear_part import (
+    fast_part,
+    find_linear_part,
+    without_slow_part,
+)
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics
 import pytest
@@ -84,11 +88,34 @@ def test_creep_in_the_displacement_leaves_no_slow_pole():
     assert not slow.any()
 
 
-def test_one_slow_sine_shows_neither_modes_nor_order():
+def test_one_slow_sine_shows_no_mode_but_what_its_start_rings():
     w = 0.5 * np.sin(2.0 * np.pi * 40.0 * np.arange(20_000) / FS)
     x = stage(w) + 1e-3 * np.random.default_rng(1).standard_normal(w.size)
     found = found_in(w, x)
-    assert found.fit is None or not [m for m in found.fit.dynamics.modes(FS) if m.damping < 0.1]
+    modes = [] if found.fit is None else found.fit.dynamics.modes(FS)
+    for mode in (m for m in modes if m.damping < 0.1):
+        assert min(abs(mode.frequency / f - 1.0) for f, *_ in MODES) < 0.01
+
+
+def test_a_mode_that_rings_longer_than_a_window_is_kept():
+    # for half a second, which is many windows
+    rings = np.exp(2.0 * np.pi * 60.0 / FS * (-0.006 + 1j * np.sqrt(1.0 - 0.006**2)))
+    a = np.real(np.poly([rings, np.conj(rings)]))
+    w = noise()
+    x = signal.lfilter([a.sum()], a, w)
+    found = found_in(w, x + 2e-5 * np.random.default_rng(1).standard_normal(w.size))
+    [mode] = [m for m in found.fit.dynamics.modes(FS) if m.damping < 0.1]
+    assert mode.frequency == pytest.approx(60.0, rel=1e-3)
+
+
+def test_a_real_pole_beside_a_real_zero_far_below_the_modes_goes():
+    rings = np.exp(2.0 * np.pi * 1300.0 / FS * (-0.02 + 1j))
+    pole, zero, lag = np.exp(-2.0 * np.pi * np.array([70.0, 75.0, 300.0]) / FS)
+    modes = [rings, np.conj(rings), lag]
+    G = Dynamics(np.real(np.poly([*modes, pole]))[1:], np.poly([zero]))
+    left = fast_part(G, FS)
+    np.testing.assert_allclose(sorted(left.poles, key=abs), sorted(modes, key=abs), rtol=1e-9)
+    assert left.gain == pytest.approx(1.0)
 
 
 def test_pure_delay_is_found_to_a_part_of_a_sample():
