@@ -15,6 +15,7 @@ import difflib
 import importlib
 import json
 import os
+import shlex
 import signal
 import sys
 from types import SimpleNamespace
@@ -266,7 +267,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             text = f'no such option: {error.option_name}{guess and "; "}{guess}'
         return stop(BAD_INPUT, f'{text} (see {place} --help)', 'UsageError')
     except PiezoIdentError as error:
-        return stop(BAD_INPUT, str(error), type(error).__name__)
+        text = str(error)
+        if error.options:
+            text = text.replace(f', as in {error.options}', '')
+            text += f'; for example: piezo_ident {shlex.join(words)} {error.options}'
+        return stop(BAD_INPUT, text, type(error).__name__)
     except OSError as error:
         where = f'{error.filename}: ' if error.filename else ''
         return stop(BAD_INPUT, f'{where}{error.strerror or error}', 'OSError')

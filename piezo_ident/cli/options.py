@@ -33,9 +33,10 @@ def _file(text: str) -> Path:
     return Path(_name(text))
 
 
-def _columns(text: str) -> str:
+def _columns(ctx: Any, param: Any, parts: tuple[str, ...]) -> str | None:
+    text = ','.join(parts)
     parse_columns(text)  # refused before any work
-    return text
+    return text or None
 
 
 def _whole(text: str) -> int:
@@ -119,8 +120,10 @@ EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effec
 #: how records are read: fields of `ReadOptions`, whose defaults hold where an option is absent
 READING = [
     _option(
-        *('--columns', _columns, 't=NAME,...'),
+        *('--columns', str, 't=NAME,...'),
         'Name or number of the columns t, v, y (default: by the header).',
+        multiple=True,
+        callback=_columns,
     ),
     _option('--rate', float, 'HZ', 'Samples a second of files without time, as in 20e3.'),
     _unit_of('time', 't'),

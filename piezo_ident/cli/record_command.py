@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
-from piezo_ident.cli.records import data_of, print_faults, read_all, RECORD_FILES
+from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program
@@ -79,5 +79,5 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
 
 
 def _check_record_output(args: SimpleNamespace) -> None:
-    check_suffix(args.out, (*RECORD_FILES, ''), 'a record')
+    check_suffix(args.out, (*record_io.WRITERS, *BAG_FILES, ''), 'a record')
     check_file(args.out, overwrite=args.overwrite, folder_too=True)

@@ -22,8 +22,8 @@ from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
 __all__ = [
+    'BAG_FILES',
     'MODEL_FILES',
-    'RECORD_FILES',
     'check_bag_options',
     'check_order',
     'data_of',
@@ -52,7 +52,8 @@ def naming(*names: str) -> Iterator[None]:
     except PiezoIdentError as error:
         if any(name in str(error) for name in names):
             raise
-        raise type(error)(f'{", ".join(names)}: {error}') from None
+        text = f'{", ".join(names)}: {error}'
+        raise type(error)(text, options=error.options) from None
 
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:

@@ -13,11 +13,18 @@ class PiezoIdentError(Exception):
 
     Its message is one line without control characters, which could steer a terminal, whatever
     names of a file it quotes.
+
+    Parameters
+    ----------
+    message : str
+    options : str
+        What to add to the command line, as it is typed, where that mends it.
     """
 
-    def __init__(self, message: str = '') -> None:
+    def __init__(self, message: str = '', *, options: str = '') -> None:
         shown = (c if c.isprintable() else ' ' if c.isspace() else '?' for c in message)
         super().__init__(''.join(shown)[:_LONGEST])
+        self.options = options if options.isprintable() else ''
 
 
 class DataError(PiezoIdentError):

@@ -219,7 +219,8 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
         fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
-            f'(1 nm .. 10 mm); name the unit of y with --displacement-unit {" or ".join(fitting)}'
+            f'(1 nm .. 10 mm); name the unit of y with --displacement-unit {" or ".join(fitting)}',
+            options=f'--displacement-unit {"um" if "um" in fitting else fitting[0]}',
         )
     for key, span in moved.items():
         offset = max(map(abs, ranges[key]))

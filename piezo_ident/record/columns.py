@@ -41,6 +41,8 @@ _UNIT = re.compile(
     r'(?P<name>.*?)\s*(?:\[(?P<a>[^][]*)\]|\((?P<b>[^()]*)\)|/\s*(?P<c>[^\W\d]+))'
     r'|(?P<bare>.*?)(?:[_\s.]+|\bin\s+)(?P<d>[^\W\d_]+)'
 )
+#: the structs or groups before the name of a column
+_PATH = r'^(\w+\.)+(?=\S)'
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +144,11 @@ def choose(
         if role not in places and (rate is None or role != 't'):
             here = [i for i, name in enumerate(names) if name == role and i not in barred]
             if len(here) > 1:
+                way = f'--columns {role}={here[0] + 1}'
                 raise DataError(
                     f'{path}: column {role} stands there twice; keep one of them, or say which by '
-                    f'its number: --columns {role}={here[0] + 1}'
+                    f'its number: {way}',
+                    options=way,
                 )
             places |= dict.fromkeys([role][: len(here)], *here)
     free = [i for i in range(len(names)) if i not in {*places.values(), *empty}]
@@ -154,7 +158,11 @@ def choose(
             continue
         fitting = _fitting(role, [(i, names[i]) for i in free])
         if len(fitting) > 1:
-            raise DataError(_ambiguous(role, [names[i] for i in fitting], fitting, path))
+            # of several runs in groups, the one whose columns are named already
+            groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
+            fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
+        if len(fitting) > 1:
+            raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
         if fitting:
             guessed[role] = fitting[0]
             free.remove(fitting[0])
@@ -163,7 +171,7 @@ def choose(
     needed = ['t'] * (rate is None) + ['v'] + ['y'] * (not options.voltage_alone)
     missing = [role for role in needed if role not in {*places, *guessed}]
     if missing:
-        raise DataError(_missing(missing, names, free, path))
+        raise _missing(missing, names, free, path)
     places |= guessed
     for i in [i for i in free if names[i].startswith('x_') and len(names[i]) > 2]:
         if names[i] in places:
@@ -219,7 +227,7 @@ def _parts(name: str) -> tuple[str, str]:
     [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive voltage', '')]
     """
     # of a field of a struct, or a channel of a group, its own name
-    name = re.sub(r'^(\w+\.)+(?=\S)', '', name.strip())
+    name = re.sub(_PATH, '', name.strip())
     found = _UNIT.fullmatch(name)
     if not found:
         return name, ''
@@ -230,6 +238,12 @@ def _parts(name: str) -> tuple[str, str]:
         return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
     # what stands in square brackets is a unit, known or not
     return (found['name'], unit) if known or found['a'] is not None else (name, '')
+
+
+def _group(name: str) -> str:
+    """Return the struct or group of a column."""
+    found = re.match(_PATH, name)
+    return found[0] if found else ''
 
 
 def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
@@ -277,10 +291,12 @@ def _unit_of(
     if unit and unit not in UNITS[role]:
         quantity = _QUANTITIES[role]
         kind = next((q for r, q in _QUANTITIES.items() if unit in UNITS[r]), None)
+        way = f'--{quantity}-unit {[*UNITS[role]][-2]}'
         raise DataError(
             f'{path}: {listed([name])} is to be the {quantity}, '
             + (f'but its unit is of a {kind}' if kind else f'whose unit {unit!r} is unknown')
-            + f'; name another column, or its unit: --{quantity}-unit {[*UNITS[role]][-2]}'
+            + f'; name another column, or its unit: {way}',
+            options='' if kind else way,
         )
     return unit
 
@@ -289,12 +305,14 @@ def _option(role: str, name: str) -> str:
     return f'--columns {shlex.quote(f"{role}={name}")}'
 
 
-def _ambiguous(role: str, names: Sequence[str], places: Sequence[int], path: Path) -> str:
+def _ambiguous(role: str, names: Sequence[str], places: Sequence[int], path: Path) -> DataError:
     # equal names are told apart by their numbers
     ways = names if len(set(names)) == len(names) else [str(i + 1) for i in places]
-    return (
+    first, second = (_option(role, way) for way in ways[:2])
+    return DataError(
         f'{path}: {len(names)} columns may be the {_QUANTITIES[role]} ({listed(names)}); say '
-        f'which: {_option(role, ways[0])} or {_option(role, ways[1])}'
+        f'which: {first} or {second}',
+        options=first,
     )
 
 
@@ -305,21 +323,21 @@ def _said(role: str, place: int, names: Sequence[str], unit: str) -> str:
     return f'{role} is {name} {known}'
 
 
-def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> str:
+def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> DataError:
     ways = [names[i] or str(i + 1) for i in free]
     found = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
-    rate = ' --rate 20e3'
+    rate = '--rate 20e3'
+    further = ''
+    if missing == ['t']:
+        further = f', or the column of time: {_option("t", ways[0])}' if ways else ''
+        return DataError(f'{found}; give the sampling rate, as in {rate}{further}', options=rate)
     if len(ways) < len(missing) and missing[0] == 't':
         # not enough columns for time too
-        missing = missing[1:]
-    elif 't' in missing:
-        rate = ', or without a column of time --rate 20e3'
-    else:
-        rate = ''
+        missing, further = missing[1:], f' {rate}'
     if len(ways) < len(missing):
-        return f'{found}; add a column named {missing[-1]} to the file'
+        return DataError(f'{found}; add a column named {missing[-1]} to the file')
     # an example that can be typed
     pairs = ','.join(f'{role}={name}' for role, name in zip(missing, ways, strict=False))
-    columns = f' --columns {shlex.quote(pairs)}' if pairs else ''
-    what = 'name the columns' if pairs else 'give the sampling rate'
-    return f'{found}; {what}, as in{columns}{rate}'
+    options = f'--columns {shlex.quote(pairs)}{further}'
+    either = f', or without a column of time {rate}' if 't' in missing else ''
+    return DataError(f'{found}; name the columns, as in {options}{either}', options=options)

@@ -41,6 +41,7 @@ WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]],
     '.mat': write_mat,
 }
 
+SHEETS = ('.xlsx', '.xls', '.ods')
 _WRITTEN = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 _READ = f'a bag folder, .mcap, .db3, {", ".join(READERS)}'
 #: sampling rates [Hz] at which time in another unit than seconds is likelier
@@ -100,7 +101,8 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         raise DataError(f'{path}: does not exist; check the name')
     check_regular(path)
     if suffix not in READERS:
-        raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; give {_READ}')
+        sheet = 'save its sheet as CSV, or ' if suffix in SHEETS else ''
+        raise DataError(f'{path}: unknown format {suffix or "(no suffix)"}; {sheet}give {_READ}')
     try:
         table = READERS[suffix](path, options)
     except OSError as error:

@@ -28,6 +28,7 @@ _NUMBER = re.compile(rf'{_DIGITS}|[-+]?(nan|inf)', re.IGNORECASE | re.ASCII)
 _ALONE = re.compile(
     rf'\W*(?P<name>.+?)\s*[:=,;\t]+\s*(?P<value>{_DIGITS})(\s*(?P<unit>[^\W\d]+))?(\W.*)?'
 )
+_LVM_UNITS = 'Y_Unit_Label'
 #: None: blanks
 _SEPARATORS = ('\t', ';', ',', None)
 
@@ -130,6 +131,10 @@ def _above(
         break
     if not names and units:
         names, units = units, []
+    if not units:
+        # LabVIEW lists the units of its columns far above them
+        rows = [cells_of(lines[i], separator) for i in filled if lines[i].startswith(_LVM_UNITS)]
+        units = ['', *rows[-1][1:]] if rows else []
     names = [
         f'{name} [{unit.strip("[]()")}]' if unit and name else name
         for name, unit in zip(names, [*units, *[''] * len(names)], strict=False)

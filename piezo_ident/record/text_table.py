@@ -65,9 +65,11 @@ def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTabl
         )
     names = layout.names
     if not names and not options.columns:
+        way = '--columns ' + ('t=1,v=2,y=3' if layout.width > 2 else 'v=1,y=2 --rate 20e3')
         raise DataError(
-            f'{path}: no header line; say which column is which by their numbers: '
-            f'--columns t=1,v=2,y=3 (of {layout.width})'
+            f'{path}: no header line; say which column is which by their numbers (of '
+            f'{layout.width}): {way}',
+            options=way,
         )
     choice = choose(
         names or [''] * layout.width, options, path, scalars=layout.numbers, empty=layout.empty
@@ -102,14 +104,19 @@ def _rows(
     commas: Any = None
     while chunk := _whole_rows(lines):
         if any(map(str.strip, chunk)):
-            try:
-                part = np.loadtxt(chunk, dtype, converters=commas, **options)
-            except ValueError:
+            # the slow ways last: comments between the rows, and decimal commas
+            slow: Any = dict.fromkeys(number, _with_comma)
+            for rows, converters in ((chunk, commas), (chunk, slow), (None, None), (None, slow)):
                 try:
-                    commas = dict.fromkeys(number, _with_comma)
-                    part = np.loadtxt(chunk, dtype, converters=commas, **options)
+                    part = np.loadtxt(
+                        rows or _without_comments(chunk), dtype, converters=converters, **options
+                    )
                 except ValueError:
-                    raise _culprit(chunk, line + 1, layout, wanted, path) from None
+                    continue
+                commas = converters
+                break
+            else:
+                raise _culprit(_without_comments(chunk), line + 1, layout, wanted, path)
             if 'segment' in places:
                 new, at = label_runs(map(str.strip, part[f'{places["segment"]}']))
                 names += new
@@ -121,6 +128,10 @@ def _rows(
         raise DataError(f'{path}: no rows below the header; record some samples')
     columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
     return columns, names, starts
+
+
+def _without_comments(lines: Iterable[str]) -> list[str]:
+    return ['\n' if line.lstrip().startswith(COMMENT) else line for line in lines]
 
 
 def _with_comma(text: str) -> float:

@@ -59,6 +59,21 @@ def test_misspelt_words(capsys, tmp_path, line, guess):
     assert 'piezo_ident' in refuse(capsys, tmp_path, shlex.split(line), guess, '--help)')
 
 
+def test_what_a_file_lacks_is_added_to_the_command(capsys, tmp_path):
+    path, lines = tmp_path / 'a file.csv', '\n'.join(f'{k},{k % 7},{k}' for k in range(99))
+    path.write_text(f'voltage,position,unused\n{lines}')
+    words = ['convert', str(path), str(tmp_path / 'out.npz')]
+    for option in ('--rate 20e3', '--displacement-unit um'):
+        message = refuse(capsys, tmp_path, words, option)
+        words = shlex.split(message.partition('for example: piezo_ident ')[2])
+    assert run(capsys, *words)[0] == 0
+
+
+def test_columns_may_be_given_in_parts():
+    given = parsed('identify r.csv --columns t=a --columns v=b')
+    assert given['columns'] == 't=a,v=b'
+
+
 def test_validation_takes_all_words_up_to_the_next_option():
     given = parsed('identify a b --validation c d --model m.yaml --validation e')
     assert list(map(str, given['records'])) == ['a', 'b']

@@ -74,6 +74,18 @@ def quoted_csv(path: Path) -> None:
     path.write_text(f'"t [s]","v [V]","y [\u03bcm]"\n"{text}', encoding='utf-8-sig')
 
 
+def units_lvm(path: Path) -> None:
+    head = LVM.replace('X_Dimension', 'Y_Unit_Label\tVolts\tum\t\t\nX_Dimension')
+    table = rows(K / RATE, V, UM, separator='\t', comma=True)
+    path.write_text(f'{head}X_Value\tDrive\tStrain gauge\tComment\n{table}')
+
+
+def commented_txt(path: Path) -> None:
+    table = rows(K / RATE, V, UM, separator='\t').splitlines()
+    table.insert(500, '# somebody touched the table')
+    path.write_text('\n'.join(['# run 7', '#', '# Time[s]\tU_out[V]\tx[um]', *table]))
+
+
 def labview_lvm(path: Path) -> None:
     table = rows(K / RATE, V, UM, separator='\t', comma=True).replace('\n', '\tstarted\n', 1)
     path.write_text(f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n{table}')
@@ -164,6 +176,8 @@ FILES = {
     unicode_txt: '',
     quoted_csv: '',
     labview_lvm: '',
+    units_lvm: '',
+    commented_txt: '',
     without_time_lvm: '',
     without_time_txt: '--rate 5e3',
     scope_csv: '',
@@ -201,7 +215,7 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
     said = capsys.readouterr().err
     assert (' v is ' in said) is (maker is not rounded_csv)
     assert said.count('\n') == (maker is not rounded_csv)
-    assert ("t is 'X_Value' in s" in said) is (maker is labview_lvm)
+    assert ("t is 'X_Value' in s" in said) is (maker in (labview_lvm, units_lvm))
 
 
 @pytest.mark.parametrize(
@@ -254,6 +268,17 @@ def test_options_that_do_not_fit_the_file(tmp_path, choices, words):
     with pytest.raises(DataError) as caught:
         pi.read(path, **choices)
     assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_one_run_of_several_in_groups(tmp_path, capsys):
+    path, out = tmp_path / 'runs.npz', tmp_path / 'out.npz'
+    runs = [{f'run{i}.time': K / RATE, f'run{i}.voltage': V + i} for i in (1, 2)]
+    np.savez(path, **runs[0], **runs[1], **{f'run{i}.position_um': UM for i in (1, 2)})
+    assert main(['convert', str(path), str(out)]) == 2
+    # the command that is shown is typed
+    shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
+    assert main(shlex.split(shown.replace('run1', 'run2'))) == 0
+    np.testing.assert_array_equal(pi.read(out).pieces[0].v, V + 2)
 
 
 def test_commands_that_are_suggested_read_the_same_way():
