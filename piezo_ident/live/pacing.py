@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 
-__all__ = ['ArrivalClock', 'Schedule']
+__all__ = ['ArrivalClock', 'Rate', 'Schedule']
 
 #: a block this much behind its time is not caught up with: readers keep only so many blocks [s]
 SLIP = 0.25
@@ -121,3 +121,17 @@ class ArrivalClock:
         ways = (arrival - self.set_by, arrival - self._before)
         now = self._now
         return min(ways, key=lambda stamp: (stamp - now > 4 * STEP, abs(stamp - now)))
+
+
+class Rate:
+    """How fast a count grows, from one look to the next."""
+
+    def __init__(self) -> None:
+        self._at, self._count = time.monotonic(), 0.0
+
+    def of(self, count: float) -> float:
+        """Return the growth a second since the last look; 0 where it started over."""
+        now = time.monotonic()
+        rate = max(0.0, count - self._count) / max(now - self._at, 1e-3)
+        self._at, self._count = now, count
+        return rate

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.pacing import Schedule, SLIP
-from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, Rate, run, WARN
+from piezo_ident.live.pacing import Rate, Schedule, SLIP
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import cut_blocks, Samples
@@ -285,7 +285,7 @@ class ExcitationNode(LabNode):
             self.report_status(
                 'running',
                 math.floor(100.0 * stop / sequence.n),
-                f'{_name(sequence)}: {label}{warning}',
+                f'{_name(sequence)}, segment {label}{warning}',
                 level,
                 segment=label,
             )

@@ -16,7 +16,6 @@ import os
 from pathlib import Path
 import sys
 import threading
-import time
 import traceback
 from typing import Any
 
@@ -28,6 +27,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
+from piezo_ident.nodes.given import begin, unknown
 from piezo_ident.nodes.journal import FromPackage, Journal, one_line, shown
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
@@ -44,10 +44,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-__all__ = ['LabNode', 'Rate', 'guard_settings', 'run']
+__all__ = ['LabNode', 'guard_settings', 'run']
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
@@ -66,20 +65,6 @@ def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettin
     return GuardSettings(
         v['voltage_low'], v['voltage_high'], v['slew'], v['ramp_slew'], v['rest'], sample_rate
     )
-
-
-class Rate:
-    """How fast a count grows, from one look to the next."""
-
-    def __init__(self) -> None:
-        self._at, self._count = time.monotonic(), 0.0
-
-    def of(self, count: float) -> float:
-        """Return the growth a second since the last look; 0 where it started over."""
-        now = time.monotonic()
-        rate = max(0.0, count - self._count) / max(now - self._at, 1e-3)
-        self._at, self._count = now, count
-        return rate
 
 
 class LabNode(Node):
@@ -260,6 +245,10 @@ class LabNode(Node):
         level, message, values = self.diagnose()
         if level != OK:
             self.journal.warn(message, level)
+        own = (self.get_name(), self.get_namespace())
+        if self.get_node_names_and_namespaces().count(own) > 1:
+            name = self.get_fully_qualified_name()
+            self.journal.warn(f'another node is called {name} too, or was until it was killed')
         array = DiagnosticArray(status=[self._diagnostic(level, message, values)])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
@@ -306,8 +295,8 @@ class LabNode(Node):
         """Wait a moment until the last status was heard."""
         self._status.wait_for_all_acked(Duration(seconds=0.1))
 
-    def introduce(self) -> None:
-        """Write that the node is up, and which parameters are not what they are by default."""
+    def introduce(self, argv: Sequence[str] | None) -> None:
+        """Write that the node is up, which parameters differ from the default, what is unknown."""
         changed = {
             name: value
             for name, value in self.values.items()
@@ -315,6 +304,8 @@ class LabNode(Node):
         }
         said = f'; set: {shown(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
+        for line in unknown(self, argv):
+            self.journal.tell(line, WARN)
 
     def close(self) -> None:
         """Give way: ramp to rest, close files, stop threads; called once, before the end."""
@@ -351,13 +342,17 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     sys.setswitchinterval(SWITCH)
     ENDING.listen()
     ENDING.patience = STARTING
-    rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        begin(argv)
+    except PiezoIdentError as error:
+        sys.stderr.write(f'piezo_ident: error: {error}\n')
+        return 2
     executor = SingleThreadedExecutor()
     ENDING.on_wanted = executor.wake
     node, code = None, 0
     try:
         node = make()
-        node.introduce()
+        node.introduce(argv)
         ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience
         executor.add_node(node)
         _spin(executor, node)

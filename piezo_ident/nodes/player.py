@@ -22,8 +22,8 @@ import time
 from typing import Any
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.pacing import Schedule, SLIP
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
+from piezo_ident.live.pacing import Rate, Schedule, SLIP
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag

@@ -53,9 +53,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.pacing import Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, Rate, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
@@ -254,7 +255,8 @@ class StageNode(LabNode):
 
     def _report_state(self) -> None:
         faults = self._recent_faults()
-        now = {'running': self._segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
+        segment = f'segment {self._segment}'
+        now = {'running': segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
         text = f'{faults}; {now}' if faults else now
         level = WARN if faults else OK
         self.report_status(self._state, 0.0, text, level, segment=self._segment)

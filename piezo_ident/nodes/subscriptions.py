@@ -89,16 +89,16 @@ def message_class(name: str) -> Any:
         raise PiezoIdentError(f'message type {name} is not installed; install {package}') from None
 
 
-def topics_problem(names: Sequence[str]) -> str | None:
+def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | None:
     """Return why these cannot be names of topics, None when they can."""
     if not names:
-        return 'topics must name at least one'
+        return f'{parameter} must name at least one'
     for name in names:
         try:
             validate_topic_name(name)
         except (InvalidTopicNameException, ValueError) as error:
             reason = ' '.join(str(error).split())
-            return f'topics: {name!r} is no name of a topic ({reason})'
+            return f'{parameter}: {name!r} is no name of a topic ({reason})'
     return None
 
 

@@ -66,7 +66,7 @@ def test_cancel_during_the_excitation_ramps_to_rest(course):
         seen, begun = settling(course), len(course.statuses('identifier'))
         for what in ('identify', 'run', 'clear', 'save'):
             ok, reason = course.call(f'identifier/{what}')
-            assert not ok and 'busy: excitation' in reason
+            assert not ok and 'busy: program' in reason
         begin = time.monotonic()
         assert course.call('identifier/cancel')[0]
         answered = time.monotonic() - begin

@@ -17,6 +17,7 @@ from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
+from piezo_ident.live.pacing import Rate
 from piezo_ident.model.files import load
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
@@ -31,8 +32,9 @@ from piezo_ident.nodes.identifier.jobs import (
     warm_up,
 )
 from piezo_ident.nodes.identifier.worker import Worker
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, Rate, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.parameters import NODES
+from piezo_ident.nodes.subscriptions import topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from std_msgs.msg import String
 
@@ -146,6 +148,8 @@ class IdentifierNode(LabNode):
                 settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
             except PiezoIdentError as error:
                 return str(error)
+        if name == 'channels' and (topics := list(filter(None, value))):
+            return topics_problem(topics, name)
         if name.endswith('program') and not value.strip():
             return f'{name} must not be empty; name a program, a path, or write YAML'
         if name == 'model' and value:
@@ -172,7 +176,8 @@ class IdentifierNode(LabNode):
         self._refuse_when_busy()
         settings_of(self.values)
         # older data may come from another stage, or another day
-        self.excite(self.values['program'], 'excitation', self._run_ended, self._forget)
+        about = 'program for the identification'
+        self.excite(self.values['program'], about, self._run_ended, self._forget)
         return 'the program is requested; see ~/status'
 
     def _run_ended(self, reason: str | None) -> None:

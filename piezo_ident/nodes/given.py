@@ -1,0 +1,55 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What a node is given when it starts, on its command line or by a launch file.
+
+ROS passes over a parameter or an argument that nobody knows without a word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import difflib
+import re
+import sys
+
+from piezo_ident.common.errors import ConfigError
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+__all__ = ['begin', 'unknown']
+
+
+def begin(argv: Sequence[str] | None) -> None:
+    """
+    Initialise ROS, without its signal handlers.
+
+    Raises
+    ------
+    ConfigError
+        When ROS cannot take the arguments, or a file that they name.
+    """
+    try:
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    # of which the classes of rcl's errors are
+    except RuntimeError as error:
+        # without the places in the sources of rcl
+        text = re.sub(r', at /\S+:\d+|failed to initialize rcl: ', '', str(error))
+        text = ' '.join(text.split())
+        raise ConfigError(f'ROS does not take the arguments: {text}') from None
+
+
+def unknown(node: Node, argv: Sequence[str] | None) -> Iterator[str]:
+    """Return a line on each parameter and argument that was given and that the node has not."""
+    known = node.list_parameters([], 0).names
+    given = set(getattr(node, '_parameter_overrides', ()))
+    for name in sorted(given.difference(known)):
+        close = difflib.get_close_matches(name, known, n=1)
+        guess = f'; did you mean {close[0]}?' if close else ''
+        yield f'parameter {name} is not one of this node{guess}'
+    rest = remove_ros_args(args=sys.argv if argv is None else argv)[1:]
+    if rest:
+        yield f'{" ".join(rest)} is passed over; set parameters by --ros-args -p NAME:=VALUE'
