@@ -11,6 +11,7 @@ from piezo_ident.identification.results import Steps
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.sines import SineError, sines_of
 from piezo_ident.report import headline, identification_text, steps_to_json, table_one, to_json
+from piezo_ident.report.html import Page, page_html, Section
 from piezo_ident.report.identification import (
     dynamics_tables,
     error_table,
@@ -175,6 +176,9 @@ def test_lengths_and_columns():
     # words stay whole on a narrow screen, and prose alone is wrapped
     wide = Table('t', ('', 'n', 'word', 'why'), [('a' * 50, '1', 'noise', 'so it is ' * 9)])
     assert wide.kinds == ('', '', 'text', 'prose')
+    # prose goes below the rest of its row there
+    page = Page('t', 's', 'h', [], [], [Section('a', [wide, table])], [], 'f')
+    assert page_html(page).count('<table class="stacked">') == 1
     assert table.lines() == ['t:', '      n  text', 'a     1  b', 'bb?  12  2']
     assert Table('', ('', ''), [('a', 'b ' * 60)]).lines()[1].startswith('   b b')
     assert Table('t', ('', 'n'), []).text_columns == (False, False)
