@@ -14,6 +14,7 @@ from piezo_ident.diagnosis.next_experiment import next_experiment
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.record.record import Record
+from piezo_ident.report.refined import changes
 from piezo_ident.report.table import listed, number
 
 __all__ = ['Prompt', 'Step', 'next_steps']
@@ -127,7 +128,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
         )
     if result.verdict == 'none':
         yield _use('the model lacks nothing that these data show', prompt, prompt.given)
-    elif not result.unseen:
+    elif not result.unseen and changes(result.given, result.model):
         yield Step(
             'check the refined model on a record that took no part',
             prompt.command('predict', prompt.model, OTHER),

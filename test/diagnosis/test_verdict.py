@@ -9,8 +9,10 @@ import numpy as np
 from piezo_ident.diagnosis import criteria, forward_selection
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
 from piezo_ident.diagnosis.forward_selection import takes
+from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
-from piezo_ident.diagnosis.verdict import judge, rivals_of
+from piezo_ident.diagnosis.results import Errors, Unexplained
+from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
 import pytest
 
@@ -54,6 +56,13 @@ def a_round(*contenders, before=WHOLE):
 
 def rivals(rows, *contenders):
     return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE)]
+
+
+def test_a_refit_that_is_not_kept_is_said():
+    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.2, 0.4))
+    findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
+    said = sentence(findings, errors, rest, 0.05, True)
+    assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
 
 
 # -- which candidates are separated -------------------------------------------------------------
