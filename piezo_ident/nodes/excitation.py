@@ -282,13 +282,10 @@ class ExcitationNode(LabNode):
             self._send(playing, sequence.v[start:stop], label)
             clock.note(start, stop - start, time.monotonic())
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
-            self.report_status(
-                'running',
-                math.floor(100.0 * stop / sequence.n),
-                f'{_name(sequence)}, segment {label}{warning}',
-                level,
-                segment=label,
-            )
+            percent = math.floor(100.0 * stop / sequence.n)
+            text = f'{_name(sequence)}, segment {label}{warning}'
+            brief = f'{percent} %: {text}'
+            self.report_status('running', percent, text, level, brief=brief, segment=label)
 
     def _send(self, playing: Playing, v: NDArray[np.float64], label: str) -> None:
         begin = time.perf_counter()

@@ -14,7 +14,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-__all__ = ['FromPackage', 'Journal', 'one_line', 'shown']
+__all__ = ['FromPackage', 'Journal', 'one_line', 'shortened', 'shown']
 
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
@@ -24,7 +24,10 @@ ECHO = 1.0
 MOST = 50
 #: longest line, as of a parameter that holds a program
 LONGEST = 500
+#: longest path in a text that has to be brief
+PATH = 40
 
+_PATH = re.compile(r'(?:/[^\s/:;,]+){2,}')
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?')
 
 
@@ -105,9 +108,19 @@ def one_line(text: str, longest: int = LONGEST) -> str:
     return line if len(line) <= longest else f'{line[: longest - 4].rstrip()} ...'
 
 
+def shortened(text: str, longest: int) -> str:
+    """Return a text in one line, with the ends of long paths alone, cut where it is too long."""
+
+    def end(match: re.Match[str]) -> str:
+        path = match[0]
+        return path if len(path) <= PATH else f'...{path[3 - PATH :]}'
+
+    return one_line(_PATH.sub(end, text), longest)
+
+
 def shown(values: Mapping[str, Any]) -> str:
     """Return parameters as text; one may hold a whole program."""
-    return ', '.join(f'{name} = {one_line(str(value), 60)}' for name, value in values.items())
+    return ', '.join(f'{name} = {shortened(str(value), 60)}' for name, value in values.items())
 
 
 def _fresh(told: dict[str, float]) -> dict[str, float]:

@@ -28,7 +28,7 @@ from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.given import begin, unknown
-from piezo_ident.nodes.journal import FromPackage, Journal, one_line, shown
+from piezo_ident.nodes.journal import FromPackage, Journal, shortened, shown
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 from rcl_interfaces.msg import (
@@ -216,14 +216,16 @@ class LabNode(Node):
             Further numbers.
         """
         if not brief:
-            brief = f'{progress:.0f} %: {text}' if progress and not text[:1].isdigit() else text
+            # a program may be called 3peaks
+            is_number = text.partition(' ')[0].replace('.', '', 1).isdigit()
+            brief = text if is_number or not progress else f'{progress:.0f} %: {text}'
         key = (state, round(progress), text, level, brief, tuple(values.items()))
         with self._status_lock:
             if key == self._last_status:
                 return
             before, self._last_status = self._last_status, key
             pairs = {'state': state, 'progress': f'{progress:.0f}', **values, 'text': text}
-            self._status.publish(self._diagnostic(level, one_line(brief, LONGEST), pairs))
+            self._status.publish(self._diagnostic(level, shortened(brief, LONGEST), pairs))
         if before and (state != before[0] or level > before[3]):
             known = '' if text.startswith(state) else f'{state}: '
             self.journal.tell(f'{known}{text}', level)

@@ -274,7 +274,8 @@ class PlayerNode(LabNode):
         }
 
     def _report(self, state: str, message: str, level: bytes = OK, progress: float = 0.0) -> None:
-        self.report_status(state, progress, message, level, **self._numbers())
+        brief = f'{progress:.0f} %: {message}' if state == 'playing' else ''
+        self.report_status(state, progress, message, level, brief=brief, **self._numbers())
 
 
 def chosen_topics(

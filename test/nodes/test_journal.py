@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from piezo_ident.nodes.journal import Journal, LONGEST, MOST
+from piezo_ident.nodes.journal import Journal, LONGEST, MOST, shortened
 
 
 class Lines(list):
@@ -31,6 +31,13 @@ def test_levels_and_long_texts():
     assert lines == [('info', 'running: sine'), ('warning', 'lost'), ('error', 'failed')]
     journal.tell('x' * 1000)
     assert len(lines[-1][1]) == LONGEST
+
+
+def test_a_long_path_leaves_room_for_what_is_wrong_with_it():
+    path = f'/home/{"a_long_name/" * 20}monday'
+    text = shortened(f'{path}: cannot be written; choose another', 100)
+    assert text.startswith('...') and '/monday: cannot be written; choose another' in text
+    assert shortened('1.5 % of stroke, with /tmp/model.yaml', 100).endswith('with /tmp/model.yaml')
 
 
 def test_what_goes_on_is_told_once():

@@ -123,11 +123,13 @@ class ExcitationClient:
         self._phase, self._future, self.progress = 'finding', None, 0.0
         self._sign = time.monotonic()
 
-    def stop(self) -> None:
-        """Give up the run and have the excitation ramp to rest."""
-        if self._phase in ('starting', 'playing') and self._stop.service_is_ready():
+    def stop(self) -> bool:
+        """Give up the run; return whether the excitation was started, and is to ramp to rest."""
+        is_started = self._phase in ('starting', 'playing') and self._stop.service_is_ready()
+        if is_started:
             self._stop.call_async(Trigger.Request())
         self._phase = ''
+        return is_started
 
     def _end(self, reason: str | None) -> None:
         if reason is not None:

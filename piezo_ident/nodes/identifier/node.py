@@ -223,10 +223,11 @@ class IdentifierNode(LabNode):
 
     def _cancel(self) -> str:
         if self._excitation.running:
-            self._excitation.stop()
+            ramps = self._excitation.stop()
             self._session.drop()
-            self._set_state('cancelled', 0.0, 'the excitation ramps to rest')
-            return 'cancelled; the excitation ramps to rest'
+            text = 'the excitation ramps to rest' if ramps else 'the excitation was not started'
+            self._set_state('cancelled', 0.0, text)
+            return f'cancelled; {text}'
         if not self._worker.is_busy:
             raise PiezoIdentError('there is no work to cancel')
         self._worker.cancel()
@@ -294,7 +295,7 @@ class IdentifierNode(LabNode):
     def _progress(self, step: str, share: float) -> None:
         state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
         percent = 100.0 * share if state == 'saving' else percent_of(step, share)
-        self.report_status(state, percent, step)
+        self.report_status(state, percent, step, brief=f'{percent:.0f} %: {step}')
 
     def _ended(self, result: Result | None, error: Exception | None) -> None:
         # published by the executor, so that the worker is free when the end is reported
