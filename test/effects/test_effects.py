@@ -305,8 +305,8 @@ def test_steps_are_small_enough_to_be_differences(name):
 @given(
     rate=st.floats(20.0, 1e6),
     low=st.floats(-2.0, 2.0),
-    span=st.floats(0.0, 3.0),
-    fastest=st.floats(0.0, 1e5),
+    span=st.just(0.0) | st.floats(1e-9, 3.0),
+    fastest=st.just(0.0) | st.floats(1e-9, 1e5),
     duration=st.floats(0.01, 1e5),
     lines=st.lists(st.floats(1e-6, 1e6), max_size=3),
     modes=st.lists(st.tuples(st.floats(0.1, 1e6), st.floats(1e-3, 1.0)), max_size=5),
