@@ -69,16 +69,19 @@ class Journal:
 
     def warn(self, text: str, level: bytes = DiagnosticStatus.WARN) -> None:
         """Write what may hold on, and is found again and again with other numbers."""
-        line = one_line(text)
-        pattern = _NUMBER.sub('#', line)
+        new = []
         with self._lock:
             patterns = _fresh(self._patterns)
-            # a part of what was told is no news
-            known = next((p for p in patterns if pattern in p), None)
-            is_new = known is None and len(patterns) < MOST
-            patterns[known or pattern] = time.monotonic() + QUIET
-        if is_new:
-            self._write(line, level)
+            # a list of problems grows one by one
+            for part in one_line(text).split('; '):
+                pattern = _NUMBER.sub('#', part)
+                # a part of what was told is no news
+                known = next((p for p in patterns if pattern in p), None)
+                if known is None and len(patterns) < MOST:
+                    new.append(part)
+                patterns[known or pattern] = time.monotonic() + QUIET
+        if new:
+            self._write('; '.join(new), level)
 
     def _write(self, line: str, level: bytes) -> None:
         # rclpy knows a call by its place, and takes one severity from each

@@ -47,8 +47,9 @@ def test_what_goes_on_is_told_once():
     for k in range(100):
         journal.warn(f'no voltage for {k / 7:.2f} s')
         journal.warn(f'{k} blocks lost')
+        journal.warn(f'{k} blocks lost; {k + 1} blocks lost; too late')
         journal.tell('started')
-    said = ['ramping: no voltage for 0.51 s', '0 blocks lost', 'started']
+    said = ['ramping: no voltage for 0.51 s', '0 blocks lost', 'too late', 'started']
     assert [text for _, text in lines] == said
 
 
