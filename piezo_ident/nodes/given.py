@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-__all__ = ['begin', 'unknown']
+__all__ = ['begin', 'no_parameter', 'unknown_to']
 
 
 def begin(argv: Sequence[str] | None) -> None:
@@ -42,14 +42,18 @@ def begin(argv: Sequence[str] | None) -> None:
         raise ConfigError(f'ROS does not take the arguments: {text}') from None
 
 
-def unknown(node: Node, argv: Sequence[str] | None) -> Iterator[str]:
-    """Return a line on each parameter and argument that was given and that the node has not."""
+def no_parameter(node: Node, name: str) -> str:
+    """Return that a node has no such parameter, and the name that may be meant."""
     known = node.list_parameters([], 0).names
-    given = set(getattr(node, '_parameter_overrides', ()))
-    for name in sorted(given.difference(known)):
-        close = difflib.get_close_matches(name, known, n=1)
-        guess = f'; did you mean {close[0]}?' if close else ''
-        yield f'parameter {name} is not one of this node{guess}'
+    close = difflib.get_close_matches(name, known, n=1)
+    guess = f'; did you mean {close[0]}?' if close else ''
+    return f'{name} is no parameter of this node{guess}'
+
+
+def unknown_to(node: Node, argv: Sequence[str] | None) -> Iterator[str]:
+    """Return a line on each parameter and argument that was given and that the node has not."""
+    given = getattr(node, '_parameter_overrides', ())
+    yield from (no_parameter(node, name) for name in sorted(given) if not node.has_parameter(name))
     rest = remove_ros_args(args=sys.argv if argv is None else argv)[1:]
     if rest:
         yield f'{" ".join(rest)} is passed over; set parameters by --ros-args -p NAME:=VALUE'

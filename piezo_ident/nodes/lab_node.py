@@ -27,7 +27,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.given import begin, unknown
+from piezo_ident.nodes.given import begin, no_parameter, unknown_to
 from piezo_ident.nodes.journal import FromPackage, Journal, shortened, shown
 from piezo_ident.nodes.parameters import Declaration, NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
@@ -154,9 +154,14 @@ class LabNode(Node):
             or not self._declared[p.name].read_only
             or (p.type_, p.value) != (self.get_parameter(p.name).type_, self.values[p.name])
         ]
-        if not wanted:
-            return SetParametersResult(successful=True)
-        return super().set_parameters_atomically(wanted)
+        result = SetParametersResult(successful=True)
+        if unknown := [p.name for p in wanted if not self.has_parameter(p.name)]:
+            result = SetParametersResult(reason=no_parameter(self, unknown[0]))
+        elif wanted:
+            result = super().set_parameters_atomically(wanted)
+        if not result.successful:
+            self.journal.tell(f'parameter refused: {result.reason}', WARN)
+        return result
 
     def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         # two that come at once may each fit what is there, and not each other
@@ -164,7 +169,6 @@ class LabNode(Node):
         for parameter in parameters:
             problem = self._problem(parameter.name, parameter.value)
             if problem:
-                self.journal.tell(f'parameter refused: {problem}', WARN)
                 return SetParametersResult(successful=False, reason=problem)
         return SetParametersResult(successful=True)
 
@@ -306,7 +310,7 @@ class LabNode(Node):
         }
         said = f'; set: {shown(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
-        for line in unknown(self, argv):
+        for line in unknown_to(self, argv):
             self.journal.tell(line, WARN)
 
     def close(self) -> None:

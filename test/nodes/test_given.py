@@ -28,7 +28,7 @@ def test_what_cannot_be_taken_costs_one_line():
         g.wait(lambda: '--rate 3 is passed over' in twin.log, 'the arguments')
         for handle in (first, twin):
             g.wait(lambda h=handle: 'another node is called /recorder' in h.log, 'the namesake')
-            assert handle.log.count('is not one of this node') == (handle is first)
+            assert handle.log.count('is no parameter of this node') == (handle is first)
         for handle in (first, twin):
             handle.send(signal.SIGINT)
             assert handle.process.wait(60) == 0

@@ -96,6 +96,7 @@ def test_a_run_through_the_whole_graph(whole):
         ('recorder', Log.INFO, r'done: \d+ messages in .*bag'),
         ('recorder', Log.WARN, '~/stop refused: not recording'),
         ('excitation', Log.WARN, 'parameter refused: .*no_such_program'),
+        ('excitation', Log.WARN, 'parameter refused: Wrong parameter type'),
     ],
 )
 def test_the_log_tells_what_happened(whole, node, level, line):
@@ -103,6 +104,7 @@ def test_the_log_tells_what_happened(whole, node, level, line):
         whole.asked = ['recorder/stop']
         assert not whole.call('recorder/stop')[0]
         assert not whole.set('excitation', 'program', 'no_such_program')[0]
+        assert not whole.set('excitation', 'program', 1)[0]
     said = whole.lines()
     whole.wait(lambda: any(x[:2] == (node, level) and re.match(line, x[2]) for x in said), line)
 
@@ -300,7 +302,9 @@ def test_bad_parameters_are_refused_with_the_reason(whole, node):
 def test_what_is_no_parameter_is_refused(whole):
     for node in NODES:
         taken, reason = whole.set(node, 'nonsense', 1)
-        assert not taken and 'undeclared parameter' in reason
+        assert not taken and reason == 'nonsense is no parameter of this node'
+    reason = 'rate_facter is no parameter of this node; did you mean rate_factor?'
+    assert whole.set('excitation', 'rate_facter', 1.0) == (False, reason)
 
 
 def test_every_yaml_file_loads_into_its_running_node():
