@@ -347,16 +347,20 @@ PAGE = """\
 <html lang="en"><head><meta charset="utf-8"><title>piezo_ident: the demo</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>
-body {{ font: 16px/1.5 system-ui, 'Segoe UI', 'DejaVu Sans', sans-serif; color: #1a1a1a;
-  max-width: 62rem; margin: 0 auto; padding: 1.5rem; }}
+:root {{ color-scheme: light dark; --ink: #1a1a1a; --paper: #fff; --soft: #555; --back: #f1f6fa; }}
+@media (prefers-color-scheme: dark) {{ :root {{ --ink: #e4e4e4; --paper: #17191c; --soft: #a9adb2;
+  --back: #182936; }} a {{ color: #7ab8f5; }} }}
+body {{ font: 16px/1.5 system-ui, 'Segoe UI', 'DejaVu Sans', sans-serif; color: var(--ink);
+  background: var(--paper); max-width: 62rem; margin: 0 auto; padding: 1.5rem; }}
 h1 {{ font-size: 1.6rem; margin: 0; }} h2 {{ font-size: 1.2rem; margin: 2rem 0 .5rem; }}
-.verdict {{ font-size: 1.15rem; border-left: 4px solid #0072B2; background: #f1f6fa;
+.verdict {{ font-size: 1.15rem; border-left: 4px solid #0072B2; background: var(--back);
   padding: .5rem .9rem; }}
 table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
 th, td {{ padding: .25rem 1rem .25rem 0; text-align: left; border-bottom: 1px solid #ddd; }}
-figure {{ margin: 1.2rem 0; }} img {{ max-width: 100%; }}
-figcaption, footer {{ color: #555; font-size: .9rem; }}
-pre {{ background: #f5f5f5; padding: .7rem; overflow-x: auto; font-size: .85rem; }}
+figure {{ margin: 1.2rem 0; overflow-x: auto; }}
+img {{ display: block; background: #fff; width: 50rem; max-width: 100%; min-width: 32rem; }}
+figcaption, footer {{ color: var(--soft); font-size: .9rem; }}
+pre {{ background: var(--back); padding: .7rem; white-space: pre-wrap; font-size: .85rem; }}
 </style></head><body>
 <h1>A stage with effects that nobody declared</h1>
 <p>{intro}</p>

@@ -198,8 +198,10 @@ def segments_figure(
     heights = [0.12] + [1.6, 1.0] * rows
     grid = fig.add_gridspec(2 * rows + 1, min(2, len(cells)), height_ratios=heights)
     for i, (run, s) in enumerate(cells):
-        trace = fig.add_subplot(grid[2 * (i // 2) + 1, i % 2])
-        error = fig.add_subplot(grid[2 * (i // 2) + 2, i % 2], sharex=trace)
+        # one that is left takes the whole row
+        across = slice(None) if i % 2 == 0 and i + 1 == len(cells) else i % 2
+        trace = fig.add_subplot(grid[2 * (i // 2) + 1, across])
+        error = fig.add_subplot(grid[2 * (i // 2) + 2, across], sharex=trace)
         _draw_segment(trace, error, run, s, (errors or {}).get((run.record, s.label), ''))
     head = fig.add_subplot(grid[0, :])
     head.set_axis_off()
