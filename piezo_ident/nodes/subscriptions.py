@@ -189,6 +189,17 @@ class _Topic:
     #: whether the last message came from the only publisher since
     is_followed: bool = False
 
+    def note(self, number: int) -> None:
+        """Take note of the number that the publisher gave a message."""
+        if self.subscription.msg_type is Float64MultiArray:
+            self.losses.note(number, alone=self.is_followed)
+        # a latched message may be replaced on its way
+        elif self.request is not None and not self.request.latched:
+            # of several that publish by right, as on /diagnostics, the numbers say nothing
+            if not self.is_followed:
+                self.losses.restart()
+            self.losses.note(number, alone=True)
+
 
 class RawSubscriptions:
     """
@@ -313,7 +324,7 @@ class RawSubscriptions:
                     raw, info = message
                     topic.taken += 1
                     number = info['publication_sequence_number'] or 0
-                    topic.losses.note(number, alone=topic.is_followed)
+                    topic.note(number)
                     topic.is_followed = topic.is_single
                     arrival = info['received_timestamp'] or time.time_ns()
                     messages.append((self._clock.stamp(arrival), topic.name, raw))

@@ -191,3 +191,7 @@ class LossCount:
         nearest = max(before)
         self.lost += number - nearest - 1
         self._last[self._last.index(nearest)] = number
+
+    def restart(self) -> None:
+        """Take the next number as a first one."""
+        self._last.clear()

@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import best_of_three, Graph, Late
 from piezo_ident.cli import main
 from piezo_ident.nodes.wire import LATCHED, STREAM, to_message
@@ -37,6 +38,10 @@ def pair(k: int) -> tuple[Samples, Samples]:
         Samples(t, 5 + np.sin(7 * t), 'noise', 'voltage'),
         Samples(t, 1e-5 + 1e-6 * np.sin(7 * t), 'noise', 'displacement'),
     )
+
+
+#: without /diagnostics, which come all the time
+COUNTED = ['voltage', 'displacement', 'residual', 'model']
 
 
 class Source:
@@ -103,7 +108,8 @@ def test_record_stop_and_refusals(tmp_path):
         source = Source(g, '/a')
         model = g.node.create_publisher(String, '/a/model', LATCHED)
         model.publish(String(data='the first'))
-        g.start('recorder', {'output': str(tmp_path / 'bag'), 'sample_rate': RATE}, 'a')
+        settings = {'output': str(tmp_path / 'bag'), 'sample_rate': RATE, 'topics': COUNTED}
+        g.start('recorder', settings, 'a')
         assert g.call('a/recorder/stop') == (False, 'not recording; call start first')
         path = start(g, 'a/recorder')
         assert path == str(tmp_path / 'bag')
@@ -183,7 +189,8 @@ def test_record_stop_and_refusals(tmp_path):
 def test_a_long_recording_is_cut_into_parts_and_loses_nothing(tmp_path):
     with Graph() as g:
         source = Source(g)
-        g.start('recorder', {'output': str(tmp_path / 'bag'), 'max_bag_size': 500_000})
+        settings = {'output': str(tmp_path / 'bag'), 'max_bag_size': 500_000, 'topics': COUNTED}
+        g.start('recorder', settings)
         assert start(g) == str(tmp_path / 'bag')
         with source:
             g.wait(lambda: (tmp_path / 'bag_3').exists(), 'the fourth part')
@@ -262,6 +269,29 @@ def killed(tmp_path, storage, capsys):
     if before / 200 - kept >= 1.0:
         raise Late(f'{before / 200 - kept:.3f} s were lost')
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * record.pieces[0].t))
+
+
+def test_nothing_is_lost_where_several_publish_or_a_status_is_replaced(tmp_path):
+    with Graph() as g:
+        topics = [g.node.create_publisher(DiagnosticArray, '/diagnostics', 10) for _ in '123']
+        for _ in range(40):
+            topics[0].publish(DiagnosticArray())
+        status = g.node.create_publisher(DiagnosticStatus, '/stage/status', LATCHED)
+        pose = g.node.create_publisher(JointState, '/preview', 10)
+        g.start('recorder', {'output': str(tmp_path / 'bag')})
+        start(g)
+        for publisher in (status, pose, *topics):
+            g.wait(publisher.get_subscription_count, publisher.topic_name)
+        # the first of them has published for long
+        for k in range(1, 100):
+            status.publish(DiagnosticStatus(message=str(k)))
+            topics[k % 3].publish(DiagnosticArray())
+        for _ in range(5):
+            pose.publish(JointState())
+            assert pose.wait_for_all_acked(Duration(seconds=60.0))
+        end = g.finish('recorder/stop')
+        assert end['state'] == 'done' and end['lost'] == '0'
+    assert {'/stage/status', '/preview', '/diagnostics'} <= set(contents(tmp_path / 'bag'))
 
 
 def test_other_topics_types_and_qos(tmp_path):
