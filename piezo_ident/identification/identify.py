@@ -12,7 +12,7 @@ doi:10.1109/TMECH.2015.2465868.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import platform
 from typing import Any
 
@@ -26,8 +26,10 @@ from piezo_ident.identification.errors import (
     predictions_of,
     validation_errors,
 )
-from piezo_ident.identification.prepare import prepare, Run
+from piezo_ident.identification.linear_part import without_pairs
+from piezo_ident.identification.prepare import Excerpt, prepare, Run
 from piezo_ident.identification.results import (
+    DynamicsResult,
     FitOutcome,
     Identification,
     Progress,
@@ -38,7 +40,7 @@ from piezo_ident.identification.results import (
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
 from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step
-from piezo_ident.identification.step3_hysteresis import fit_again
+from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
 from piezo_ident.identification.three_steps import (
     beside_law,
     first_step,
@@ -58,6 +60,8 @@ import scipy
 
 __all__ = ['first_steps', 'identify']
 
+#: share by which a model may err more without a pair of G that H may stand for
+PAIR = 0.01
 _UNLABELLED = (
     '{}: no segments are labelled {}; drive the stage with the program identification, or '
     'identify unlabelled data in one go'
@@ -170,20 +174,31 @@ def _labelled(
     unstarted, runs = runs, with_starts(runs)
     delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
-    dynamics, G = steps.dynamics or second_step(runs, delay, settings, progress)
-    # the same with what is known of the lag by now
-    runs = with_starts(unstarted, lag_of(G, delay))
-    fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-    hysteresis = third_step(fit, held, G, delay, settings, progress, others=small_excerpts(runs))
-    if hysteresis.law != 'plays':
-        # G was found beside plays
-        refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay)
-        if refined is not None:
-            dynamics, G = refined
-            hysteresis = fit_again(hysteresis, fit, G, delay)
-    model = model_of(rate, scaling, hysteresis, G, delay)
+
+    def fitted(dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
+        # the starts with what is known of the lag by now
+        runs = with_starts(unstarted, lag_of(G, delay))
+        fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
+        small = small_excerpts(runs)
+        hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
+        if hysteresis.law != 'plays':
+            # G was found beside plays
+            refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
+            if refined is not None:
+                dynamics, G = refined
+                hysteresis = fit_again(hysteresis, fit, G, delay)
+        model = model_of(rate, scaling, hysteresis, G, delay)
+        return _Fitted(runs, fit, held, dynamics, hysteresis, model, _left(model, runs))
+
+    best = fitted(*(steps.dynamics or second_step(runs, delay, settings, progress)), lean=False)
+    if without_pairs(best.model.dynamics, rate).a.size < best.model.dynamics.a.size:
+        lean = fitted(*second_step(runs, delay, settings, progress, lean=True), lean=True)
+        # H may do as well what the pair does
+        best = lean if lean.left < (1.0 + PAIR) ** 2 * best.left else best
+    runs, fit, held, model = best.runs, best.fit, best.held, best.model
+    dynamics, hysteresis = best.dynamics, best.hysteresis
     warnings = []
-    if not _worth_its_dynamics(model, runs):
+    if best.left > _left(model.without_dynamics(), runs):
         warnings.append(
             'G errs more than the hysteresis alone on the data that choose, and was left out; '
             'record noise of larger amplitude'
@@ -223,17 +238,29 @@ def _labelled(
     )
 
 
-def _worth_its_dynamics(model: StageModel, runs: Sequence[Run]) -> bool:
-    """Return whether the model errs less with G than without on what chooses."""
-    errors = np.zeros(2)
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """What the second and the third step gave, and what their model leaves of what chooses."""
+
+    runs: Sequence[Run]
+    fit: Sequence[Excerpt]
+    held: Sequence[Excerpt]
+    dynamics: DynamicsResult
+    hysteresis: HysteresisFit
+    model: StageModel
+    left: float
+
+
+def _left(model: StageModel, runs: Sequence[Run]) -> float:
+    """Return the sum of squares that a model leaves of what chooses, offsets apart [m^2]."""
+    left = 0.0
     for run in runs:
         kept = run.held_out() & run.use
         if kept.any():
             memory = run.start(model.hysteresis.thresholds)
-            for i, m in enumerate((model, model.without_dynamics())):
-                e = (run.piece.y - m.predict_piece(run.piece, memory))[kept]
-                errors[i] += float(np.sum((e - e.mean()) ** 2))
-    return bool(errors[0] <= errors[1])
+            e = (run.piece.y - model.predict_piece(run.piece, memory))[kept]
+            left += float(np.sum((e - e.mean()) ** 2))
+    return left
 
 
 def first_steps(

@@ -42,6 +42,7 @@ __all__ = [
     'fast_part',
     'find_linear_part',
     'refined_linear_part',
+    'without_pairs',
     'without_slow_part',
 ]
 
@@ -51,8 +52,8 @@ Vector = NDArray[np.float64]
 SLOWEST = 40.0
 #: at low sampling rates, as a share of the rate
 SLOWEST_SHARE = 0.01
-#: a real pole and a real zero whose frequencies differ by less than this factor are what H lacks
-#: of small motion, below this share of the frequency of the lowest mode that rings (its damping)
+#: a real pole and a real zero whose frequencies differ by less than this factor may be what H
+#: lacks of small motion, below this share of the frequency of the lowest mode that rings (damping)
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 #: delays [samples] that the scan tries, and its na and nb
 MAX_DELAY, SCAN_ORDER = 30, 8
@@ -162,14 +163,23 @@ def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128],
     return residues, poles, np.real(np.atleast_1d(direct))
 
 
-def fast_part(G: Dynamics, rate: float) -> Dynamics:
-    """Return G with G(1) = 1, without its slow real poles where it can do without them."""
-    G = _without_pairs(G, rate)
+def fast_part(G: Dynamics, rate: float, lean: bool = False) -> Dynamics:
+    """
+    Return G with G(1) = 1, without its slow real poles where it can do without them.
+
+    Where `lean`, it goes without the pairs of `without_pairs` too.
+    """
+    G = without_pairs(G, rate) if lean else G
     return without_slow_part(G, rate) or G.normalised()
 
 
-def _without_pairs(G: Dynamics, rate: float) -> Dynamics:
-    """Return G without pairs of a real pole and a near real zero far below its modes."""
+def without_pairs(G: Dynamics, rate: float) -> Dynamics:
+    """
+    Return G without pairs of a real pole and a near real zero far below its modes.
+
+    Small loops that open less than H says make such a pair, and so does hysteresis that depends on
+    the rate.
+    """
     rings = [mode.frequency for mode in G.modes(rate) if mode.damping < RINGS]
     poles, zeros = np.asarray(G.poles, dtype=complex), np.asarray(np.roots(G.b), dtype=complex)
     highest = BELOW_MODES * min(rings, default=0.0)

@@ -235,10 +235,12 @@ def _orders(
 
 
 def second_step(
-    runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress
+    runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress, lean: bool = False
 ) -> tuple[DynamicsResult, Dynamics]:
     """
     Find G, with the hysteresis undone; the dynamics returned are stable, with G(1) = 1.
+
+    Where `lean`, G goes without the pairs of `linear_part.without_pairs`.
 
     Raises
     ------
@@ -257,7 +259,7 @@ def second_step(
     raw = noise_segment(run, run.u, start, stop)
     [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
     del raw  # of an hour's record it is a gigabyte
-    G = fast_part(first, rate)
+    G = fast_part(first, rate, lean)
 
     excerpts = triangle_excerpts(runs)
     n = int(sum(e.use.sum() for e in excerpts))
@@ -272,11 +274,11 @@ def second_step(
     progress('dynamics', 0.45)
     undone = noise_segment(run, run.through(H), start, stop)
     found = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
-    result, G = _best_in_free_run(found, runs, H, delay, progress)
+    result, G = _best_in_free_run(found, runs, H, delay, progress, lean)
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
     fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
-    G = fast_part(fit.dynamics, rate)
+    G = fast_part(fit.dynamics, rate, lean)
     progress('dynamics', 0.95)
     # the same regression on the measured and on the modelled answer: the plays that the noise
     # drags along count in both
@@ -306,28 +308,34 @@ def _best_in_free_run(
     H: Hysteresis,
     delay: Delay,
     progress: Progress,
+    lean: bool,
 ) -> tuple[DynamicsResult, Dynamics]:
     """Refine each G by its free run, and return the best on what was held out."""
     # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
     stretches, held = _stretches(runs, H, delay)
     rate = runs[0].piece.sample_rate
     best, (result, G) = float('inf'), found[0]
-    G = fast_part(G, rate)
+    G = fast_part(G, rate, lean)
     for i, (candidate, start) in enumerate(found):
         tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
-        fast = fast_part(start, rate)
+        fast = fast_part(start, rate, lean)
         fit = output_error(stretches, fast, maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
         # a larger model comes later, and must earn its size
         if score < best / (1.0 + GAIN):
             best, result = score, candidate
-            G = fast_part(fit.dynamics, rate)
+            G = fast_part(fit.dynamics, rate, lean)
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
     return result, G
 
 
 def beside_law(
-    runs: Sequence[Run], H: Hysteresis, dynamics: DynamicsResult, G: Dynamics, delay: Delay
+    runs: Sequence[Run],
+    H: Hysteresis,
+    dynamics: DynamicsResult,
+    G: Dynamics,
+    delay: Delay,
+    lean: bool = False,
 ) -> tuple[DynamicsResult, Dynamics] | None:
     """
     Return G refined beside an H of another law than that it was found with.
@@ -336,7 +344,7 @@ def beside_law(
     """
     stretches, held = _stretches(runs, H, delay)
     fit = output_error(stretches, G, maxiter=8)
-    refined = fast_part(fit.dynamics, runs[0].piece.sample_rate)
+    refined = fast_part(fit.dynamics, runs[0].piece.sample_rate, lean)
     if simulation_error(held, refined) > (1.0 - WORTH) * simulation_error(held, G):
         return None
     return replace(dynamics, covariance=fit.normalised_covariance), refined
