@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import difflib
+from pathlib import Path
 import re
 import sys
 
@@ -20,7 +21,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-__all__ = ['begin', 'no_parameter', 'unknown_to']
+__all__ = ['begin', 'home_problem', 'no_parameter', 'unknown_to']
 
 
 def begin(argv: Sequence[str] | None) -> None:
@@ -40,6 +41,15 @@ def begin(argv: Sequence[str] | None) -> None:
         text = re.sub(r', at /\S+:\d+|failed to initialize rcl: ', '', str(error))
         text = ' '.join(text.split())
         raise ConfigError(f'ROS does not take the arguments: {text}') from None
+
+
+def home_problem(path: str) -> str | None:
+    """Return what is wrong with the home folder with which a path begins, None when nothing is."""
+    try:
+        Path(path).expanduser()
+    except RuntimeError:
+        return f'{path}: there is no such home folder; write the path out'
+    return None
 
 
 def no_parameter(node: Node, name: str) -> str:

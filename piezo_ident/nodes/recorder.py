@@ -25,6 +25,7 @@ from typing import Any
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import Rate
+from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
@@ -81,6 +82,7 @@ class RecorderNode(LabNode):
                 return 'output must name a folder'
             if value.endswith(('.mcap', '.db3')):
                 return f'output must name a folder, without .mcap or .db3, got {value!r}'
+            return home_problem(value)
         return topics_problem(value) if name == 'topics' else None
 
     # services

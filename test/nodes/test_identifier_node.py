@@ -115,6 +115,8 @@ def test_what_cannot_be_done_is_refused_with_the_reason(empty):
         ('thresholds', 401, 'range'),
         ('program', ' ', 'must not be empty'),
         ('sweeps_program', ' ', 'must not be empty'),
+        ('output', ' ', 'blank'),
+        ('output', '~nobody_at_all/x', 'no such home folder'),
         ('model', '/nowhere.yaml', 'no such file'),
         ('model', __file__, 'YAML'),
     ],

@@ -19,6 +19,7 @@ from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
 from piezo_ident.model.files import load
+from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs
@@ -148,6 +149,8 @@ class IdentifierNode(LabNode):
                 settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
             except PiezoIdentError as error:
                 return str(error)
+        if name == 'output':
+            return 'output is blank; name a folder' if value.isspace() else home_problem(value)
         if name == 'channels' and (topics := list(filter(None, value))):
             return topics_problem(topics, name)
         if name.endswith('program') and not value.strip():
