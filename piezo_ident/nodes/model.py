@@ -132,6 +132,9 @@ class ModelNode(LabNode):
             return
         self._source, self._refusal = source, ''
         self._models += 1
+        if self._models > 1:
+            # the state stays what it was
+            self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
         self._error.clear()
 
     def _refuse_model(self, reason: str) -> None:

@@ -307,6 +307,7 @@ def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     assert node.status()['text'] == f'with {file}'
     assert lab.set('model', 'model', str(other)) == (True, '')
     lab.wait(lambda: node.status()['text'] == f'with {other}', 'the other file')
+    lab.wait(lambda: 'model 2 is taken over' in node.log, 'a line of it')
     prediction = lab.collect('prediction')
     lab.matched('prediction')
     send(lab, blocks(1000))
