@@ -22,14 +22,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.results import DelayResult
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
 )
+from piezo_ident.identification.step3_hysteresis import (
+    even_thresholds,
+    factorise,
+    fit_hysteresis,
+)
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 
-__all__ = ['fit_starts', 'lag_of', 'with_starts']
+__all__ = ['fit_starts', 'lag_of', 'with_starts', 'without_harm']
 
 Vector = NDArray[np.float64]
 Rule = Callable[[Vector], Vector]
@@ -44,6 +50,9 @@ PULL = 1e-3
 TURNS = 12
 #: smallest fall of the loss that is worth another turn, as a share of it
 WORTH = 1e-3
+#: a start is left out where H errs so many times more behind it, and what is behind it covers this
+#: share of the voltage
+HARM, ENOUGH = 4.0, 0.8
 
 
 class _Thinned:
@@ -231,6 +240,34 @@ def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
         if rule is not None:
             found[i] = replace(runs[i], memory=rule, known=runs[i].use)
     return found
+
+
+def without_harm(
+    runs: Sequence[Run], excerpts: Sequence[Excerpt], G: Dynamics, found: DelayResult
+) -> tuple[list[Run], list[Excerpt]]:
+    """
+    Return runs and their excerpts without the start where it spoils H behind it.
+
+    Noise at one voltage hardly tells the memory that it starts with, and a wrong one bends all.
+    """
+    known = [replace(e, use=e.use & r.known) for e, r in zip(excerpts, runs, strict=True)]
+    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    enough = all(e.use.any() and np.ptp(e.u[e.use]) > ENOUGH * swing for e in known)
+    pairs = zip(excerpts, known, strict=True)
+    if not enough or all(np.array_equal(a.use, b.use) for a, b in pairs):
+        return list(runs), list(excerpts)
+    r, delay = even_thresholds(swing, COUNT), Delay(found.samples, found.fraction)
+    R = factorise(known, r, G, delay)
+
+    def left(fitted: Sequence[Excerpt]) -> float:
+        n = sum(int(e.use.sum()) for e in fitted)
+        fit = fit_hysteresis(factorise(fitted, r, G, delay), r, n)
+        theta = np.concatenate([fit.offsets, fit.coefficients])
+        return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
+
+    if left(excerpts) < HARM**2 * left(known):
+        return list(runs), list(excerpts)
+    return [replace(run, use=run.use & run.known) for run in runs], known
 
 
 def _rule(u0: float, r: Vector, memory: Vector) -> Rule:

@@ -35,7 +35,7 @@ from piezo_ident.identification.results import (
     silent,
 )
 from piezo_ident.identification.spectra import broadband_response, excited_band
-from piezo_ident.identification.starts import fit_starts, lag_of
+from piezo_ident.identification.starts import fit_starts, lag_of, without_harm
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
 from piezo_ident.identification.step3_choice import third_step
 from piezo_ident.identification.step3_hysteresis import (
@@ -46,7 +46,7 @@ from piezo_ident.identification.step3_hysteresis import (
     HysteresisFit,
 )
 from piezo_ident.identification.three_steps import model_of, within
-from piezo_ident.identification.warnings import warn_of_range, warn_of_zeros
+from piezo_ident.identification.warnings import warn_of_range, warn_of_starts, warn_of_zeros
 from piezo_ident.model.stage_model import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -285,7 +285,7 @@ def fit_unlabelled(
     """
     chosen, parts = fitted_parts(runs, settings)
     joint = joint_fit(chosen, parts, settings, progress)
-    whole = list(joint.excerpts)
+    used, whole = without_harm(chosen, joint.excerpts, joint.G, joint.delay)
     early, late = _early_and_late(whole)
     joint = _simplest(joint, early, late)
     delay = Delay(joint.delay.samples, joint.delay.fraction)
@@ -295,7 +295,7 @@ def fit_unlabelled(
         # a short record has no motion to waste on its own test
         everything = [
             replace(e, use=run.use & (e.use | ~mask))
-            for run, e, mask in zip(chosen, whole, parts, strict=True)
+            for run, e, mask in zip(used, whole, parts, strict=True)
         ]
         hysteresis = _again(judged, everything, joint.G, delay, settings)
     model, tested = (model_of(rate, scaling, h, joint.G, delay) for h in (hysteresis, judged))
@@ -303,7 +303,12 @@ def fit_unlabelled(
     model = within(model, low, high)
     # where two have one name nobody could tell whose start it is
     keys = [key_of(run) for run in runs]
-    own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
+    own = {
+        key_of(run): i
+        for i, run in enumerate(chosen)
+        # a start that was left out is not known
+        if keys.count(key_of(run)) == 1 and used[i] is run
+    }
     memories, at_test = (
         {key: whole[i].start(m.hysteresis.thresholds) for key, i in own.items()}
         for m in (model, tested)
@@ -318,6 +323,7 @@ def fit_unlabelled(
     warnings = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
         f'together on {names}, as the errors say; the weights of H were then fitted to all of it',
+        *warn_of_starts(chosen, used),
         *warn_of_range(chosen, parts, scaling),
         *warn_of_zeros(offsets, scaling),
     ]

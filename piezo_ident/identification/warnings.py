@@ -16,7 +16,7 @@ from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['LAW_WORDS', 'warn_of_range', 'warn_of_zeros', 'warnings_of']
+__all__ = ['LAW_WORDS', 'warn_of_range', 'warn_of_starts', 'warn_of_zeros', 'warnings_of']
 
 #: change of G within the excited band below which the band is too narrow to know G by
 HARDLY = 0.1
@@ -164,4 +164,15 @@ def warn_of_zeros(offsets: Mapping[tuple[str, float], float], scaling: Scaling) 
         'its errors are told without it'
         for (record, _), offset in offsets.items()
         if abs(offset) > ZERO_MOVED * abs(scaling.Y)
+    ]
+
+
+def warn_of_starts(runs: Sequence[Run], used: Sequence[Run]) -> list[str]:
+    """Return a warning where the start of a run was left out of the fit of H."""
+    return [
+        f'{run.record}: H was fitted without its first '
+        f'{np.argmax(left.use) / run.piece.sample_rate:.4g} s; what the stage did before is not '
+        'known, and no guess suits them. Begin with a sweep over the whole range'
+        for run, left in zip(runs, used, strict=True)
+        if not np.array_equal(run.use, left.use)
     ]
