@@ -18,29 +18,43 @@ def course():
         yield g
 
 
+@pytest.fixture(scope='module')
+def driven(course):
+    """Return the graph with an excitation, also where a later test runs alone."""
+    course.start('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 2})
+    return course
+
+
+@pytest.fixture(scope='module')
+def measured(driven):
+    """Return the graph with an excitation and a stage."""
+    driven.start('stage', {'seed': 3})
+    assert driven.set('identifier', 'excitation_limit', 20.0)[0]
+    return driven
+
+
 def test_run_without_an_excitation_fails_with_the_reason(course):
     end = course.finish('identifier/run')
     assert end['state'] == 'failed'
     assert "no excitation offers 'excitation/start' within 1 s" in end['text']
 
 
-def test_run_without_a_stage_fails_with_the_reason(course):
-    course.start('excitation', {'rate_factor': 2.0, 'block_size': 1000, 'subscribers': 2})
+def test_run_without_a_stage_fails_with_the_reason(driven):
+    course = driven
     said = 'no publisher of displacement within 1 s'
     # it may take a moment to know of the excitation
     course.wait(lambda: said in course.finish('identifier/run')['text'], said)
     assert course.status('identifier')['level'] == '2'
 
 
-def test_run_drives_the_excitation_and_identifies(course):
-    course.start('stage', {'seed': 3})
-    assert course.set('identifier', 'excitation_limit', 20.0)[0]
+def test_run_drives_the_excitation_and_identifies(measured):
+    course = measured
     assert course.set('identifier', 'program', 'nonsense')[0]
     end = course.finish('identifier/run')
     assert end['state'] == 'failed' and 'the excitation refuses the program' in end['text']
     assert course.set('identifier', 'program', PROGRAM)[0]
     end = course.finish('identifier/run')
-    assert (end['state'], end['level']) == ('done', '0'), end
+    assert (end['state'], end['level']) == ('done', '0'), end['text']
     states = [s['state'] for s in course.statuses('identifier')]
     assert states.index('exciting') < states.index('identifying') < states.index('done')
     course.wait(lambda: course.texts('model'), 'the model')
@@ -59,7 +73,8 @@ def settling(g):
     return seen
 
 
-def test_cancel_during_the_excitation_ramps_to_rest(course):
+def test_cancel_during_the_excitation_ramps_to_rest(measured):
+    course = measured
     voltage = course.collect('voltage')
 
     def attempt():
@@ -87,7 +102,8 @@ def test_cancel_during_the_excitation_ramps_to_rest(course):
     best_of_three(attempt)
 
 
-def test_the_end_of_the_node_ends_the_excitation(course):
+def test_the_end_of_the_node_ends_the_excitation(measured):
+    course = measured
     voltage, seen = course.collect('voltage'), settling(course)
     assert course.handle('identifier').stop() == 0
     course.wait(
