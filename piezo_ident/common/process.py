@@ -35,6 +35,8 @@ Job = Callable[[Tick], Any]
 
 #: time between two ticks, and time in which a cancelled job may end by itself [s]
 EVERY, GRACE = 0.02, 0.8
+#: time that a killed process may take to be gone [s]
+LAST = 0.3
 
 
 def _view(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -63,7 +65,8 @@ def _receive(channel: Connection) -> Any:
 
 def _end(process: Any, channel: Connection) -> None:
     process.kill()
-    process.join()
+    # one that gives way to all others has to wait for a processor even to die
+    process.join(LAST)
     channel.close()
 
 
