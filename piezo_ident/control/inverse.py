@@ -178,8 +178,11 @@ def invert(
     first = min(lead, int(moves[0]) - 1 if moves.size else lead)
     used = slice(max(first, 0), lead + y.size)
     u, e, t, short = u[used], e[used], t[used], short[used]
-    if short.any() and not clip:
-        raise DataError(_unreached(t[short], s.Y * e[short], (low, high), slew))
+    warnings: tuple[str, ...] = ()
+    if short.any():
+        warnings = (_unreached(t[short], s.Y * e[short], (low, high), slew),)
+        if not clip:
+            raise DataError(*warnings)
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     predicted = s.y(x[used] - e)
     return Inverse(
@@ -192,7 +195,7 @@ def invert(
         passes=passes,
         error=percent_of_stroke(goal, predicted),
         expected=_known_error(model),
-        warnings=(_unreached(t[short], s.Y * e[short], (low, high), slew),) if short.any() else (),
+        warnings=warnings,
     )
 
 

@@ -61,7 +61,7 @@ import scipy
 __all__ = ['first_steps', 'identify']
 
 #: share by which a model may err more without a pair of G that H may stand for
-PAIR = 0.01
+AS_WELL = 0.01
 _UNLABELLED = (
     '{}: no segments are labelled {}; drive the stage with the program identification, or '
     'identify unlabelled data in one go'
@@ -194,7 +194,7 @@ def _labelled(
     if without_pairs(best.model.dynamics, rate).a.size < best.model.dynamics.a.size:
         lean = fitted(*second_step(runs, delay, settings, progress, lean=True), lean=True)
         # H may do as well what the pair does
-        best = lean if lean.left < (1.0 + PAIR) ** 2 * best.left else best
+        best = lean if lean.left < (1.0 + AS_WELL) ** 2 * best.left else best
     runs, fit, held, model = best.runs, best.fit, best.held, best.model
     dynamics, hysteresis = best.dynamics, best.hysteresis
     warnings = []

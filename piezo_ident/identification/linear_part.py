@@ -164,11 +164,7 @@ def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128],
 
 
 def fast_part(G: Dynamics, rate: float, lean: bool = False) -> Dynamics:
-    """
-    Return G with G(1) = 1, without its slow real poles where it can do without them.
-
-    Where `lean`, it goes without the pairs of `without_pairs` too.
-    """
+    """Return G with G(1) = 1, without slow real poles where it can; `lean`, without pairs too."""
     G = without_pairs(G, rate) if lean else G
     return without_slow_part(G, rate) or G.normalised()
 
@@ -185,9 +181,9 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     highest = BELOW_MODES * min(rings, default=0.0)
     for pole in sorted(poles[_between(poles, 0.0, highest, rate)].real, reverse=True):
         size = -np.log(pole) * rate / (2.0 * np.pi)
-        near = zeros[_between(zeros, size / PAIR, size * PAIR, rate)]
+        near = np.flatnonzero(_between(zeros, size / PAIR, size * PAIR, rate))
         if near.size:
-            zeros = np.delete(zeros, np.argmin(np.abs(zeros - near[np.argmin(abs(near - pole))])))
+            zeros = np.delete(zeros, near[np.argmin(np.abs(zeros[near] - pole))])
             poles = np.delete(poles, np.argmin(np.abs(poles - pole)))
     if poles.size == G.a.size:
         return G
@@ -211,16 +207,20 @@ def _supported(G: Dynamics, motion: FastMotion) -> bool:
     ringing = (poles.imag > 0.0) & (np.abs(poles) ** 20 > 0.1) & (height > TALL * abs(G.gain))
     least = 512 * max(1, round(motion.rate / 20_000.0))
     longest = max(e.u.size for e in motion.whole)
+
+    @functools.cache
+    def coherence(size: int) -> Vector | None:
+        sums = [cross_spectra(e.u, e.x, size) for e in motion.whole if e.u.size >= size]
+        if not sums:
+            return None
+        s_uu, s_yy, s_uy = (sum(parts) for parts in zip(*sums, strict=True))
+        return np.asarray(np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, np.finfo(float).tiny))
+
     for pole, frequency in zip(poles[ringing], f[ringing], strict=True):
         # a window that is shorter than the ring sees the answer to what came before it
         size = max(least, min(int(RING_TIMES / (1.0 - np.abs(pole))), longest // FEWEST))
-        sums = [cross_spectra(e.u, e.x, size) for e in motion.whole if e.u.size >= size]
-        if not sums:
-            continue
-        s_uu, s_yy, s_uy = (sum(parts) for parts in zip(*sums, strict=True))
-        coherence = np.abs(s_uy) ** 2 / np.maximum(s_uu * s_yy, np.finfo(float).tiny)
-        k = int(frequency * size / motion.rate)
-        if not (coherence[max(0, k - 1) : k + 3] > COHERENT).any():
+        found, k = coherence(size), int(frequency * size / motion.rate)
+        if found is not None and not (found[max(0, k - 1) : k + 3] > COHERENT).any():
             return False
     return True
 

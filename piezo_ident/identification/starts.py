@@ -258,14 +258,8 @@ def without_harm(
         return list(runs), list(excerpts)
     r, delay = even_thresholds(swing, COUNT), Delay(found.samples, found.fraction)
     R = factorise(known, r, G, delay)
-
-    def left(fitted: Sequence[Excerpt]) -> float:
-        n = sum(int(e.use.sum()) for e in fitted)
-        fit = fit_hysteresis(factorise(fitted, r, G, delay), r, n)
-        theta = np.concatenate([fit.offsets, fit.coefficients])
-        return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
-
-    if left(excerpts) < HARM**2 * left(known):
+    both, alone = (fit_hysteresis(S, r, 1) for S in (factorise(excerpts, r, G, delay), R))
+    if both.left(R) < HARM**2 * alone.left(R):
         return list(runs), list(excerpts)
     return [replace(run, use=run.use & run.known) for run in runs], known
 

@@ -95,10 +95,8 @@ def _held_loss(
 ) -> tuple[float, NDArray[np.float64]]:
     n = int(sum(e.use.sum() for e in fit))
     result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds, n)
-    h = result.hysteresis
-    R = factorise(held, h.thresholds, dynamics, delay)
-    x = np.concatenate([result.offsets, h.weights, [h.p1, h.p2]])
-    return float(np.linalg.norm(R[:, :-1] @ x - R[:, -1])), merged(h)
+    R = factorise(held, thresholds, dynamics, delay)
+    return float(np.sqrt(result.left(R))), merged(result.hysteresis)
 
 
 def choose_thresholds(

@@ -244,6 +244,11 @@ class HysteresisFit:
         """Root mean square of the residual, averaged over the rows of the fit, normalised."""
         return float(np.sqrt(self.loss / self.n))
 
+    def left(self, R: NDArray[np.float64]) -> float:
+        """Return the sum of squares that it leaves of the same runs as `factorise` has them."""
+        theta = np.concatenate([self.offsets, self.coefficients])
+        return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
+
 
 def fit_hysteresis(
     R: NDArray[np.float64],

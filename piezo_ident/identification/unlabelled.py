@@ -174,10 +174,11 @@ def joint_fit(
         for e in excerpts
         if e.use.sum() > 1
     )
+    undone = [H(e.u, e.start(H.thresholds)) for e in excerpts]
     response = broadband_response(
         [
-            (e.u[a:b], H(e.u, e.start(H.thresholds))[a:b], e.x[a:b])
-            for e, run, mask in zip(excerpts, runs, fitted, strict=True)
+            (e.u[a:b], w[a:b], e.x[a:b])
+            for e, w, run, mask in zip(excerpts, undone, runs, fitted, strict=True)
             # a rest before a jump belongs to it
             for a, b in true_runs(run.use & mask)
         ],
@@ -388,9 +389,7 @@ def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]
 
     def error(G: Dynamics, delay: Delay) -> float:
         fit = fit_hysteresis(factorise(early, r, G, delay), r, n)
-        R = factorise(late, r, G, delay)
-        theta = np.concatenate([fit.offsets, fit.coefficients])
-        return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
+        return fit.left(factorise(late, r, G, delay))
 
     if not any(e.use.any() for e in late) or not all(e.use.any() for e in early):
         return joint

@@ -42,7 +42,7 @@ def read_npz(path: Path, options: ReadOptions) -> RecordTable:
             _check_size(sum(info.file_size for info in archive.infolist()))
         with np.load(path, allow_pickle=False) as archive:
             names = archive.files
-            if _needed(options) <= {*names} and not options.columns:
+            if {*names}.issuperset(options.needed) and not options.columns:
                 used = {k: archive[k] for k in names if re.fullmatch(_USED, k)}
                 return _table(used, names, path, options)
             arrays: dict[str, Any] = {}
@@ -63,7 +63,7 @@ def read_mat(path: Path, options: ReadOptions) -> RecordTable:
     if _HDF5 in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
         return read_hdf5(path, options)
     with _damage(path, 'MATLAB file', 'save it again with save -v7'):
-        needed = None if options.columns else sorted(_needed(options))
+        needed = None if options.columns else options.needed
         names, arrays = read_variables(path, _USED, needed)
     return _table(arrays, names, path, options)
 
@@ -150,11 +150,6 @@ def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
 # --- what they share ------------------------------------------------------------------------
 
 
-def _needed(options: ReadOptions) -> set[str]:
-    """Return the names that a file must have to be read as it is."""
-    return {'v', *('t' if options.rate is None else ''), *('' if options.voltage_alone else 'y')}
-
-
 def _library(module: str, path: Path, package: str = '') -> Any:
     try:
         return importlib.import_module(module)
@@ -176,7 +171,7 @@ def _table(
 ) -> RecordTable:
     """Choose the columns among some arrays, and check them."""
     numbers = {k: np.asarray(x) for k, x in arrays.items() if k not in _LABELS}
-    own = _needed(options) <= {*numbers}
+    own = numbers.keys() >= {*options.needed}
     candidates = [k for k, x in numbers.items() if own or _may_be_column(k, x)]
     scalars = {
         k: float(x.ravel()[0]) for k, x in numbers.items() if x.size == 1 and x.dtype.kind in 'iuf'

@@ -23,7 +23,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
-__all__ = ['Choice', 'RecordTable', 'choose', 'is_wanted', 'listed']
+__all__ = ['ChosenColumns', 'RecordTable', 'choose', 'is_wanted', 'listed']
 
 Vector = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class RecordTable:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ChosenColumns:
     """The place of each quantity among the columns, and what else `RecordTable` wants to know."""
 
     places: dict[str, int]
@@ -112,7 +112,7 @@ def choose(
     *,
     scalars: Mapping[str, float] | None = None,
     empty: Iterable[int] = (),
-) -> Choice:
+) -> ChosenColumns:
     """
     Decide which column is which.
 
@@ -168,8 +168,8 @@ def choose(
             free.remove(fitting[0])
     if rate is None and 't' not in {*places, *guessed}:
         rate, origin = _rate_of(scalars or {})
-    needed = ['t'] * (rate is None) + ['v'] + ['y'] * (not options.voltage_alone)
-    missing = [role for role in needed if role not in {*places, *guessed}]
+    known = {*places, *guessed, *('t' if rate is not None else '')}
+    missing = [role for role in options.needed if role not in known]
     if missing:
         raise _missing(missing, names, free, path)
     places |= guessed
@@ -186,7 +186,7 @@ def choose(
             parts.insert(0, f't is k / {rate:.9g} Hz by {origin}')
         action = 'guessed; --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
-    return Choice(
+    return ChosenColumns(
         places,
         tuple(n for i, n in enumerate(names) if n and i not in used),
         {role: unit for role, unit in units.items() if unit},

@@ -100,6 +100,12 @@ class ReadOptions:
             return parse_columns(self.columns)
         return {role: str(name) for role, name in (self.columns or {}).items()}
 
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """What a table must have."""
+        absent = {'t' if self.rate is not None else '', 'y' if self.voltage_alone else ''}
+        return tuple(role for role in 'tvy' if role not in absent)
+
     def unit(self, role: str) -> str | None:
         """Return the unit that is given for ``t``, ``v`` or ``y``."""
         return {'t': self.time_unit, 'v': self.voltage_unit, 'y': self.displacement_unit}[role]
