@@ -37,8 +37,7 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp('whole')
     with Graph() as g:
         g.lines()
-        g.texts('model')
-        g.texts('report')
+        models, reports = g.texts('model'), g.texts('report')
         g.start_all(
             ('excitation', {'subscribers': 3, 'block_size': 500}),
             ('stage', {'seed': 3}),
@@ -48,6 +47,25 @@ def whole(tmp_path_factory):
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
         )
         g.output, g.asked = folder, []
+        # recorded here, for every test of this file may be run alone
+        end = g.finish('recorder/start', 'recording')
+        assert end['state'] == 'recording', end
+        # the recorder is the fourth
+        assert g.set('excitation', 'subscribers', 4)[0]
+        end = g.finish('identifier/run')
+        assert (end['state'], end['level'], end['progress']) == ('done', '0', '100'), end
+        g.wait(lambda: models and reports, 'model and report')
+        g.wait(lambda: g.status('model')['text'] == 'with topic model', 'the model')
+        told = lambda: 'residual_percent' in g.diagnostics('model')  # noqa: E731
+        g.wait(told, 'the live error to be recorded')
+        end = g.finish('recorder/stop')
+        assert end['state'] == 'done', end
+        assert g.set('excitation', 'subscribers', 3)[0]
+        # some values are there only while a stream comes
+        assert g.set('excitation', 'program', HIGH)[0]
+        assert g.call('excitation/start')[0]
+        g.wait(lambda: 'head_room' in g.diagnostics('model'), 'the head-room')
+        assert g.finish('excitation/stop', 'stopped')['state'] == 'stopped'
         yield g
 
 
@@ -64,20 +82,9 @@ def subscribers(g, topic):
 
 
 def test_a_run_through_the_whole_graph(whole):
-    assert whole.finish('recorder/start', 'recording')['state'] == 'recording'
-    # the recorder is the fourth
-    assert whole.set('excitation', 'subscribers', 4)[0]
-    end = whole.finish('identifier/run')
-    assert (end['state'], end['level'], end['progress']) == ('done', '0', '100'), end
-    whole.wait(lambda: whole.texts('model') and whole.texts('report'), 'model and report')
     report = json.loads(whole.texts('report')[-1])
     assert report['data_faults'] == [] and report['delay']['samples'] == 3
     assert model_of(whole.texts('model')[-1]).delay.total == pytest.approx(3, abs=0.1)
-    whole.wait(lambda: whole.status('model')['text'] == 'with topic model', 'the model')
-    told = lambda: 'residual_percent' in whole.diagnostics('model')  # noqa: E731
-    whole.wait(told, 'the live error to be recorded')
-    assert whole.finish('recorder/stop')['state'] == 'done'
-    assert whole.set('excitation', 'subscribers', 3)[0]
     record = pi.read(whole.output / 'bag')
     assert record.n == round(3.37 * 20_000) and record.faults == ()
 
@@ -117,12 +124,15 @@ def test_live_replayed_and_offline_models_are_equal(whole):
         whole.start('player', {'bag': str(bag), 'rate': 4.0}, 'replay', wait=False),
         whole.start('identifier', QUICK, 'replay', wait=False),
     ]
-    assert whole.finish('replay/player/start')['state'] == 'done'
-    assert whole.finish('replay/identifier/identify')['state'] == 'done'
-    whole.wait(lambda: replayed, 'the replayed model')
-    models.append(replayed[-1])
-    for handle in players:
-        assert handle.stop() == 0
+    try:
+        for asked in 'player/start', 'identifier/identify':
+            end = whole.finish(f'replay/{asked}')
+            assert end['state'] == 'done', (asked, end)
+        whole.wait(lambda: replayed, 'the replayed model')
+        models.append(replayed[-1])
+    finally:
+        ended = [handle.stop() for handle in players]
+    assert ended == [0, 0]
     settings = pi.Settings(max_order=6, thresholds=10, solver='swarm')
     offline = numbers(pi.identify(pi.read(bag), settings).model)
     for text in models:
@@ -162,8 +172,6 @@ def test_topics_are_those_of_the_table(whole):
                 assert latched == ('transient local' in t.qos), name
                 assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE, name
             assert found, name
-    # some values are there only while a stream comes
-    whole.wait(lambda: 'head_room' in whole.diagnostics('model'), 'the head-room')
     assert whole.finish('excitation/stop', 'stopped')['state'] == 'stopped'
     # a replay on its way
     assert whole.call('player/start')[0]
@@ -249,6 +257,11 @@ def test_parameters_are_those_of_the_table(whole, node):
 
 @pytest.mark.parametrize('node', NODES)
 def test_the_policy_allows_what_the_node_does_and_no_more(whole, node):
+    if node == 'player':
+        # it publishes what it finds in a bag
+        assert whole.call('player/start')[0]
+        whole.wait(lambda: whole.status('player')['state'] == 'playing', 'the player to play')
+        assert whole.finish('player/stop', 'stopped')['state'] == 'stopped'
     may = {
         right: {re.sub(r'^(?!/)', '/', name.replace('~', f'/{node}')) for name in names}
         for right, names in rights(node).items()
