@@ -24,8 +24,8 @@ from typing import Any
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
-from piezo_ident.nodes.subscriptions import message_class, topics_problem
-from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.nodes.subscriptions import DEPTH, message_class, topics_problem
+from piezo_ident.nodes.wire import LATCHED
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
 from piezo_ident.record.bags.recover import Bag, Stored
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -343,11 +343,12 @@ def _profile(connection: Connection) -> QoSProfile:
     offered = getattr(connection.ext, 'offered_qos_profiles', None) or []
     reliable = all(o.reliability != QosReliability.BEST_EFFORT for o in offered)
     latched = bool(offered) and all(o.durability == QosDurability.TRANSIENT_LOCAL for o in offered)
-    depth = LATCHED.depth if latched else STREAM.depth
     known = [o.depth for o in offered if o.history == QosHistory.KEEP_LAST and o.depth > 0]
+    # a replay may be faster than the recording was, so it keeps as many as its readers do
+    least = LATCHED.depth if latched else DEPTH
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=max(known, default=depth),
+        depth=max([least, *known]),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -31,6 +31,7 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 from std_msgs.msg import Float64MultiArray
 
 __all__ = [
+    'DEPTH',
     'BlockSubscriptions',
     'RawSubscriptions',
     'between_turns',
