@@ -35,7 +35,6 @@ ROOMS = (
     'identification',
     'diagnosis',
     'control',
-    'control',
     'live',
     'report',
     'many',

@@ -166,6 +166,20 @@ cli = Verbs(
             'predict model.yaml scan.csv --out predicted.csv',
         ),
         Verb(
+            'invert',
+            'Find the voltage under which a stage moves as wanted.\n\n'
+            'REFERENCE is a table of t,y: the time and the wanted displacement, at the rate of '
+            'the model.',
+            [options.MODEL, options.REFERENCE],
+            {
+                'Outputs': options.INVERT,
+                'The voltage': options.DRIVE,
+                'How to read the motion': options.MOTION,
+            },
+            'invert model.yaml scan.csv --out drive.csv --plot drive.png',
+            'invert model.yaml scan.csv --displacement-unit um --limits 0 9 --clip',
+        ),
+        Verb(
             'diagnose',
             'Find the effect that a model lacks, and add it.\n\nMODEL is a model file; with '
             f'--each also a folder with one of the name of every record. {RECORD_HELP}',

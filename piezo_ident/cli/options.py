@@ -45,6 +45,16 @@ def _whole(text: str) -> int:
     return int(text)
 
 
+def _speed(text: str) -> float:
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = 0.0
+    if not speed > 0.0:
+        raise click.BadParameter(f'{text!r} is no speed; give volts a second, above 0')
+    return speed
+
+
 def _order(text: str) -> tuple[int, ...]:
     parts = text.split(',')
     if len(parts) != 2:
@@ -111,6 +121,7 @@ OVERWRITE = _flag('--overwrite', 'Replace outputs that exist.')
 
 MODEL, MODEL_FILE = _argument('model', 'MODEL'), _argument('model_file', 'MODEL')
 IN, OUT = _argument('record', 'IN'), _argument('out', 'OUT')
+REFERENCE = _argument('record', 'REFERENCE')
 RECORD, RECORDS = (
     _argument('record', 'RECORD'),
     _argument('records', 'RECORD...', nargs=-1, required=True),
@@ -158,6 +169,29 @@ PREDICT = [
     _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
     _option('--plot', _file, 'PICTURE', 'Picture of measured and predicted.'),
     OVERWRITE,
+]
+
+INVERT = [
+    _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v.'),
+    _option('--plot', _file, 'PICTURE', 'Picture of voltage, wanted and predicted motion.'),
+    OVERWRITE,
+]
+
+#: how a wanted motion is read
+MOTION = [
+    option
+    for option in READING
+    if option.name in ('columns', 'rate', 'time_unit', 'displacement_unit')
+]
+
+DRIVE = [
+    _option(
+        *('--limits', float, 'LO HI', 'Of the voltage [V] (default: the identified range).'),
+        nargs=2,
+        callback=_limits,
+    ),
+    _option('--slew', _speed, 'V/S', 'Largest speed of the voltage (default: any).'),
+    _flag('--clip', 'Come as near as the limits allow, instead of refusing.'),
 ]
 
 

@@ -121,13 +121,13 @@ def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
     """Refuse options that choose topics where no record is a bag, or columns where all are."""
     tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
-        if tables and getattr(args, option) is not None:
+        if tables and getattr(args, option, None) is not None:
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
             )
     bags = all(p.is_dir() or p.suffix.lower() in BAG_FILES for p in paths)
     for option in ('columns', 'rate', 'time_unit', 'voltage_unit'):
-        if bags and getattr(args, option) is not None:
+        if bags and getattr(args, option, None) is not None:
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for tables, and {paths[0]} is a bag; leave it '
                 'out'

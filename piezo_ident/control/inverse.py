@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
+from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.model.metrics import percent_of_stroke
@@ -43,8 +44,8 @@ SHORT = 1e-4
 STILL = 1e-5
 
 
-@dataclass(frozen=True, eq=False)
-class Inverse:
+@dataclass(frozen=True, eq=False, repr=False)
+class Inverse(Showable):
     """
     A voltage, and where it takes the model.
 
@@ -182,7 +183,7 @@ def invert(
     if short.any():
         warnings = (_unreached(t[short], s.Y * e[short], (low, high), slew),)
         if not clip:
-            raise DataError(*warnings)
+            raise DataError(*warnings, options='--clip')
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     predicted = s.y(x[used] - e)
     return Inverse(

@@ -66,7 +66,7 @@ def label_runs(labels: Iterable[str]) -> tuple[list[str], list[int]]:
 
 def assemble(
     t: ArrayLike,
-    v: ArrayLike,
+    v: ArrayLike | None,
     y: ArrayLike | None,
     segments: SegmentStarts | None = None,
     channels: Mapping[str, ArrayLike] | None = None,
@@ -82,8 +82,8 @@ def assemble(
     Parameters
     ----------
     t, v, y : array_like, shape (n,)
-        Time [s], command voltage [V] and displacement [``options.displacement_unit``]; that
-        of the record is NaN where `y` is None.
+        Time [s], command voltage [V] and displacement [``options.displacement_unit``]; NaN in
+        the record where `v` or `y` is None.
     segments : tuple of (names, starts), optional
         Label of each stretch and the row at which it begins; an empty label means none.
     channels : mapping of str to array_like, shape (n,), optional
@@ -128,15 +128,16 @@ def assemble(
 
 def _table(
     t: ArrayLike,
-    v: ArrayLike,
+    v: ArrayLike | None,
     y: ArrayLike | None,
     segments: SegmentStarts | None,
     channels: Mapping[str, ArrayLike],
     name: str,
 ) -> OrderedRows:
     columns = {}
-    given = {'t': t, 'v': v, **({} if y is None else {'y': y}), **channels}
-    for key, values in given.items():
+    for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
+        if values is None:
+            continue
         try:
             columns[key] = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
@@ -187,8 +188,8 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
 
 
 def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: str) -> None:
-    v = table.columns['v']
-    if limits is None or (limits[0] <= v.min() and v.max() <= limits[1]):
+    v = table.columns.get('v')
+    if v is None or limits is None or (limits[0] <= v.min() and v.max() <= limits[1]):
         return
     low, high = limits
     outside = np.flatnonzero((v < low) | (v > high))
@@ -207,7 +208,7 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     if latest > MAX_TIME:
         raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
     moved = {k: high - low for k, (low, high) in ranges.items() if k != 't'}
-    span = moved['v']
+    span = moved.get('v', 0.0)
     idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
     if not (idle or VOLTAGE[0] <= span <= VOLTAGE[1]):
         raise DataError(f'{name}: v spans {span:.3g} V, which is no voltage; write v in volts')
@@ -340,6 +341,5 @@ def _piece(table: OrderedRows, part: tuple[int, int], clock: Clock) -> Piece:
         if segments and segments[-1].label == label and segments[-1].stop == a:
             a = segments.pop().start
         segments.append(Segment(label, a, b))
-    v = columns.pop('v')
-    y = columns.pop('y', np.full(v.size, np.nan))
+    v, y = (columns.pop(role, np.full(stop - start, np.nan)) for role in 'vy')
     return Piece(v, y, clock.sample_rate, clock.start_time, tuple(segments), columns)

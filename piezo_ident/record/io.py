@@ -65,7 +65,8 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         ``columns={'t': 'time_s', 'v': 'voltage', 'y': 'position_um'}``, guessed by the header when
         absent; ``rate=20e3`` where there is no time; ``time_unit='ms'``, ``voltage_unit``,
         ``displacement_unit='um'``; ``voltage_limits=(0, 10)``; ``voltage_alone=True`` for a table
-        without displacement, which is then NaN.  For bags ``namespace``, ``voltage_topic``,
+        without displacement, which is then NaN, and ``displacement_alone=True`` for one without
+        voltage.  For bags ``namespace``, ``voltage_topic``,
         ``displacement_topic``, and ``recover=True`` for an unfinished one.
 
     Returns
@@ -113,12 +114,13 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         factor = UNITS[role].get(table.units.get(role, ''), 1.0)
         if role in columns and factor != 1.0:
             columns[role] = columns[role] / factor
-    v = columns.pop('v')
-    t = columns.pop('t') if table.rate is None else np.arange(v.size) / table.rate
+    v, y = (columns.pop(role, None) for role in 'vy')
+    n = next(x.size for x in (v, y) if x is not None)
+    t = columns.pop('t') if table.rate is None else np.arange(n) / table.rate
     record = assemble(
         t,
         v,
-        columns.pop('y', None),
+        y,
         (table.names, table.starts),
         {name[2:]: x for name, x in columns.items()},
         name=str(path),

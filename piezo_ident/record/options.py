@@ -41,6 +41,8 @@ class ReadOptions:
         Read an unfinished bag as far as it goes instead of refusing it.
     voltage_alone : bool, optional
         Take a table without displacement, as of a planned scan; the displacement is then NaN.
+    displacement_alone : bool, optional
+        Take a table without voltage, as of a motion that is wanted; the voltage is then NaN.
     columns : mapping of str to str, or str, optional
         Name or number (from 1) of the columns ``t``, ``v``, ``y``, ``segment`` and ``x_<name>``;
         those left out are taken by the header.  Also as text, ``'t=time_s,v=voltage'``.
@@ -64,6 +66,7 @@ class ReadOptions:
     displacement_topic: str | None = None
     recover: bool = False
     voltage_alone: bool = False
+    displacement_alone: bool = False
     columns: Mapping[str, str] | str = ''
     rate: float | None = None
     time_unit: str | None = None
@@ -103,8 +106,12 @@ class ReadOptions:
     @property
     def needed(self) -> tuple[str, ...]:
         """What a table must have."""
-        absent = {'t' if self.rate is not None else '', 'y' if self.voltage_alone else ''}
-        return tuple(role for role in 'tvy' if role not in absent)
+        absent = {
+            't': self.rate is not None,
+            'v': self.displacement_alone,
+            'y': self.voltage_alone,
+        }
+        return tuple(role for role in 'tvy' if not absent[role])
 
     def unit(self, role: str) -> str | None:
         """Return the unit that is given for ``t``, ``v`` or ``y``."""

@@ -23,6 +23,9 @@ from piezo_ident.report.table import length, number, plain_text, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from piezo_ident.control.inverse import Inverse
+
+    Result = Identification | Diagnosis | FreeRun | Inverse
 
 __all__ = ['plot', 'save_plot', 'to_html', 'to_text']
 
@@ -31,20 +34,18 @@ ENDINGS = ('.png', '.pdf', '.svg')
 #: dots an inch on a screen
 DPI = 110
 
-Result = Identification | Diagnosis | FreeRun
-
 
 def plot(result: Result | Record) -> Figure:
     """
     Draw the picture that tells most of a result.
 
     Of an identification that is the hysteresis loop, measured and modelled, with the error; of a
-    free run the longest piece over time; of a diagnosis the residual before and after; of a record
-    voltage and displacement over time.
+    free run the longest piece over time; of a diagnosis the residual before and after; of an
+    inverse the voltage and where it leads; of a record voltage and displacement over time.
 
     Parameters
     ----------
-    result : Identification, Diagnosis, FreeRun or Record
+    result : Identification, Diagnosis, FreeRun, Inverse or Record
 
     Returns
     -------
@@ -56,6 +57,7 @@ def plot(result: Result | Record) -> Figure:
         When the result holds no data.
     """
     from piezo_ident.report.figures.diagnosis import worst_pieces
+    from piezo_ident.report.figures.drive import drive_figure
     from piezo_ident.report.figures.free_run import loops_figure, overview_figure, record_figure
     from piezo_ident.report.figures.residual import residual_figure
 
@@ -65,6 +67,8 @@ def plot(result: Result | Record) -> Figure:
         return loops_figure(piece_runs(result.model, result.records, result.memories))
     if isinstance(result, Diagnosis):
         return residual_figure(worst_pieces(result, 1)[0])
+    if not isinstance(result, FreeRun):
+        return drive_figure(result)
     return overview_figure(_longest(result))
 
 
@@ -80,7 +84,7 @@ def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
 
     Parameters
     ----------
-    result : Identification, Diagnosis or FreeRun
+    result : Identification, Diagnosis, FreeRun or Inverse
     path : path
         Ending in .png, .pdf or .svg; an old file is replaced.
 
@@ -120,7 +124,9 @@ def _summary(result: Result | Record) -> tuple[str, Table]:
         return identification.headline(result), identification.brief_table(result)
     if isinstance(result, Diagnosis):
         return diagnosis.headline(result), diagnosis.brief_table(result)
-    return _record(result) if isinstance(result, Record) else _free_run(result)
+    if isinstance(result, Record):
+        return _record(result)
+    return _free_run(result) if isinstance(result, FreeRun) else _drive(result)
 
 
 def _record(record: Record) -> tuple[str, Table]:
@@ -146,3 +152,19 @@ def _free_run(result: FreeRun) -> tuple[str, Table]:
     rows += [('samples', str(errors.n))]
     rows += [('warning', warning) for warning in result.warnings]
     return f'{text} ({FORMULA}).', Table('Free run', ('', ''), rows)
+
+
+def _drive(result: Inverse) -> tuple[str, Table]:
+    rows = [('voltage', f'{result.v.min():.4g} .. {result.v.max():.4g} V')]
+    lead = 1e3 * float(result.t[result.lead] - result.t[0])
+    rows += [('begins', f'{lead:.4g} ms before the motion')] if lead else []
+    rows += [('left by the inversion', f'{number(result.error)} % of stroke')]
+    expected = 'unknown, the model holds no error on data it was not fitted to'
+    if result.expected is not None:
+        rms = length(0.01 * result.expected * float(np.ptp(result.wanted)))
+        expected = f'{number(result.expected)} % of stroke, {rms} rms, as the model errs elsewhere'
+    rows += [('expected', expected)]
+    rows += [('warning', warning) for warning in result.warnings]
+    rows += [('% of stroke', FORMULA)]
+    text = f'A voltage of {result.v.size} samples moves {length(float(np.ptp(result.wanted)))}.'
+    return text, Table('Drive', ('', ''), rows)

@@ -1,0 +1,97 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``invert``: the voltage under which a stage moves as wanted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from piezo_ident.cli.console import Console, deferred_interrupts
+from piezo_ident.cli.outputs import check_distinct, check_file, check_suffix
+from piezo_ident.cli.predict_command import PICTURES, TABLE_FILES
+from piezo_ident.cli.records import check_order, naming, print_faults, read_all
+from piezo_ident.common.errors import DataError
+from piezo_ident.common.files import temporary_output
+from piezo_ident.control.inverse import invert
+from piezo_ident.model.files import load
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.io import WRITERS
+from piezo_ident.record.record import Piece, Record
+
+__all__ = ['invert_command']
+
+
+def invert_command(args: SimpleNamespace, console: Console) -> None:
+    """``piezo_ident invert``."""
+    for path, suffixes, what in (
+        (args.out, TABLE_FILES, 'a voltage'),
+        (args.plot, PICTURES, 'a picture'),
+    ):
+        if path is not None:
+            check_suffix(path, suffixes, what)
+            check_distinct(path, [args.model, args.record])
+            check_file(path, overwrite=args.overwrite)
+    check_order(args.model, args.record, 'invert')
+    model = load(args.model)
+    (reference,) = read_all([args.record], args, console, displacement_alone=True)
+    piece = _whole(reference, model)
+    with naming(str(args.record)):
+        drive = invert(
+            replace(model, sample_rate=piece.sample_rate),
+            piece.y,
+            limits=args.limits,
+            slew=args.slew or np.inf,
+            clip=args.clip,
+            channels=piece.channels,
+        )
+    console.say(f'{args.model}, told to move as {reference.name}:')
+    console.say(str(drive))
+    with deferred_interrupts():
+        if args.out is not None:
+            columns = {'t': piece.start_time + drive.t, 'v': drive.v}
+            with temporary_output(args.out, overwrite=True) as target, target.open('xb') as file:
+                WRITERS[args.out.suffix.lower()](file, lambda: iter([columns]), (), ())
+        if args.plot is not None:
+            from piezo_ident.report import save_plot
+
+            save_plot(drive, args.plot)
+    print_faults(reference, (), console)
+    files: dict[str, Path | None] = {'out': args.out, 'plot': args.plot}
+    for path in filter(None, files.values()):
+        console.say(f'wrote {path}')
+    console.result(
+        {
+            'model': str(args.model),
+            'reference': str(args.record),
+            'formula': FORMULA,
+            'percent_of_stroke': drive.error,
+            'expected_percent_of_stroke': drive.expected,
+            'lead': drive.lead,
+            'clipped': int(np.count_nonzero(drive.clipped)),
+            'voltage_range': [float(drive.v.min()), float(drive.v.max())],
+            'steepest': float(np.abs(np.diff(drive.v)).max()) * model.sample_rate,
+            'warnings': list(drive.warnings),
+            **{key: path and str(path) for key, path in files.items()},
+        }
+    )
+
+
+def _whole(reference: Record, model: StageModel) -> Piece:
+    """Return a reference that is one piece at the rate of the model, or refuse it."""
+    (piece, *more) = reference
+    if more:
+        raise DataError(
+            f'{reference.name}: its time jumps, or its rate changes, {len(more)} times; a wanted '
+            'motion is one piece'
+        )
+    if not model.takes(piece):
+        raise DataError(
+            f'{reference.name}: is sampled at {piece.sample_rate:g} Hz, the model at '
+            f'{model.sample_rate:g} Hz; write the motion at the rate of the model'
+        )
+    return piece
