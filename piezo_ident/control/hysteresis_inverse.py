@@ -5,10 +5,10 @@
 The inverse of H: the voltage under which H is what is wanted, sample by sample.
 
 Between two samples H is a function of the new voltage alone, and a rising one where H has an
-inverse.  So each sample is a root of one unknown, which a bracketed secant finds to the last
-digits from the sample before; the plays then move on, as under the voltage that was found.  That
-serves every law of H alike.  For a sum of plays without a cubic the inverse is a sum of plays
-again: K. Kuhnen, "Modeling, identification and compensation of complex hysteretic nonlinearities",
+inverse.  So each sample is a root of one unknown, which Newton's steps within a bracket find from
+the sample before; the plays then move on, as under the voltage that was found.  That serves every
+law of H alike.  For a sum of plays without a cubic the inverse is a sum of plays again:
+K. Kuhnen, "Modeling, identification and compensation of complex hysteretic nonlinearities",
 European Journal of Control 9(4), 2003, doi:10.3166/ejc.9.407-418.
 """
 
@@ -17,9 +17,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.common.kernel import ordered_kernel
+from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.kernels import hysteresis, relaxing, wide_hysteresis
+from piezo_ident.operators.kernels import curve, held, relaxing
 
 __all__ = ['HysteresisInverse']
 
@@ -27,37 +27,62 @@ Array = NDArray[np.float64]
 
 #: difference of H from what is wanted that is none, normalised
 NONE = 1e-13
-#: evaluations of H between two ends, at most
+#: evaluations of H for a sample, at most
 TRIALS = 80
-#: change of the voltage, and slope, below which a secant says nothing
+#: slope of H below which a step says nothing
 FLAT = 1e-6
 
 
-@ordered_kernel
-def _value(
+@kernel
+def _plays(
     u: float,
     r: Array,
     q: Array,
-    p1: float,
-    p2: float,
-    p0: float,
-    low: float,
-    c: Array,
-    lags: Array,
     memory: Array,
     after: Array,
-) -> float:
-    """Return H at its next voltage u, and the memory after it in `after`."""
-    one, w = np.empty(1), np.empty(1)
-    one[0] = u
-    after[:] = memory
-    if c.shape[0] == 0:
-        hysteresis(one, r, q, p1, p2, after[: r.size], w)
-    else:
-        wide_hysteresis(one, r, q, p1, p2, p0, low, c, after[: r.size], w)
-    if lags.shape[0]:
-        relaxing(one, lags, after[r.size :], w)
-    return float(w[0])
+) -> tuple[float, float]:
+    """Return what the plays of H add at u, and its slope; `after` takes their outputs."""
+    w, slope = 0.0, 0.0
+    for i in range(r.size):
+        f = held(memory[i], u - r[i], u)
+        after[i] = f
+        w += q[i] * f
+        slope += 0.0 if f == memory[i] else q[i]
+    return w, slope
+
+
+@kernel
+def _wide_plays(
+    u: float,
+    r: Array,
+    q: Array,
+    low: float,
+    c: Array,
+    memory: Array,
+    after: Array,
+) -> tuple[float, float]:
+    """Do as `_plays`, with curves and bias."""
+    w, slope = 0.0, 0.0
+    for i in range(r.size):
+        f = held(memory[i], u - r[i], u)
+        after[i] = f
+        t = f - low
+        w += q[i] * f + c[3, i] * (u - low) * t + curve(c, i, t)
+        bent = t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
+        rise = q[i] + c[3, i] * (u - low) + (bent if 0.0 < t < c[4, i] else 0.0)
+        slope += c[3, i] * t + (0.0 if f == memory[i] else rise)
+    return w, slope
+
+
+@ordered_kernel
+def _lags(u: float, up: bool, lags: Array, z: Array) -> float:
+    """Return the slope of what the lags z along the path add at u, upwards or down."""
+    slope = 0.0
+    for j in range(lags.shape[0]):
+        a, d1, d2, d3 = lags[j, 0], lags[j, 1], lags[j, 2], lags[j, 3]
+        behind = u * (d1 + u * (d2 + u * d3)) - z[j]
+        slope += (a if up else -a) * behind - (d1 + u * (2.0 * d2 + u * 3.0 * d3))
+    return slope
 
 
 @ordered_kernel
@@ -84,42 +109,52 @@ def _invert(
 
     `last` holds the voltage and H before, and a slope of H; it is carried on with `memory`.
     """
-    after = np.empty(memory.size)
-    slope = last[2]
+    after, one, value = memory.copy(), np.empty(1), np.empty(1)
+    u, w, slope = last[0], last[1], last[2]
     for k in range(wanted.size):
-        goal = wanted[k]
-        near, f_near = last[0], last[1] - goal
-        u, f = near, f_near
-        if abs(f_near) > NONE:
-            bound = min(most, near + step) if f_near < 0.0 else max(least, near - step)
-            far, f_far = near - f_near / slope, f_near
-            while True:
-                if (far - bound) * f_near <= 0.0:
-                    far = bound
-                f_far = _value(far, r, q, p1, p2, p0, low, c, lags, memory, after) - goal
-                if far == bound or f_far * f_near <= 0.0:
+        goal, start = wanted[k], u
+        f = w - goal
+        if abs(f) > NONE:
+            # between these lies the voltage, open where H was not asked yet
+            below, above = max(least, start - step), min(most, start + step)
+            if f < 0.0:
+                below = start
+            else:
+                above = start
+            before = 2.0 * abs(f)
+            for _ in range(TRIALS):
+                # Newton's step, to an end where it leads beyond, to the middle where it is slow
+                new = u - f / slope
+                if abs(f) > 0.5 * before and above - below < np.inf:
+                    new = 0.5 * (below + above)
+                new = min(max(new, below), above)
+                if new == u:
                     break
-                width = far - near
-                near, f_near = far, f_far
-                far = near + 2.0 * width
-            u, f = far, f_far
-            if f_far * f_near < 0.0:
-                # the secant of Illinois: the value at an end that stays is halved
-                for _ in range(TRIALS):
-                    if abs(f) <= NONE or near == far:
-                        break
-                    u = far - f_far * (far - near) / (f_far - f_near)
-                    f = _value(u, r, q, p1, p2, p0, low, c, lags, memory, after) - goal
-                    if f * f_far < 0.0:
-                        near, f_near = far, f_far
-                    else:
-                        f_near *= 0.5
-                    far, f_far = u, f
-            memory[:] = after
-            if abs(u - last[0]) > FLAT:
-                slope = max((f + goal - last[1]) / (u - last[0]), FLAT)
-        out[k], reached[k] = u, f + goal
-        last[0], last[1], last[2] = u, f + goal, slope
+                before, u = abs(f), new
+                if c.shape[0] == 0:
+                    w, slope = _plays(u, r, q, memory, after)
+                else:
+                    w, slope = _wide_plays(u, r, q, low, c, memory, after)
+                w += ((p1 * u + p0) * u + p2) * u
+                slope += (3.0 * p1 * u + 2.0 * p0) * u + p2
+                if lags.shape[0]:
+                    one[0], value[0] = u, w
+                    after[r.size :] = memory[r.size :]
+                    relaxing(one, lags, after[r.size :], value)
+                    w = value[0]
+                    slope += _lags(u, u > start, lags, after[r.size :])
+                f = w - goal
+                slope = max(slope, FLAT)
+                if f < 0.0:
+                    below = u
+                else:
+                    above = u
+                if abs(f) <= NONE:
+                    break
+            for i in range(memory.size):
+                memory[i] = after[i]
+        out[k], reached[k] = u, w
+    last[0], last[1], last[2] = u, w, slope
 
 
 class HysteresisInverse:
