@@ -24,7 +24,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
-from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from scipy.optimize import brentq
 
@@ -67,8 +67,8 @@ class Inverse(Showable):
     error : float
         100 rms(wanted - predicted) / (max wanted - min wanted): what the inversion leaves.
     expected : float or None
-        The error [% of stroke] of the model on data it was not fitted to, if it is known: the
-        stage will err by about as much.
+        The error of the model [% of stroke], as of its diagnosis or its identification, if it is
+        known: the stage will err by about as much.
     warnings : tuple of str
 
     Examples
@@ -195,7 +195,7 @@ def invert(
         clipped=short,
         passes=passes,
         error=percent_of_stroke(goal, predicted),
-        expected=_known_error(model),
+        expected=expected_error(model),
         warnings=warnings,
     )
 
@@ -238,10 +238,3 @@ def _unreached(t: Array, e: Array, limits: tuple[float, float], slew: float) -> 
         f'reach within {limits[0]:g} .. {limits[1]:g} V{speed}: by up to '
         f'{1e6 * float(np.abs(e).max()):.3g} um'
     )
-
-
-def _known_error(model: StageModel) -> float | None:
-    """Return the error of a model on data it was not fitted to, % of stroke, if it is known."""
-    errors = model.identification.get('errors')
-    known = errors.get('selection') if isinstance(errors, Mapping) else None
-    return float(known) if isinstance(known, int | float) else None

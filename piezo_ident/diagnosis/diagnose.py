@@ -240,7 +240,8 @@ def _diagnosed(
             selected.fitted.held_out_residual(rows, rows.group),
         )
     )
-    refined = refine(simulator, given, selected.fitted, findings)
+    overall = before.overall, after.overall
+    refined = refine(simulator, given, selected.fitted, findings, overall)
     if refined.is_given:
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)

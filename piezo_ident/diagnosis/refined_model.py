@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.joint_fit import Fitted
+from piezo_ident.diagnosis.results import FORMULA
 from piezo_ident.diagnosis.rows import means, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
@@ -45,8 +46,18 @@ def lasting(effects: tuple[str, ...]) -> list[str]:
     return [name for name in effects if not find_effect(name).time_driven]
 
 
-def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Findings) -> Refined:
-    """Return the model that the user gets, from a refit with what was found."""
+def refine(
+    simulator: Simulator,
+    given: State,
+    fitted: Fitted,
+    findings: Findings,
+    errors: tuple[float, float],
+) -> Refined:
+    """
+    Return the model that the user gets, from a refit with what was found.
+
+    `errors` are those of the model as given and of the refit, which the file will tell.
+    """
     rows, model = simulator.rows, simulator.model
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
@@ -70,10 +81,13 @@ def refine(simulator: Simulator, given: State, fitted: Fitted, findings: Finding
         )
         state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
         return Refined(
-            _model(simulator, state, findings, model.scaling.range), fitted.state, metres
+            # what the model leaves out was there, and will be
+            _model(simulator, state, findings, model.scaling.range, errors[:1]),
+            fitted.state,
+            metres,
         )
     return Refined(
-        _model(simulator, fitted.state, findings, _range(simulator)), fitted.state, metres
+        _model(simulator, fitted.state, findings, _range(simulator), errors), fitted.state, metres
     )
 
 
@@ -119,7 +133,11 @@ def _range(simulator: Simulator) -> tuple[float, float]:
 
 
 def _model(
-    simulator: Simulator, state: State, findings: Findings, span: tuple[float, float]
+    simulator: Simulator,
+    state: State,
+    findings: Findings,
+    span: tuple[float, float],
+    errors: tuple[float, ...],
 ) -> StageModel:
     """Return the model of a state, in the record that holds the most rows, and its range."""
     rows = simulator.rows
@@ -135,6 +153,11 @@ def _model(
             'verdict': findings.verdict,
             'effects': list(findings.effects),
             'records': list(rows.names),
+            'errors': {
+                'unit': '% of stroke',
+                'formula': FORMULA,
+                **dict(zip(('before', 'after'), map(float, errors), strict=False)),
+            },
         },
     }
     return replace(model, scaling=moved, identification=provenance)

@@ -26,7 +26,7 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Predictor', 'TurningPoints', 'expected_error', 'warm_up']
+__all__ = ['Predictor', 'TurningPoints', 'warm_up']
 
 #: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
@@ -148,17 +148,6 @@ class TurningPoints:
             parts_t.append(t)
             parts_v.append(v)
         return np.concatenate(parts_t), np.concatenate(parts_v)
-
-
-def expected_error(model: StageModel) -> float | None:
-    """Return the error at identification [% of stroke], on held-out data where there are any."""
-    errors = model.identification.get('errors')
-    if isinstance(errors, dict):
-        for data in ('held_out', 'selection', 'fitted'):
-            value = errors.get(data)
-            if isinstance(value, (int, float)) and 0.0 < value < float('inf'):
-                return float(value)
-    return None
 
 
 class Predictor:

@@ -5,13 +5,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import robust_range
 
-__all__ = ['FORMULA', 'fit_percent', 'nrmse_fit', 'percent', 'percent_of_stroke', 'strokes']
+if TYPE_CHECKING:
+    from piezo_ident.model.stage_model import StageModel
+
+__all__ = [
+    'FORMULA',
+    'expected_error',
+    'fit_percent',
+    'nrmse_fit',
+    'percent',
+    'percent_of_stroke',
+    'strokes',
+]
 
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
@@ -88,3 +100,25 @@ def fit_percent(y: Vector, y_hat: Vector) -> float:
         Measured and simulated displacement, same unit.
     """
     return nrmse_fit(float(np.linalg.norm(y - y_hat)), float(np.linalg.norm(y - y.mean())))
+
+
+def expected_error(model: StageModel) -> float | None:
+    """
+    Return the error to expect of a model in free run [% of stroke], None where it is not known.
+
+    Of a refined model that of its diagnosis, on kinds of motion that were held out; else that of
+    its identification, on data as far from the fit as there are.
+    """
+    found = model.identification
+    diagnosis = found.get('diagnosis')
+    places = (
+        (diagnosis.get('errors') if isinstance(diagnosis, Mapping) else None, ('after', 'before')),
+        (found.get('errors'), ('validation', 'held_out', 'selection', 'fitted')),
+    )
+    for errors, kinds in places:
+        known = errors if isinstance(errors, Mapping) else {}
+        for kind in kinds:
+            value = known.get(kind)
+            if isinstance(value, int | float) and 0.0 < value < float('inf'):
+                return float(value)
+    return None

@@ -17,9 +17,9 @@ import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
-from piezo_ident.live.predictor import expected_error, Predictor, warm_up
+from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.files import load, model_from_dict
-from piezo_ident.model.metrics import percent
+from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message

@@ -31,6 +31,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
+from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
@@ -286,9 +287,10 @@ def test_hum_stays_in_its_record(truths):
 
 def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
     model, record, _ = measured('creep', 0.3, 1)
-    refined = diagnose(model, record, FEW).model
-    again = model_from_dict(model_to_dict(refined))
+    first = diagnose(model, record, FEW)
+    again = model_from_dict(model_to_dict(first.model))
     assert [e.name for e in again.effects] == ['creep']
+    assert expected_error(again) == first.after.overall < expected_error(model)
     second = diagnose(again, record, FEW)
     assert second.verdict == 'none', second.sentence
     assert second.before.overall < 0.1

@@ -7,7 +7,7 @@
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.monitor import LiveError, Matcher, Preview
-from piezo_ident.live.predictor import expected_error, Predictor, TurningPoints
+from piezo_ident.live.predictor import Predictor, TurningPoints
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -226,14 +226,6 @@ def test_another_sampling_rate_is_refused():
     other.set_model(model(rate=20_000.0))
     assert other.process(cut(drive(300))[0]) is None
     assert 'identify a model at the rate of the stream' in other.problem
-
-
-def test_expected_error_prefers_what_was_held_out():
-    assert expected_error(model()) is None
-    errors = {'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'unit': '% of stroke'}
-    assert expected_error(model(identification={'errors': errors})) == 0.3
-    del errors['held_out']
-    assert expected_error(model(identification={'errors': errors})) == 0.2
 
 
 def block(first, n, value=0.0):

@@ -3,10 +3,13 @@
 
 """The error numbers against their formulas."""
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
-from piezo_ident.model.metrics import fit_percent, percent_of_stroke
+from paper_stage import PAPER
+from piezo_ident.model.metrics import expected_error, fit_percent, percent_of_stroke
 import pytest
 
 Y = np.array([0.0, 1.0, 2.0, 4.0])
@@ -43,3 +46,20 @@ def test_percentages_do_not_depend_on_the_unit(scale, shift, errors):
     one, two = (Y, Y + e), (scale * (Y + shift), scale * (Y + e + shift))
     assert percent_of_stroke(*two) == pytest.approx(percent_of_stroke(*one), rel=1e-6, abs=1e-9)
     assert fit_percent(*two) == pytest.approx(fit_percent(*one), rel=1e-6, abs=1e-6)
+
+
+def of(**identification):
+    return expected_error(replace(PAPER, identification=identification))
+
+
+def test_expected_error_is_that_of_data_as_far_from_the_fit_as_there_are():
+    assert of() is None
+    assert of(errors='none', diagnosis='none') is None
+    errors = {'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'unit': '% of stroke'}
+    assert of(errors=errors) == 0.3
+    assert of(errors={'fitted': 0.1, 'selection': 0.2}) == 0.2
+    assert of(errors={'fitted': 0.1, 'held_out': float('nan')}) == 0.1
+    # of a refined model, that of the model that it was no more
+    assert of(errors=errors, diagnosis={'errors': {'before': 0.5, 'after': 0.05}}) == 0.05
+    assert of(errors=errors, diagnosis={'errors': {'before': 0.5}}) == 0.5
+    assert of(errors=errors, diagnosis={'verdict': 'named'}) == 0.3
