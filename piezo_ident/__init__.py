@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     )
     from piezo_ident.control.inverse import Inverse, invert
     from piezo_ident.control.learning import Learning
+    from piezo_ident.control.live_inverse import LiveInverse
     from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
@@ -61,6 +62,7 @@ _HOMES = {
     'IdentificationError': 'common.errors',
     'Inverse': 'control.inverse',
     'Learning': 'control.learning',
+    'LiveInverse': 'control.live_inverse',
     'ModelError': 'common.errors',
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
@@ -93,6 +95,7 @@ __all__ = [
     'IdentificationError',
     'Inverse',
     'Learning',
+    'LiveInverse',
     'ModelError',
     'PiezoIdentError',
     'Program',

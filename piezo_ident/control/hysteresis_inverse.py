@@ -205,13 +205,22 @@ class HysteresisInverse:
 
     def reset(self, u0: float) -> float:
         """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
-        h, m = self.hysteresis, self.hysteresis.thresholds.size
+        h = self.hysteresis
         w, memory = h.follow(np.array([u0]), h.initial_memory(u0))
-        self._memory = np.concatenate(
-            [memory[:m], np.zeros(self._parameters[0].size - m), memory[m:]]
-        )
-        self._last = np.array([u0, w[0], 1.0])
+        self._take(memory, np.array([u0, w[0], 1.0]))
         return float(w[0])
+
+    def follow(self, u: Array) -> None:
+        """Take the plays along under voltages that something else applied, shape (n,)."""
+        m, lanes = self.hysteresis.thresholds.size, self._parameters[0].size
+        memory = np.concatenate([self._memory[:m], self._memory[lanes:]])
+        w, memory = self.hysteresis.follow(u, memory)
+        self._take(memory, np.array([u[-1], w[-1], self._last[2]]))
+
+    def _take(self, memory: Array, last: Array) -> None:
+        m, lanes = self.hysteresis.thresholds.size, self._parameters[0].size
+        self._memory = np.concatenate([memory[:m], np.zeros(lanes - m), memory[m:]])
+        self._last = last
 
     def process(self, w: Array) -> tuple[Array, Array]:
         """

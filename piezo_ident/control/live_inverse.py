@@ -1,0 +1,384 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The voltage under which a model goes where it is told, while it is told: block by block.
+
+The offline inverse repeats one pass over the whole motion,
+
+    w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
+
+and Q looks ahead by a few samples alone.  So pass after pass may run behind the one before it by
+as many samples: each has its own H^-1 and its own model, which run once over every sample, and
+nothing is done twice.  That is the offline iteration, sample by sample, but for the ends of Q that
+do not fit into the preview; what they cost is tried out beforehand and told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.inverse import SHORT
+from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse
+from piezo_ident.effects import find_effect
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['PREVIEW', 'Driven', 'LiveInverse']
+
+Array = NDArray[np.float64]
+
+#: samples that a wanted motion is known ahead
+PREVIEW = 400
+#: passes that are tried
+MOST_PASSES = 4
+#: share of the error that one more pass must leave at most
+WORTH = 0.7
+#: what Q may miss before the present sample, as a share of the sum of its magnitudes, and its most
+#: samples there
+OUTSIDE, LONGEST = 1e-6, 8192
+#: share of a delay that a preview must exceed for Q to be worth anything
+BEYOND = 1.2
+#: error of the trial [% of stroke] from which the preview is called short
+LARGE = 0.1
+#: trial motion: samples, periods [samples] and amplitudes [of the range] of its sines
+TRIAL, SINES = 6000, ((2000.0, 0.3), (400.0, 0.08))
+
+
+class Driven(NamedTuple):
+    """
+    What leaves for a block of a wanted motion.
+
+    Attributes
+    ----------
+    v : ndarray, shape (n,)
+        Voltage [V].
+    clipped : ndarray of bool, shape (n,)
+        Where a limit keeps the voltage from what the motion wants.
+    """
+
+    v: Array
+    clipped: NDArray[np.bool_]
+
+
+class LiveInverse:
+    """
+    The inverse of a model, block by block.
+
+    The stage rests at `rest` before the first block, and the wanted motion with it, at `position`.
+    Each sample of a wanted motion gives one of voltage; the stage is there `preview` samples
+    later.
+
+    Parameters
+    ----------
+    model : StageModel
+    limits : tuple of float, optional
+        Lowest and highest voltage [V]; the identified range when absent.
+    slew : float, optional
+        Largest speed of the voltage [V/s].
+    preview : int, optional
+        Samples that the wanted motion is known ahead.
+    rest : float, optional
+        Voltage before the first block [V]; the lower limit when absent.
+
+    Attributes
+    ----------
+    preview, passes : int
+        Samples ahead, and passes that share them.
+    error : float
+        100 rms(wanted - reached) / (max wanted - min wanted) [%] of the model itself on a trial
+        motion of two slow sines: what the finite preview and the passes leave.
+    position : float
+        Displacement of the stage at rest [m].
+    warnings : tuple of str
+
+    Raises
+    ------
+    DataError
+        When the limits are crossed, or rest lies outside of them.
+    ModelError
+        When the model has no inverse, or the preview does not reach beyond its delay.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> live = pi.LiveInverse(model)
+    >>> wanted = live.position + 20e-6 * (1 - np.cos(np.arange(4000) / 200))
+    >>> v = np.concatenate([live.process(wanted[k : k + 100]).v for k in range(0, 4000, 100)])
+    >>> y = model.simulate(v)
+    >>> bool(np.abs(y[live.preview :] - wanted[: -live.preview]).max() < 2e-9)
+    True
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        *,
+        limits: tuple[float, float] | None = None,
+        slew: float = np.inf,
+        preview: int = PREVIEW,
+        rest: float | None = None,
+    ) -> None:
+        low, high = model.scaling.range if limits is None else limits
+        self._rest = low if rest is None else float(rest)
+        if not (low < high and slew > 0.0 and low <= self._rest <= high):
+            raise DataError(
+                'live inverse: give limits as (lowest, highest) voltage with rest between them, '
+                'and a slew above zero'
+            )
+        self.model, self.warnings = _without_channels(model)
+        self.preview = int(preview)
+        self._limits, self._slew = (float(low), float(high)), float(slew)
+        if self.preview < BEYOND * model.total_delay.total or self.preview < 1:
+            raise ModelError(
+                f'a preview of {preview} samples does not reach beyond the delay of the model, '
+                f'{model.total_delay.total:g} samples; make it longer'
+            )
+        self._filter = linear_inverse(self.model)
+        self.passes, self.error = self._tried()
+        if self.error > LARGE:
+            self.warnings += (
+                f'a preview of {preview} samples in {self.passes} passes leaves '
+                f'{self.error:.2g} % of stroke on a slow motion, were the model exact; '
+                f'{MOST_PASSES * self._filter.ahead} are enough for anything',
+            )
+        self._passes = self._built(self.passes, self._slew)
+        self.reset()
+
+    def _built(self, passes: int, slew: float) -> list[_Pass]:
+        """Return passes that share the preview."""
+        s, rate = self.model.scaling, self.model.sample_rate
+        bounds = float(s.u(self._limits[0])), float(s.u(self._limits[1]))
+        Q = _shortened(self._filter, self.preview // passes)
+        waits = [self.preview - passes * Q.ahead] + [0] * (passes - 1)
+        return [
+            _Pass(
+                self.model,
+                HysteresisInverse(self.model.hysteresis, bounds, slew / s.V / rate),
+                Q,
+                wait,
+                passes - 1 - k,
+                k == 0,
+            )
+            for k, wait in enumerate(waits)
+        ]
+
+    def _tried(self) -> tuple[int, float]:
+        """Return the number of passes that is best on a trial motion, and the error it leaves."""
+        stream = self.model.stream()
+        low, high, rest = (stream.reset(v) for v in (*self._limits, self._rest))
+        k = np.arange(TRIAL)
+        motion = sum(a * np.sin(2 * np.pi * k / period) for period, a in SINES)
+        fade = 0.5 - 0.5 * np.cos(np.pi * np.minimum(k / SINES[0][0], 1.0))
+        wanted = rest + fade * (0.5 * (low + high) - rest + (high - low) * motion)
+        best, least = 1, np.inf
+        for passes in range(1, MOST_PASSES + 1):
+            if self.preview < BEYOND * passes * self.model.total_delay.total:
+                break
+            self._passes = self._built(passes, np.inf)
+            self.reset()
+            v = self.process(np.append(wanted, np.full(self.preview, wanted[-1]))).v
+            error = percent_of_stroke(wanted, self.model.stream().process(v)[self.preview :])
+            if not error < WORTH * least:
+                break
+            best, least = passes, error
+        return best, least
+
+    def reset(self) -> None:
+        """Come to rest, with the clock of the voltage at zero."""
+        self.position = float(np.mean([p.reset(self._rest) for p in self._passes]))
+
+    def recall(self, v: Array, t: Array) -> None:
+        """
+        Bring amplifier and plays into their state after a past voltage; the rest is at rest.
+
+        Parameters
+        ----------
+        v, t : ndarray, shape (n,)
+            Voltage [V] and time [s]; the stage was at rest before the first sample.
+        """
+        for p in self._passes:
+            p.recall(v, t)
+
+    def follow(self, v: Array, tick: int = 0) -> None:
+        """
+        Take the model along under a voltage that something else applied, up to now.
+
+        The wanted motion is then taken to have been what the model makes of that voltage, and is
+        `position` now.  The first `preview` samples that come next give no voltage yet.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n,)
+            [V]
+        tick : int, optional
+            Samples since the clock of the voltage was zero, at the first one.
+        """
+        for p in self._passes:
+            y = p.follow(v, tick)
+        self.position = float(y[-1])
+
+    def process(self, wanted: ArrayLike) -> Driven:
+        """
+        Return the voltage for the next samples of a wanted motion.
+
+        Parameters
+        ----------
+        wanted : array_like, shape (n,)
+            Displacement [m].
+
+        Returns
+        -------
+        Driven
+            Of as many samples; after `follow`, of `preview` fewer.
+
+        Raises
+        ------
+        DataError
+            When the wanted motion is no vector of finite numbers.
+        """
+        y = np.asarray(wanted, dtype=np.float64)
+        if y.ndim != 1 or not np.isfinite(y).all():
+            raise DataError(
+                'live inverse: the wanted motion must be a vector of finite numbers, in metres'
+            )
+        s = self.model.scaling
+        x = d = s.x(y)
+        w = np.full(x.size, self._passes[0].origin)
+        for p in self._passes:
+            x, d, w, u, short = p.process(x, d, w)
+        return Driven(np.clip(s.v0 + s.V * u, *self._limits), short)
+
+
+class _Pass:
+    """
+    One pass of the iteration: its filter, its H^-1 and its model, a little behind the one before.
+
+    Parameters
+    ----------
+    model : StageModel
+    H : HysteresisInverse
+    Q : LinearInverse
+    wait : int
+        Samples that it holds back for nothing.
+    left : int
+        Passes that come after it.
+    is_first : bool
+        Whether none comes before it.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        H: HysteresisInverse,
+        Q: LinearInverse,
+        wait: int,
+        left: int,
+        is_first: bool,
+    ) -> None:
+        self._model, self._H, self._stream = model, H, model.stream()
+        self._taps = Q.taps[::-1].copy()
+        self._ahead, self._behind = Q.ahead + wait, Q.behind
+        self._later, self._is_first, self._is_last = left * Q.ahead, is_first, left == 0
+
+    def reset(self, v0: float) -> float:
+        """Come to rest and return the displacement there [m]."""
+        s, u0 = self._model.scaling, float(self._model.scaling.u(v0))
+        w0, y0 = self._H.reset(u0), self._stream.reset(v0)
+        x0 = float(s.x(y0))
+        # a bent sensor, say, makes of the rest of the chain more than a gain
+        self.origin = w0 - x0 * float(self._taps.sum())
+        self._tick = self._later
+        n, is_first = self._ahead, self._is_first
+        self._x, self._w = np.full(n, x0), np.full(n, self.origin if is_first else w0)
+        self._d = np.full(self._behind + n, x0 if is_first else 0.0)
+        return y0
+
+    def recall(self, v: Array, t: Array) -> None:
+        """Take the plays through a past voltage."""
+        u = self._model.scaling.u(v)
+        self._H.reset(float(u[0]))
+        self._H.follow(u)
+        self._stream.recall(v, t)
+
+    def follow(self, v: Array, tick: int) -> Array:
+        """Take the model along under a voltage, and return its displacement [m]."""
+        s = self._model.scaling
+        self._H.follow(s.u(v))
+        y = self._run(v, tick)
+        # nothing of a wanted motion is known any more
+        self._x = self._w = np.empty(0)
+        past = self._d[: self._behind]
+        self._d = np.append(past, s.x(y) if self._is_first else np.zeros(v.size))[v.size :]
+        return y
+
+    def process(
+        self, x: Array, d: Array, w: Array
+    ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+        """
+        Return what the next pass works on, of as many samples as are known far enough ahead.
+
+        Parameters
+        ----------
+        x, d, w : ndarray, shape (n,)
+            Wanted motion, what of it is missing, and H so far, normalised.
+
+        Returns
+        -------
+        x, d, w : ndarray, shape (m,)
+            The same after this pass.
+        u : ndarray, shape (m,)
+            Voltage, normalised.
+        short : ndarray of bool, shape (m,)
+            Where H could not become what it should.
+        """
+        x, d, w = (np.append(*z) for z in ((self._x, x), (self._d, d), (self._w, w)))
+        n = max(x.size - self._ahead, 0)
+        self._x, self._d, self._w = x[n:], d[n:], w[n:]
+        if n == 0:
+            nothing = np.empty(0)
+            return nothing, nothing, nothing, nothing, nothing > 0.0
+        x, d = x[:n], d[: n + self._taps.size - 1]
+        goal = w[:n] + np.correlate(d, self._taps, 'valid')
+        u, reached = self._H.process(goal)
+        if not self._is_last:
+            s = self._model.scaling
+            d = x - s.x(self._run(s.v0 + s.V * u, self._tick))
+        return x, d, reached, u, np.abs(goal - reached) > SHORT
+
+    def _run(self, v: Array, tick: int) -> Array:
+        self._tick = tick + v.size
+        return self._stream.process(v, np.arange(tick, self._tick) / self._model.sample_rate)
+
+
+def _shortened(Q: LinearInverse, most: int) -> LinearInverse:
+    """Return a filter that looks ahead by so many samples at most, of the same static gain."""
+    ahead = min(Q.ahead, most)
+    size = np.abs(Q.taps[::-1])
+    idle = int(np.argmax(np.cumsum(size) > OUTSIDE * size.sum()))
+    behind = min(max(Q.behind - idle, 0), LONGEST)
+    taps = Q.taps[Q.ahead - ahead : Q.ahead + 1 + behind]
+    return LinearInverse(taps * (Q.taps.sum() / taps.sum()), ahead, behind)
+
+
+def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
+    """Return a model without effects of further channels, which have no preview."""
+    left = [
+        setting
+        for setting in model.effects
+        if any(p.name == 'channel' for p in find_effect(setting.name).parameters)
+    ]
+    if not left:
+        return model, ()
+    told = ', '.join(setting.name for setting in left)
+    kept = tuple(setting for setting in model.effects if setting not in left)
+    return replace(model, effects=kept), (
+        f'{told} is not made up for: a further channel is not known ahead',
+    )
