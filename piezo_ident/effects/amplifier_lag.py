@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['AmplifierLag']
@@ -79,3 +80,14 @@ class AmplifierLag(Effect):
             return block
         x = np.ascontiguousarray(block.x)
         return block.with_signal(_follow(x, self._pole, self._state))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        if self._pole == 0.0:
+            return CCode()
+        return CCode(
+            {'share': 1.0 - self._pole},
+            'double y;\n',
+            's->y = x;\n',
+            'x = s->y = piezo_alive(s->y + share * (x - s->y));\n',
+        )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import held
 
@@ -71,3 +72,14 @@ class Backlash(Effect):
         gain = self.number('gain')
         p = _play(np.ascontiguousarray(block.x), self.number('width'), self._state)
         return block.with_signal(p if gain == 1.0 else block.x + gain * (p - block.x))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        gain = self.number('gain')
+        lost = 's->p' if gain == 1.0 else 'x + gain * (s->p - x)'
+        return CCode(
+            {'width': self.number('width'), 'gain': gain},
+            'double p;\n',
+            's->p = x;\n',
+            f's->p = piezo_held(s->p, x - width, x + width);\nx = {lost};\n',
+        )

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.effects.second_order import SecondOrderSection
+from piezo_ident.effects.second_order import SecondOrderSection, sections_in_c
 from piezo_ident.effects.trials import ladder
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['ChangedDynamics']
@@ -105,3 +106,9 @@ class ChangedDynamics(Effect):
         for section in self._sections:
             y += section.process(block.x)
         return block.with_signal(y)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        if self._silent:
+            return CCode()
+        return sections_in_c(self._sections, 'x')

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['Creep']
@@ -127,3 +128,28 @@ class Creep(Effect):
             return block
         x = np.ascontiguousarray(block.x)
         return block.with_signal(_crept(x, self._c, self._share, self._state))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        n = self._c.size
+        if n == 0:
+            return CCode()
+        return CCode(
+            {'n': n, 'gain': self._c, 'share': self._share, 'rest': 1.0 + self._c.sum()},
+            f'double h[{n}];\n',
+            """
+        int i;
+        for (i = 0; i < n; i++)
+            s->h[i] = x;
+        x *= rest;
+        """,
+            """
+        double w = 0.0;
+        int i;
+        for (i = 0; i < n; i++) {
+            s->h[i] = piezo_alive(s->h[i] + share[i] * (x - s->h[i]));
+            w += gain[i] * s->h[i];
+        }
+        x += w;
+        """,
+        )

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
-from piezo_ident.effects.second_order import SecondOrderSection, slope_of_mode
+from piezo_ident.effects.second_order import SecondOrderSection, sections_in_c, slope_of_mode
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['CrossCoupling']
@@ -124,3 +125,15 @@ class CrossCoupling(Effect):
             self._section.reset(float(c[0]))
             self._started = True
         return block.with_signal(block.x + (self._gain * c + self._section.process(c)))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        code = sections_in_c([self._section], 'z')
+        return CCode(
+            {**code.numbers, 'gain': self._gain, 'offset': self.number('offset')},
+            f'{code.state}int started;\n',
+            's->started = 0;\n',
+            'const double z = c - offset;\n'
+            f'if (!s->started) {{\n{code.rest}s->started = 1;\n}}\n{code.step}x += gain * z;\n',
+            self.text('channel'),
+        )

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['DelayChange']
@@ -57,3 +58,7 @@ class DelayChange(Effect):
     def process(self, block: Block) -> Block:
         """Return the block as it is: the model's delay line does the work."""
         return block
+
+    def c_code(self) -> CCode:
+        """Return nothing, as `process` does nothing."""
+        return CCode()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.trials import Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block, Operator, Slot
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 
@@ -348,3 +349,17 @@ class Effect:
     def process(self, block: Block) -> Block:
         """Apply the effect; see `piezo_ident.operators.chain.Operator`."""
         raise NotImplementedError
+
+    def c_code(self) -> CCode:
+        """
+        Return the effect in C, for `piezo_ident.export_c`.
+
+        Raises
+        ------
+        ModelError
+            Unless a subclass has it.
+        """
+        raise ModelError(
+            f'effect {self.name}: is not written in C and cannot be exported; give its class a '
+            'c_code(), or take the effect out of the model'
+        )

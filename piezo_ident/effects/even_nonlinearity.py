@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['EvenNonlinearity']
@@ -54,6 +55,12 @@ class EvenNonlinearity(Effect):
         """Return the block with H applied and the even powers added."""
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + self._even(block.x))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        names = ('square', 'fourth', 'sixth')
+        step = 'x += u * u * (square + u * u * (fourth + u * u * sixth));\n'
+        return CCode({name: self.number(name) for name in names}, rest=step, step=step)
 
     def _even(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         p0, p4, p6 = (self.number(name) for name in ('square', 'fourth', 'sixth'))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['GainDrift']
@@ -82,3 +83,26 @@ class GainDrift(Effect):
         if not gain.any():
             return block
         return block.with_signal(block.x * (1.0 + np.interp(block.t, time, gain)))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        time, gain = self.array('time'), self.array('gain')
+        if not gain.any():
+            return CCode()
+        return CCode(
+            {'n': gain.size, 'knot': time, 'gain': gain},
+            rest='x *= 1.0 + gain[0];\n',
+            step="""
+        int i = 0;
+        double g = gain[n - 1];
+        if (t < knot[n - 1]) {
+            g = gain[0];
+            if (t > knot[0]) {
+                while (t >= knot[i + 1])
+                    i++;
+                g = (gain[i + 1] - gain[i]) / (knot[i + 1] - knot[i]) * (t - knot[i]) + gain[i];
+            }
+        }
+        x *= 1.0 + g;
+        """,
+        )

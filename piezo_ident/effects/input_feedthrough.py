@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['InputFeedthrough']
@@ -58,3 +59,15 @@ class InputFeedthrough(Effect):
             y[0] += k1 * (block.v[0] - before)
             y[1:] += k1 * np.diff(block.v)
         return block.with_signal(y)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        return CCode(
+            {
+                'gain': self.number('gain'),
+                'rate_gain': self.number('rate_gain') * self.sample_rate,
+            },
+            'double last;\n',
+            's->last = v;\nx += gain * v;\n',
+            'x += gain * v + rate_gain * (v - s->last);\ns->last = v;\n',
+        )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import held
@@ -124,6 +125,25 @@ class NoncongruentMinorLoops(Effect):
         more = self._more(np.ascontiguousarray(block.x))
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        n = self._r.size
+        more = """
+        double w = 0.0, bent = 0.0;
+        int i;
+        for (i = 0; i < n; i++) {
+            const double f = piezo_held(s->f[i], u - r[i], u);
+            s->f[i] = f;
+            w += slope[i] * f;
+            bent += bend[i] * f * f;
+        }
+        x += (u - bias) * w + bent;
+        """
+        start = 'int j;\nfor (j = 0; j < n; j++)\n    s->f[j] = piezo_held(0.0, u - r[j], u);\n'
+        numbers: Numbers = {'n': n, 'r': self._r, 'slope': self._slope, 'bend': self._bend}
+        numbers['bias'] = self.number('bias')
+        return CCode(numbers, f'double f[{n}];\n', f'{start}{{{more}}}\n', more)
 
     def _more(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         out: NDArray[np.float64] = _tilted(

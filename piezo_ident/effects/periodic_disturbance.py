@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['PeriodicDisturbance']
@@ -66,3 +67,16 @@ class PeriodicDisturbance(Effect):
             if amplitude != 0.0:
                 y += amplitude * np.sin(turn * m * block.t + phase)
         return block.with_signal(y)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        turn = 2 * np.pi * self.number('frequency')
+        m, amplitude, phase = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
+        return CCode(
+            {'n': m.size, 'turn': turn * m, 'amplitude': amplitude, 'phase': phase},
+            step="""
+        int i;
+        for (i = 0; i < n; i++)
+            x += amplitude[i] * sin(turn[i] * t + phase[i]);
+        """,
+        )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['PreloadLoss']
@@ -54,3 +55,9 @@ class PreloadLoss(Effect):
         """Return the block with the loss below the kink."""
         loss = np.maximum(0.0, self.number('threshold') - block.v)
         return block.with_signal(block.x - self.number('gain') * loss)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        step = 'x -= gain * (threshold > v ? threshold - v : 0.0);\n'
+        names = ('gain', 'threshold')
+        return CCode({name: self.number(name) for name in names}, rest=step, step=step)

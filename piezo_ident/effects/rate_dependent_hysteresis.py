@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator, LANES, POWERS
 from piezo_ident.operators.kernels import curve, held
@@ -186,3 +187,59 @@ class RateDependentHysteresis(Effect):
         )
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        h = self.hysteresis
+        m = h.thresholds.size
+        if m == 0:
+            return CCode()
+        names = ('gain', 'stretch', 'lead', 'lead_stretch', 'levelling', 'exponent')
+        numbers: Numbers = {name: self.number(name) for name in names}
+        r, q, *_, low, c = h.for_kernel
+        numbers |= {'m': m, 'r': r[:m], 'q': q[:m], 'low': low, 'pole': self._pole}
+        numbers |= {'per_second': self.sample_rate}
+        weight, bent = 'q[i]', ''
+        if c.size:
+            rows = ('c1', 'c2', 'c3', 'kappa', 'width')
+            numbers |= {name: row[:m] for name, row in zip(rows, c, strict=True)}
+            weight = '(q[i] + kappa[i] * (u - low))'
+            curve = 'piezo_curve(c1[i], c2[i], c3[i], width[i], {} - low)'
+            bent = f' + {curve.format("f")} - {curve.format("g")}'
+        level = 'power /= 1.0 + levelling * power; ' if self.number('levelling') > 0.0 else ''
+        level += 'power = pow(power, exponent);' if self.number('exponent') != 1.0 else ''
+        # a growth that is not there is not computed
+        half = 'r[i] * (1.0 + stretch * power)' if self.number('stretch') else 'r[i]'
+        half += ' + gain * power' if self.number('gain') else ''
+        top = 'u + r[i] * (lead_stretch * power)' if self.number('lead_stretch') else 'u'
+        top += ' + lead * power' if self.number('lead') else ''
+        return CCode(
+            numbers,
+            f'double wide[{m}], still[{m}], last, speed;\n',
+            """
+        int i;
+        for (i = 0; i < m; i++)
+            s->wide[i] = s->still[i] = piezo_held(0.0, u - r[i], u);
+        s->last = u;
+        s->speed = 0.0;
+        """,
+            f"""
+        double power, w = 0.0;
+        int i;
+        s->speed = piezo_alive(pole * s->speed + (1.0 - pole) * (u - s->last) * per_second);
+        s->last = u;
+        power = fabs(s->speed);
+        {level}
+        for (i = 0; i < m; i++) {{
+            const double g = piezo_held(s->still[i], u - r[i], u);
+            const double half = {half};
+            const double bottom = u - (half > 0.0 ? half : 0.0);
+            const double top = {top};
+            const double f = piezo_held(s->wide[i], bottom, top < bottom ? bottom : top);
+            s->still[i] = g;
+            s->wide[i] = f;
+            w += {weight} * (f - g){bent};
+        }}
+        x += w;
+        """,
+        )

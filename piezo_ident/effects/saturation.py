@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['Saturation']
 
 #: beyond this many knees from an end, rounding changes nothing that a float can hold
 FAR = 40.0
+#: L(z) in C
+_SMOOTH = 'z < 0.0 ? log1p(exp(z)) : z + log1p(exp(-z))'
 
 
 @kernel
@@ -97,6 +100,29 @@ class Saturation(Effect):
     def process(self, block: Block) -> Block:
         """Return the block with its signal limited."""
         return block.with_signal(self._limited(block.x))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        ends = {name: self.number(name) for name in ('low', 'high')}
+        knee = self.number('knee')
+        if knee == 0.0:
+            sharp = {
+                'low': 'x = x < low ? low : x;\n',
+                'high': 'x = x > high ? high : x;\n',
+            }
+            step = ''.join(sharp[name] for name, end in ends.items() if np.isfinite(end))
+            return CCode({**ends}, rest=step, step=step)
+        step = 'double y = x, z;\n'
+        # as in `_soften`, the upper end first
+        if np.isfinite(ends['high']):
+            step += 'z = (x - high) / knee;\nif (z > knees)\n    y = high;\n'
+            step += f'else if (z > -knees)\n    y = x - knee * ({_SMOOTH});\n'
+        if np.isfinite(ends['low']):
+            step += 'z = (low - x) / knee;\nif (z > knees)\n    y += low - x;\n'
+            step += f'else if (z > -knees)\n    y += knee * ({_SMOOTH});\n'
+        step += 'x = y;\n'
+        step = step if np.isfinite([*ends.values()]).any() else ''
+        return CCode({**ends, 'knee': knee, 'knees': FAR}, rest=step, step=step)
 
     def _limited(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         low, high, knee = (self.number(name) for name in ('low', 'high', 'knee'))

@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
+from piezo_ident.operators.c_code import CCode
 
-__all__ = ['SecondOrderSection', 'slope_of_mode']
+__all__ = ['SecondOrderSection', 'sections_in_c', 'slope_of_mode']
 
 
 @kernel
@@ -89,6 +92,11 @@ class SecondOrderSection:
         self._state = np.zeros(3)
 
     @property
+    def coefficients(self) -> NDArray[np.float64]:
+        """n_0, n_1, a_1 and a_2 of the filter of differences."""
+        return self._c
+
+    @property
     def section(self) -> NDArray[np.float64]:
         """b_0, b_1, b_2, a_1 and a_2 of the filter."""
         n0, n1, a1, a2 = self._c
@@ -102,3 +110,36 @@ class SecondOrderSection:
         """Return the filtered signal, shape (n,)."""
         out: NDArray[np.float64] = _run(np.ascontiguousarray(x), self._c, self._state)
         return out
+
+
+def sections_in_c(sections: Sequence[SecondOrderSection], signal: str) -> CCode:
+    """Return what adds sections of a signal, named in C, to x."""
+    n = len(sections)
+    rows = zip(
+        ('n0', 'n1', 'a1', 'a2'), np.array([z.coefficients for z in sections]).T, strict=True
+    )
+    return CCode(
+        {'n': n, **dict(rows)},
+        f'double before, s0[{n}], s1[{n}];\n',
+        f"""
+{{
+    int i;
+    s->before = {signal};
+    for (i = 0; i < n; i++)
+        s->s0[i] = s->s1[i] = 0.0;
+}}
+""",
+        f"""
+{{
+    const double d = {signal} - s->before;
+    int i;
+    s->before = {signal};
+    for (i = 0; i < n; i++) {{
+        const double y = n0[i] * d + s->s0[i];
+        s->s0[i] = piezo_alive(n1[i] * d - a1[i] * y + s->s1[i]);
+        s->s1[i] = -a2[i] * y;
+        x += y;
+    }}
+}}
+""",
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['SensorNonlinearity']
@@ -54,6 +55,12 @@ class SensorNonlinearity(Effect):
     def process(self, block: Block) -> Block:
         """Return the block as the sensor reads it."""
         return block.with_signal(self._read(block.x))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        step = 'x += x * x * (square + x * (cubic + x * fourth));\n'
+        names = ('square', 'cubic', 'fourth')
+        return CCode({name: self.number(name) for name in names}, rest=step, step=step)
 
     def _read(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['SlewLimit']
@@ -90,3 +91,15 @@ class SlewLimit(Effect):
         if np.isinf(most):
             return block
         return block.with_signal(_limit(np.ascontiguousarray(block.x), most, self._state))
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        most = self.number('limit') / self.sample_rate
+        if np.isinf(most):
+            return CCode()
+        return CCode(
+            {'most': most},
+            'double y;\n',
+            's->y = x;\n',
+            'x = s->y = piezo_held(x, s->y - most, s->y + most);\n',
+        )

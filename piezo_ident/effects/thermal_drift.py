@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['ThermalDrift']
@@ -59,4 +60,15 @@ class ThermalDrift(Effect):
         approach = -np.expm1(-t / self.number('time_constant'))
         return block.with_signal(
             block.x + self.number('rate') * t + self.number('amplitude') * approach
+        )
+
+    def c_code(self) -> CCode:
+        """Return the effect in C."""
+        names = ('rate', 'amplitude', 'time_constant')
+        return CCode(
+            {name: self.number(name) for name in names},
+            step="""
+        const double since = t > 0.0 ? t : 0.0;
+        x += rate * since - amplitude * expm1(-since / time_constant);
+        """,
         )

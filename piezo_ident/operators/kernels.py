@@ -32,6 +32,7 @@ __all__ = [
     'dynamics',
     'held',
     'hysteresis',
+    'path_lines',
     'plays',
     'relaxing',
     'wide_hysteresis',
@@ -120,6 +121,27 @@ def wide_hysteresis(
         out[k] = w + ((p1 * x + p0) * x + p2) * x
 
 
+@ordered_kernel
+def path_lines(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """
+    Return what each lag of `relaxing` tends to along a falling and a rising voltage u.
+
+    A line's own answer, in the place of phi: phi - phi' s/a + phi'' (s/a)^2 - ..., as coefficients
+    of 1, u and u^2; shape (2, 3, j).
+    """
+    n = x.shape[0]
+    lines = np.empty((2, 3, n))
+    for j in range(n):
+        d1, d2, d3 = x[j, 1], x[j, 2], x[j, 3]
+        for s in range(2):
+            # it changes its sign with the direction
+            b = 1.0 / x[j, 0] if s else -1.0 / x[j, 0]
+            lines[s, 0, j] = b * (2.0 * b * d2 - d1 - 6.0 * b * b * d3)
+            lines[s, 1, j] = d1 + b * (6.0 * b * d3 - 2.0 * d2)
+            lines[s, 2, j] = d2 - 3.0 * b * d3
+    return lines
+
+
 @kernel
 def relaxing(
     v: NDArray[np.float64],
@@ -135,16 +157,7 @@ def relaxing(
     the samples.  `state` holds each z, and then the last v.
     """
     n = x.shape[0]
-    # a line's own answer, in the place of phi: phi - phi' s/a + phi'' (s/a)^2 - ..., as
-    # coefficients of 1, u and u^2; b changes its sign with the direction
-    lines = np.empty((2, 3, n))
-    for j in range(n):
-        d1, d2, d3 = x[j, 1], x[j, 2], x[j, 3]
-        for s in range(2):
-            b = 1.0 / x[j, 0] if s else -1.0 / x[j, 0]
-            lines[s, 0, j] = b * (2.0 * b * d2 - d1 - 6.0 * b * b * d3)
-            lines[s, 1, j] = d1 + b * (6.0 * b * d3 - 2.0 * d2)
-            lines[s, 2, j] = d2 - 3.0 * b * d3
+    lines = path_lines(x)
     last = float(state[n])
     for k in range(v.size):
         u = float(v[k])

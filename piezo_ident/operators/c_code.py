@@ -1,0 +1,209 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Operators in C: the text that `piezo_ident.export` makes a header of.
+
+An operator says in C what it does to one sample, beside the loop that does it in Python; its
+numbers are those of the loop.  The loops of `piezo_ident.operators.kernels` are here, in their
+order of operations: G and z^-d give the same bits, and H differs by the order of a sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.kernels import path_lines
+
+__all__ = ['CCode', 'Numbers', 'delay_in_c', 'dynamics_in_c', 'hysteresis_in_c']
+
+#: constants of an operator by name
+Numbers = dict[str, float | int | NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class CCode:
+    """
+    An operator in C.
+
+    The statements find the signal as `x`, and leave there what goes out.  They may use the
+    numbers by their names, the state as ``s->name``, the normalised command `v`, the time `t` [s],
+    the signal into H as `u` (in the slot ``hysteresis``, where `x` is what H has made of it), the
+    further channel as `c`, and the functions ``piezo_alive``, ``piezo_held`` and ``piezo_curve``,
+    which are `piezo_ident.common.kernel.alive` and `held` and `curve` of the kernels.
+
+    Attributes
+    ----------
+    numbers : mapping of str to float, int or ndarray, shape (n,)
+        Constants.
+    state : str
+        Members of a struct.
+    rest : str
+        Statements that bring it to rest; without any, the signal passes at rest as it is.
+    step : str
+        Statements for one sample; none where the operator does nothing.
+    channel : str
+        Further channel that it needs, or nothing.
+    """
+
+    numbers: Numbers = field(default_factory=dict)
+    state: str = ''
+    rest: str = ''
+    step: str = ''
+    channel: str = ''
+
+
+_PLAYS = """
+int i;
+double w = 0.0;
+for (i = 0; i < m; i++)
+    s->f[i] = piezo_held(s->f[i], x - r[i], x);
+for (i = 0; i < m; i++)
+    w += q[i] * s->f[i];
+"""
+_WIDE = """
+for (i = 0; i < m; i++)
+    w += kappa[i] * (x - low) * (s->f[i] - low)
+        + piezo_curve(c1[i], c2[i], c3[i], width[i], s->f[i] - low);
+"""
+_PLAYS_AT_REST = """
+{
+    int i;
+    for (i = 0; i < m; i++)
+        s->f[i] = piezo_held(0.0, x - r[i], x);
+}
+"""
+# `lags` is their sum behind a step of the voltage to `to`
+_LAGS = """
+{
+    const double length = fabs(to - s->last);
+    const double *const line = lines + (to > s->last ? 3 * n : 0);
+    double left = 0.0;
+    int j;
+    lags = 0.0;
+    for (j = 0; j < n; j++) {
+        if (length > 0.0) {
+            const double e0 = line[j], e1 = line[n + j], e2 = line[2 * n + j];
+            const double now = e0 + to * (e1 + to * (e2 + to * d3[j]));
+            const double was = e0 + s->last * (e1 + s->last * (e2 + s->last * d3[j]));
+            left = j > 0 && rate[j] == 2.0 * rate[j - 1] ? left * left : exp(-rate[j] * length);
+            s->z[j] = now + (s->z[j] - was) * left;
+        }
+        lags += s->z[j] - to * (d1[j] + to * (d2[j] + to * d3[j]));
+    }
+    s->last = to;
+}
+"""
+_LAGS_AT_REST = """
+{
+    const double way[5] = {high, low, high, low, x};
+    double lags;
+    int i;
+    for (i = 0; i < n; i++)
+        s->z[i] = low * (d1[i] + low * (d2[i] + low * d3[i]));
+    s->last = low;
+    for (i = 0; i < 5; i++) {
+        const double to = way[i];
+        LAGS
+    }
+    (void)lags;
+}
+"""
+
+
+def hysteresis_in_c(h: Hysteresis) -> CCode:
+    """Return H, as `hysteresis`, `wide_hysteresis` and `relaxing` have it."""
+    m = h.thresholds.size
+    r, q, p1, p2, p0, low, c = h.for_kernel
+    numbers: Numbers = {'p0': p0, 'p1': p1, 'p2': p2}
+    numbers |= {'low': low, 'high': h.span[1]}
+    state, rest, step = '', '', 'double w = 0.0;\n'
+    if m:
+        numbers |= {'m': m, 'r': r[:m], 'q': q[:m]}
+        state, rest, step = f'double f[{m}];\n', _PLAYS_AT_REST, _PLAYS
+    if c.size:
+        names = ('c1', 'c2', 'c3', 'kappa', 'width')
+        numbers |= {name: row[:m] for name, row in zip(names, c, strict=True)}
+        step += _WIDE
+    if h.relaxations is not None and len(h.relaxations):
+        n = len(h.relaxations)
+        # names of their own beside those of the curves
+        rows = zip(('rate', 'd1', 'd2', 'd3'), h.relaxations.T, strict=True)
+        numbers |= {'n': n, 'lines': path_lines(np.array(h.relaxations)).ravel(), **dict(rows)}
+        state += f'double z[{n}];\ndouble last;\n'
+        rest += _LAGS_AT_REST.replace('LAGS', _LAGS)
+        step += f'{{\nconst double to = x;\ndouble lags;\n{_LAGS}\nw += lags;\n}}\n'
+    step += 'x = w + ((p1 * x + p0) * x + p2) * x;\n'
+    # H at rest has met its voltage once
+    return CCode(numbers, state, f'{rest}{{\n{step}}}\n', step)
+
+
+_G = """
+const double *past;
+double y = 0.0;
+int i;
+s->w[s->at_w] = s->w[s->at_w + nb] = x;
+s->at_w = s->at_w + 1 < nb ? s->at_w + 1 : 0;
+past = s->w + s->at_w;
+for (i = 0; i < nb; i++)
+    y += b[i] * past[i];
+"""
+_G_BACK = """
+past = s->y + s->at_y;
+for (i = 0; i < na; i++)
+    y -= a[i] * past[i];
+y = piezo_alive(y);
+s->y[s->at_y] = s->y[s->at_y + na] = y;
+s->at_y = s->at_y + 1 < na ? s->at_y + 1 : 0;
+"""
+_G_AT_REST = """
+{
+    int i;
+    s->at_w = 0;
+    for (i = 0; i < 2 * nb; i++)
+        s->w[i] = x;
+}
+x *= gain;
+"""
+_G_BACK_AT_REST = """
+{
+    int i;
+    s->at_y = 0;
+    for (i = 0; i < 2 * na; i++)
+        s->y[i] = x;
+}
+"""
+
+
+def dynamics_in_c(g: Dynamics) -> CCode:
+    """Return G, as `dynamics` has it: sums from the oldest sample to the newest."""
+    na, nb = g.a.size, g.b.size
+    numbers: Numbers = {'nb': nb, 'b': g.b[::-1], 'na': na, 'a': g.a[::-1], 'gain': g.gain}
+    # every sample stands twice, so that the past is always in one piece
+    state = f'double w[{2 * nb}];\nint at_w;\n'
+    if not na:
+        return CCode(numbers, state, _G_AT_REST, f'{_G}x = y;\n')
+    state += f'double y[{2 * na}];\nint at_y;\n'
+    return CCode(numbers, state, _G_AT_REST + _G_BACK_AT_REST, f'{_G}{_G_BACK}x = y;\n')
+
+
+def delay_in_c(delay: Delay) -> CCode:
+    """Return z^-d, as `DelayOperator` has it."""
+    if delay.total == 0.0:
+        return CCode()
+    between = delay.fraction > 0.0
+    n = delay.samples + (2 if between else 1)
+    state = f'double line[{n}];\nint at;\n'
+    rest = '{\nint i;\ns->at = 0;\nfor (i = 0; i < n; i++)\n    s->line[i] = x;\n}\n'
+    step = 's->line[s->at] = x;\ns->at = s->at + 1 < n ? s->at + 1 : 0;\n'
+    if between:
+        step += (
+            'x = (1.0 - part) * s->line[s->at + 1 < n ? s->at + 1 : 0] + part * s->line[s->at];\n'
+        )
+    else:
+        step += 'x = s->line[s->at];\n'
+    return CCode({'n': n, 'part': delay.fraction}, state, rest, step)
