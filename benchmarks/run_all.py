@@ -38,6 +38,7 @@ HERE = Path(__file__).resolve().parent
 #: benchmarks in the order of the page; others follow by name
 ORDER = (
     'prediction',
+    'export',
     'identification',
     'peers_arx',
     'peers_swarm',
