@@ -40,7 +40,11 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=[package_name, f'{package_name}.*']),
-    package_data={package_name: ['py.typed', 'report/templates/*.html', 'schemas/*.json']},
+    package_data={
+        package_name: [
+            *('py.typed', 'export/templates/*.h', 'report/templates/*.html', 'schemas/*.json')
+        ]
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
+    from piezo_ident.export.header import export_c
     from piezo_ident.identification.identify import identify
     from piezo_ident.identification.results import Identification, Settings
     from piezo_ident.live.guard import Guard, GuardSettings
@@ -72,6 +73,7 @@ _HOMES = {
     'StageModel': 'model.stage_model',
     'diagnose': 'diagnosis.diagnose',
     'effects': 'effects',
+    'export_c': 'export.header',
     'free_run': 'model.free_run',
     'identify': 'identification.identify',
     'invert': 'control.inverse',
@@ -106,6 +108,7 @@ __all__ = [
     '__version__',
     'diagnose',
     'effects',
+    'export_c',
     'free_run',
     'identify',
     'invert',

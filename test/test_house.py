@@ -35,6 +35,7 @@ ROOMS = (
     'identification',
     'diagnosis',
     'control',
+    'export',
     'live',
     'report',
     'many',

@@ -180,6 +180,14 @@ cli = Verbs(
             'invert model.yaml scan.csv --displacement-unit um --limits 0 9 --clip',
         ),
         Verb(
+            'export',
+            'Write a model for other programs: a C header with prediction and feed-forward.',
+            [options.MODEL],
+            {'Output': options.EXPORT, 'The voltage of the feed-forward': options.KEPT},
+            'export model.yaml --format c --out stage.h',
+            'export model.yaml --out stage.h --limits 0 9 --slew 5e3',
+        ),
+        Verb(
             'diagnose',
             'Find the effect that a model lacks, and add it.\n\nMODEL is a model file; with '
             f'--each also a folder with one of the name of every record. {RECORD_HELP}',

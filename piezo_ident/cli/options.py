@@ -177,6 +177,13 @@ INVERT = [
     OVERWRITE,
 ]
 
+EXPORT = [
+    _option('--out', _file, 'FILE', 'Header .h.'),
+    _option('--format', click.Choice(['c']), None, 'Of the file (default: c).', default='c'),
+    _option('--name', _name, 'NAME', 'With which names in it begin (default: that of the file).'),
+    OVERWRITE,
+]
+
 #: how a wanted motion is read
 MOTION = [
     option
@@ -184,13 +191,17 @@ MOTION = [
     if option.name in ('columns', 'rate', 'time_unit', 'displacement_unit')
 ]
 
-DRIVE = [
+#: what a voltage keeps
+KEPT = [
     _option(
         *('--limits', float, 'LO HI', 'Of the voltage [V] (default: the identified range).'),
         nargs=2,
         callback=_limits,
     ),
     _option('--slew', _speed, 'V/S', 'Largest speed of the voltage (default: any).'),
+]
+DRIVE = [
+    *KEPT,
     _flag('--clip', 'Come as near as the limits allow, instead of refusing.'),
 ]
 

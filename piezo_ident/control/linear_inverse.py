@@ -22,20 +22,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.effects import find_effect
+from piezo_ident.effects import Effect, find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from scipy.signal import oaconvolve
 
-__all__ = ['LinearInverse', 'linear_inverse']
+__all__ = ['LinearInverse', 'is_filter', 'linear_inverse']
 
 Array = NDArray[np.float64]
 
 #: gain of G, as a share of the static one, below which it is not made up for
 EPSILON = 3e-2
-#: what may lie outside of the filter, as a share of the sum of its magnitudes: more than what
-#: rounding leaves of poles and zeros that lie close together
-OUTSIDE = 1e-7
+#: what may lie outside of the filter, as a share of the sum of its magnitudes
+OUTSIDE = 1e-9
 #: lengths of the filter that are tried [samples]
 SHORTEST, LONGEST = 1 << 11, 1 << 19
 
@@ -100,6 +99,11 @@ def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse
     )
 
 
+def is_filter(effect: type[Effect]) -> bool:
+    """Return whether an effect is undone with G, as a filter of its own."""
+    return effect.in_dynamics and not effect.in_delay_line and effect.change != 'passed'
+
+
 def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
     """Return G with its delay, and with effects that filter it, at n // 2 + 1 frequencies."""
     z = np.exp(-2j * np.pi * np.fft.rfftfreq(n))
@@ -111,7 +115,7 @@ def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
     t = np.arange(n) / model.sample_rate
     for setting in model.effects:
         effect = find_effect(setting.name)
-        if not effect.in_dynamics or effect.in_delay_line or effect.change == 'passed':
+        if not is_filter(effect):
             continue
         operator = effect(model.sample_rate, setting.parameters)
         operator.reset(0.0, 0.0)

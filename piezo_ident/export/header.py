@@ -1,0 +1,236 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A model as a C header: prediction and feed-forward, sample by sample.
+
+Each operator is written in C beside its loop (`piezo_ident.operators.c_code.CCode`); a header is
+these texts in the order of the chain.  The feed-forward has no equations of its own: what stands
+in front of G is a function of the next voltage alone once its memory is given, and its inverse is
+the root of that very function; G and its delay are undone by `piezo_ident.control.linear_inverse`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+import re
+import textwrap
+from typing import Any
+
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident import __version__
+from piezo_ident.common.errors import ConfigError, ModelError
+from piezo_ident.common.kernel import STILL
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse, NONE, TRIALS
+from piezo_ident.control.inverse import SHORT
+from piezo_ident.control.linear_inverse import EPSILON, is_filter, linear_inverse, LinearInverse
+from piezo_ident.effects import find_effect
+from piezo_ident.export.links import Link, links_of, Part
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['export_c']
+
+#: [spans] beyond which no displacement is looked for
+FAR = 100.0
+#: width of a line of numbers or words
+WIDTH = 88
+
+
+@dataclass(frozen=True, eq=False)
+class _FeedForward:
+    """What the template of the feed-forward needs."""
+
+    taps: NDArray[np.float64]
+    ahead: int
+    gain: str
+    lowest: str
+    highest: str
+    step: str
+    says: Sequence[str]
+    inverted: Part
+
+
+def export_c(
+    model: StageModel,
+    name: str = 'stage',
+    *,
+    limits: tuple[float, float] | None = None,
+    slew: float = math.inf,
+    title: str = '',
+) -> str:
+    """
+    Return a model as a C header: prediction and feed-forward, sample by sample.
+
+    Parameters
+    ----------
+    model : StageModel
+    name : str, optional
+        With which all names in the header begin.
+    limits : tuple of float, optional
+        Lowest and highest voltage of the feed-forward [V]; the identified range when absent.
+    slew : float, optional
+        Largest speed of its voltage [V/s].
+    title : str, optional
+        First line of the header.
+
+    Returns
+    -------
+    str
+        C99 without dependencies; a comment at its head says how to call it, and what the
+        feed-forward does not make up for.
+
+    Raises
+    ------
+    ConfigError
+        When the name is none in C, or limits or slew are impossible.
+    ModelError
+        When an effect of the model is not written in C.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> header = pi.export_c(pi.SimulatedStage.load('paper').model, limits=(0.0, 10.0))
+    >>> 'static inline double stage_step(stage_state *s, double v)' in header
+    True
+    """
+    if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
+        raise ConfigError(
+            f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
+            options='--name stage',
+        )
+    low, high = model.scaling.range if limits is None else limits
+    if not (low < high and slew > 0.0):
+        raise ConfigError('export: give limits as lowest and highest voltage, and a slew above 0')
+    front, linear, back = links_of(model)
+    links = [*front.links, *linear.links, *back.links]
+    channels = Part(links).channels
+    why = ''
+    feedforward = None
+    try:
+        feedforward = _feedforward(model, front, back, (low, high), slew)
+    except ModelError as error:
+        why = str(error)
+    scaling = model.scaling
+    values: dict[str, Any] = {
+        'p': name,
+        'P': name.upper(),
+        'title': textwrap.wrap(title.replace('*/', '') or repr(model), WIDTH),
+        'hertz': f'{model.sample_rate:g}',
+        'version': __version__,
+        'rate': _number(model.sample_rate),
+        **{k: _number(getattr(scaling, k)) for k in ('v0', 'V', 'y0', 'Y')},
+        'links': links,
+        'parts': {'front': front, 'linear': linear, 'back': back},
+        'channels': channels,
+        'why': textwrap.wrap(why, WIDTH),
+        'ff': feedforward,
+    }
+    helpers = _render('helpers.h', still=_number(STILL), nothing=_number(NONE), trials=TRIALS)
+    if feedforward is not None:
+        # oldest first, as the past lies in memory
+        listed = ', '.join(repr(float(x)) for x in feedforward.taps[::-1])
+        values['feedforward'] = _render(
+            'feedforward.h',
+            **values,
+            inverted=feedforward.inverted,
+            taps='\n'.join(textwrap.wrap(listed, WIDTH, break_on_hyphens=False)),
+            far=_number(FAR),
+            short=_number(SHORT),
+        )
+    return _render('stage.h', **values, helpers=helpers)
+
+
+def _feedforward(
+    model: StageModel, front: Part, back: Part, limits: tuple[float, float], slew: float
+) -> _FeedForward:
+    """
+    Return what inverts a model.
+
+    Raises
+    ------
+    ModelError
+        When it has no inverse.
+    """
+    HysteresisInverse(model.hysteresis)
+    in_front = [link.name for link in front.links]
+    rest = tuple(e for e in model.effects if e.name not in in_front)
+    Q = linear_inverse(replace(model, effects=rest))
+    # an effect that passes the command on does so before it is known
+    undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
+    inverted = Part([x for x in undone if x.effect and not is_filter(type(x.effect))])
+    low, high, most = *limits, slew
+    for link in front.links:
+        # beyond them a change of the voltage changes nothing
+        if link.name == 'slew_limit' and link.effect:
+            most = min(most, link.effect.number('limit') * model.scaling.V)
+        if link.name == 'saturation' and link.effect and link.effect.number('knee') == 0.0:
+            low = max(low, model.scaling.v(link.effect.number('low')))
+            high = min(high, model.scaling.v(link.effect.number('high')))
+    if not low < high:
+        raise ModelError('the voltage limits lie where the amplifier is saturated')
+    return _FeedForward(
+        taps=Q.taps,
+        ahead=Q.ahead,
+        gain=_number(model.dynamics.gain),
+        lowest=_number(low),
+        highest=_number(high),
+        step=_number(most / model.sample_rate),
+        says=_says(model, front, inverted, back, Q),
+        inverted=inverted,
+    )
+
+
+def _says(
+    model: StageModel, front: Part, inverted: Part, back: Part, Q: LinearInverse
+) -> list[str]:
+    """Return what a feed-forward does, and what it does not make up for."""
+    behind = ''
+    if inverted.links:
+        behind = f' What stands behind it ({_named(inverted.links)}) is inverted likewise.'
+    text = (
+        'The voltage stays within LOWEST .. HIGHEST and changes by at most STEP from sample to '
+        'sample, whatever is wanted; a y that is no finite number is the last one again. '
+        'f.clipped counts the samples at which these limits kept the voltage from what was '
+        f'wanted. What stands in front of G ({_named(front.links)}) is inverted sample by sample, '
+        f'with its memory.{behind} G and its delay are undone by a filter of {Q.taps.size} '
+        f'samples, {Q.ahead} of them ahead.  The feed-forward does not make up for'
+    )
+    lacks = [
+        'what the model does not know: noise, and its own error',
+        f'motion at which the gain of G is below {EPSILON:.0%} of the static one: there the '
+        'voltage is kept small',
+    ]
+    for link in back.links:
+        if 'v' in link.given(link.code.step):
+            lacks.append(f'{link.name}: the voltage in the reading')
+        elif link.effect and is_filter(type(link.effect)) and len(back.links) > 1:
+            lacks.append(f'the place of {link.name}: it is undone as if it stood beside G')
+    if any(find_effect(e.name).time_driven for e in model.effects):
+        lacks.append('a clock that starts elsewhere: set f.k where it does, after the reset')
+    points = (textwrap.wrap(x, WIDTH, initial_indent='- ', subsequent_indent='  ') for x in lacks)
+    return [*textwrap.wrap(text, WIDTH), *(line for point in points for line in point)]
+
+
+def _named(links: Sequence[Link]) -> str:
+    return ', '.join(link.name for link in links if link.code.step)
+
+
+def _number(x: float) -> str:
+    if math.isinf(x):
+        return 'HUGE_VAL' if x > 0.0 else '(-HUGE_VAL)'
+    return repr(float(x)) if x >= 0.0 else f'({float(x)!r})'
+
+
+def _render(template: str, **values: Any) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('piezo_ident.export', 'templates'),
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(template).render(values)

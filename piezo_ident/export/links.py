@@ -1,0 +1,158 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The operators of a model as functions in C, and parts of its chain as calls of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+import re
+import textwrap
+
+import numpy as np
+from piezo_ident.effects import Effect
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.c_code import CCode, delay_in_c, dynamics_in_c, hysteresis_in_c
+from piezo_ident.operators.chain import Operator
+from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
+from piezo_ident.operators.hysteresis import HysteresisOperator
+
+__all__ = ['Link', 'Part', 'links_of']
+
+#: what the statements of a link may be given
+_GIVEN = ('u', 'v', 't', 'c')
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """
+    An operator of the chain in C.
+
+    Attributes
+    ----------
+    name : str
+        Of the operator.
+    tag : str
+        Unique within the model; of the member with its state, and of its functions.
+    code : CCode
+    effect : Effect or None
+    """
+
+    name: str
+    tag: str
+    code: CCode
+    effect: Effect | None = None
+
+    @property
+    def members(self) -> list[str]:
+        """The members of the struct with its state."""
+        return self.code.state.split('\n')[:-1]
+
+    def given(self, text: str) -> list[str]:
+        """Return which signals a text uses beside its own."""
+        return [name for name in _GIVEN if name in _words(text)]
+
+    def body(self, text: str) -> str:
+        """Return a text behind the numbers that it uses, without empty lines."""
+        used = _words(text)
+        lines = [_constant(name, x) for name, x in self.code.numbers.items() if name in used]
+        text = textwrap.dedent(text)
+        return '\n'.join([*lines, *(line for line in text.split('\n') if line.strip())])
+
+    def call(self, prefix: str, what: str, state: str) -> str:
+        """Return the statement that puts `x` through the link."""
+        text = getattr(self.code, what)
+        if not text:
+            return ''
+        given = [f'&{state}->{self.tag}'] if self.code.state else []
+        given += ['x', *self.given(text)]
+        return f'x = {prefix}_{self.tag}_{what}({", ".join(given)});'
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Neighbouring links, of which those of the slot ``hysteresis`` share the signal into H."""
+
+    links: Sequence[Link]
+
+    @property
+    def channels(self) -> list[str]:
+        """Further channels that they need."""
+        return list(dict.fromkeys(x.code.channel for x in self.links if x.code.channel))
+
+    @property
+    def given(self) -> list[str]:
+        """Which of v, t and c any link uses."""
+        texts = [text for link in self.links for text in (link.code.rest, link.code.step)]
+        return [name for name in 'vtc' if any(name in _words(text) for text in texts)]
+
+    def statements(self, prefix: str, what: str, channels: Sequence[str]) -> Iterator[str]:
+        """Give the statements that put `x` through the part; its state is ``*s``."""
+        wrapped = any('u' in _words(link.code.step) for link in self.links)
+        for link in self.links:
+            if wrapped and link.tag == 'hysteresis':
+                yield 'u = x;'
+            call = link.call(prefix, what, 's')
+            if link.code.channel:
+                call = call.replace(', c)', f', channel[{channels.index(link.code.channel)}])')
+            if call:
+                yield call
+
+    @property
+    def is_wrapped(self) -> bool:
+        """Whether an effect in it needs the signal into H."""
+        return any('u' in _words(link.code.step) for link in self.links)
+
+
+def links_of(model: StageModel) -> tuple[Part, Part, Part]:
+    """
+    Return the links in front of G, G with its delay, and those behind, in their order.
+
+    Raises
+    ------
+    ModelError
+        When an effect is not written in C.
+    """
+    front: list[Link] = []
+    linear: list[Link] = []
+    back: list[Link] = []
+    part = front
+    for operator in _unwrapped(model.chain().operators):
+        match operator:
+            case HysteresisOperator():
+                part.append(Link('H', 'hysteresis', hysteresis_in_c(operator.hysteresis)))
+            case DynamicsOperator():
+                part = linear
+                part.append(Link('G', 'dynamics', dynamics_in_c(operator.dynamics)))
+            case DelayOperator():
+                part.append(Link('z^-d', 'delay', delay_in_c(operator.delay)))
+                part = back
+            case Effect():
+                tag = f'{operator.name}_{len(front) + len(linear) + len(back)}'
+                part.append(Link(operator.name, tag, operator.c_code(), operator))
+    return Part(front), Part(linear), Part(back)
+
+
+def _unwrapped(operators: Iterable[Operator]) -> Iterator[Operator]:
+    """Give the operators, and H before the effects that wrap it."""
+    for operator in operators:
+        if isinstance(operator, Effect) and operator.slot == 'hysteresis':
+            yield from _unwrapped([operator.inner])
+        yield operator
+
+
+def _words(text: str) -> set[str]:
+    # not the members of the state
+    return set(re.findall(r'(?<![>.\w])[A-Za-z_]\w*', text))
+
+
+def _constant(name: str, value: object) -> str:
+    """Return the definition of a number or of a list of numbers."""
+    if isinstance(value, int):
+        return f'enum {{ {name} = {value} }};'
+    if not isinstance(value, np.ndarray):
+        return f'const double {name} = {float(value)!r};'  # type: ignore[arg-type]
+    listed = ', '.join(repr(float(x)) for x in value)
+    text = f'static const double {name}[{value.size}] = {{{listed}}};'
+    return '\n'.join(textwrap.wrap(text, 92, subsequent_indent='    ', break_on_hyphens=False))

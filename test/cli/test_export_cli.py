@@ -1,0 +1,57 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``export``: writes a header, or refuses in one line."""
+
+from dataclasses import replace
+import json
+
+from command_line import refuse, succeed
+from paper_stage import PAPER
+import piezo_ident as pi
+from piezo_ident.operators.hysteresis import Hysteresis
+import pytest
+
+
+@pytest.fixture
+def model(tmp_path):
+    PAPER.save(tmp_path / 'model.yaml')
+    return tmp_path / 'model.yaml'
+
+
+def test_a_header_is_written(capsys, tmp_path, model):
+    out = tmp_path / 'My-Stage.h'
+    said = succeed(capsys, 'export', model, '--format', 'c', '--out', out, '--limits', 0, 9)
+    assert f'wrote {out}: my_stage_step, my_stage_feedforward_step' in said
+    header = out.read_text()
+    assert 'The stage of model.yaml' in header and '#define MY_STAGE_HIGHEST 9.0' in header
+    assert (
+        header.splitlines()[3:]
+        == pi.export_c(PAPER, 'my_stage', limits=(0.0, 9.0)).splitlines()[4:]
+    )
+    more = ['--overwrite', '--name', 'axis', '--slew', '5e3', '--json']
+    result = json.loads(succeed(capsys, 'export', model, '--out', out, *more))
+    assert result['name'] == 'axis' and result['feedforward']
+    assert '#define AXIS_STEP 0.25' in out.read_text()
+
+
+def test_what_has_no_inverse_is_said(capsys, tmp_path, model):
+    replace(PAPER, hysteresis=Hysteresis([0.1], [0.1], -0.8, 2.0)).save(model)
+    assert 'no feed-forward' in succeed(capsys, 'export', model, '--out', tmp_path / 'stage.h')
+
+
+@pytest.mark.parametrize(
+    ('words', 'what'),
+    [
+        ([], '--out stage.h'),
+        (['--out', 'stage.txt'], 'choose .h'),
+        (['--out', 'stage.h', '--format', 'fortran'], 'fortran'),
+        (['--out', '3.h'], '--name stage'),
+        (['--out', 'stage.h', '--slew', '0'], 'no speed'),
+        (['--out', 'stage.h', '--limits', '3', '1'], 'lower one first'),
+        (['--out', 'none/stage.h'], 'there is no folder'),
+    ],
+)
+def test_one_line_of_refusal(capsys, tmp_path, monkeypatch, model, words, what):
+    monkeypatch.chdir(tmp_path)
+    refuse(capsys, tmp_path, ['export', 'model.yaml', *words], what)

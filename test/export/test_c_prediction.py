@@ -1,0 +1,140 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The header predicts what Python does, to 1e-12 of stroke: every effect, law of H and G."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+from c_compiler import Compiled, needs_compiler
+from effect_table import VISIBLE
+import numpy as np
+from paper_stage import PAPER
+import piezo_ident as pi
+from piezo_ident import effects
+from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+import pytest
+
+#: largest difference, as a share of stroke
+CLOSE = 1e-12
+
+
+def random_drive(rng, n=6000):
+    """Return a voltage with turns at random places, jumps, rests and noise, within 0 .. 10 V."""
+    ends = rng.uniform(0.0, 10.0, n // 100)
+    ways = [np.linspace(a, b, rng.integers(1, 300)) for a, b in pairwise(ends)]
+    v = np.concatenate([*ways, np.repeat(rng.uniform(0.0, 10.0, 5), 200)])[:n]
+    return np.clip(v + 0.02 * rng.standard_normal(v.size), 0.0, 10.0)
+
+
+def random_hysteresis(rng, law):
+    """Return an H of a law that rises everywhere."""
+    m = int(rng.integers(1, 40))
+    r = np.sort(rng.uniform(0.005, 0.99, m))
+    q = rng.uniform(0.0, 1.0, m) / m
+    wide = {'p0': rng.uniform(-0.1, 0.1), 'curves': rng.uniform(0.0, 0.2, (m, 3)) / m}
+    wide['bias'] = rng.uniform(0.0, 0.2, m) / m
+    rates = [1.0, 2.0, 4.0, 9.0]
+    lags = {'relaxations': np.column_stack([rates, rng.uniform(0, 0.03, (4, 3))])}
+    more = {'plays': {}, 'wide': wide, 'lags': lags, 'both': {**wide, **lags}}[law]
+    return Hysteresis(r, q, rng.uniform(-0.1, 0.2), 1.0, **more)
+
+
+def random_dynamics(rng):
+    """Return a stable G of some order."""
+    pairs, zeros = rng.integers(0, 5), rng.integers(0, 6)
+    poles = rng.uniform(0.3, 0.98, pairs) * np.exp(1j * rng.uniform(0.1, 2.5, pairs))
+    a = np.real(np.poly([*poles, *poles.conj()]))[1:] if pairs else np.empty(0)
+    b = np.real(np.poly(-rng.uniform(0.2, 2.5, zeros)))
+    return Dynamics(a, np.atleast_1d(b)).normalised()
+
+
+def random_model(rng, effects=(), law='plays'):
+    delay = Delay(int(rng.integers(2, 20)), float(rng.choice([0.0, rng.uniform()])))
+    return replace(
+        PAPER,
+        scaling=replace(PAPER.scaling, v0=0.3, y0=2e-6),
+        hysteresis=random_hysteresis(rng, law),
+        dynamics=random_dynamics(rng),
+        delay=delay,
+        effects=tuple(effects),
+    )
+
+
+def random_effect(rng, name):
+    """Return an effect with each number of a visible one times 0.5 to 1.5, within its bounds."""
+    values = {}
+    for p in find_effect(name).parameters:
+        value = VISIBLE[name].get(p.name, p.default)
+        if p.kind == 'number' and value is not None and (p.name in VISIBLE[name] or not p.vector):
+            value = p.clip(np.asarray(value) * rng.uniform(0.5, 1.5, np.shape(value)))
+        if value is not None and (p.name in VISIBLE[name] or not p.vector):
+            values[p.name] = value
+    if name == 'gain_drift':
+        values['time'] = np.sort(values['time'])
+    if name == 'rate_dependent_hysteresis':
+        values |= {'exponent': rng.choice([1.0, 0.6]), 'levelling': rng.choice([0.0, 0.01])}
+        values |= {'lead': 1e-5, 'lead_stretch': 1e-4}
+    if name == 'saturation':
+        values |= dict([('knee', 0.0), ('low', -np.inf), ('high', np.inf)][: rng.integers(0, 3)])
+    return EffectSetting(name, values)
+
+
+def models():
+    """Return models by name: each effect by itself, all of them, and each law of H."""
+    rng = np.random.default_rng(11)
+    made = {}
+    for name in sorted(VISIBLE):
+        for i, law in enumerate(('plays', 'wide')):
+            made[f'{name}_{i}'] = random_model(rng, [random_effect(rng, name)], law)
+    for i, law in enumerate(('plays', 'wide', 'lags', 'both')):
+        made[f'h_{law}'] = random_model(rng, law=law)
+        made[f'all_{i}'] = random_model(
+            rng, [random_effect(rng, name) for name in rng.permutation(sorted(VISIBLE))], law
+        )
+    none = Hysteresis([], [], 0.1, 1.0, p0=0.05)
+    made['h_none'] = replace(PAPER, hysteresis=none, dynamics=Dynamics.unit(), delay=Delay(0))
+    made['paper'] = PAPER
+    return made
+
+
+MODELS = models()
+
+
+@pytest.fixture(scope='module')
+def compiled(tmp_path_factory):
+    headers = {name: pi.export_c(model, name) for name, model in MODELS.items()}
+    return Compiled(tmp_path_factory.mktemp('headers'), headers)
+
+
+def test_every_effect_of_the_package_is_among_them():
+    own = {k for k, x in catalogue().items() if x.__module__.startswith('piezo_ident.')}
+    assert own == set(VISIBLE)
+
+
+def test_an_effect_that_is_not_written_in_c_is_refused_by_its_name(monkeypatch):
+    class Odd(effects.Effect):
+        name, slot, parameters = 'odd', 'output', ()
+
+        def process(self, block):
+            return block
+
+    monkeypatch.setattr(effects, 'catalogue', lambda: {'odd': Odd})
+    with pytest.raises(pi.ModelError, match='effect odd: is not written in C'):
+        pi.export_c(replace(PAPER, effects=(EffectSetting('odd', {}),)))
+
+
+@needs_compiler
+@pytest.mark.parametrize('name', MODELS)
+def test_prediction_is_that_of_python(name, compiled):
+    rng = np.random.default_rng(sum(map(ord, name)))
+    model, v = MODELS[name], random_drive(rng)
+    channel = np.cumsum(rng.standard_normal(v.size)) / 20.0
+    rest, y = compiled.predict(name, v, channel)
+    expected = model.simulate(v, channels={'other_axis': channel})
+    stroke = np.ptp(expected)
+    assert np.abs(y - expected).max() < CLOSE * stroke
+    assert abs(rest - model.stream().reset(v[0])) < CLOSE * stroke
