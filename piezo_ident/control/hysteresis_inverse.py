@@ -217,6 +217,11 @@ class HysteresisInverse:
         w, memory = self.hysteresis.follow(u, memory)
         self._take(memory, np.array([u[-1], w[-1], self._last[2]]))
 
+    @property
+    def value(self) -> float:
+        """H at the last voltage."""
+        return float(self._last[1])
+
     def _take(self, memory: Array, last: Array) -> None:
         m, lanes = self.hysteresis.thresholds.size, self._parameters[0].size
         self._memory = np.concatenate([memory[:m], np.zeros(lanes - m), memory[m:]])

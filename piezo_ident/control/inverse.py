@@ -149,7 +149,7 @@ def invert(
     bounds = float(s.u(low)), float(s.u(high))
     Q = linear_inverse(model)
     H = HysteresisInverse(model.hysteresis, bounds, slew / s.V / model.sample_rate)
-    u0 = _rest(model, float(s.x(y[0])), bounds)
+    u0 = _rest(model, float(s.x(y[0])), bounds, clip=clip)
     # the voltage moves before and after the motion
     lead, tail = Q.ahead, Q.behind
     x = np.pad(s.x(y), (lead, tail), mode='edge')
@@ -210,20 +210,21 @@ def _checked(wanted: ArrayLike) -> Array:
     return y
 
 
-def _rest(model: StageModel, x0: float, bounds: tuple[float, float]) -> float:
+def _rest(model: StageModel, x0: float, bounds: tuple[float, float], *, clip: bool) -> float:
     """Return the normalised voltage at which the model rests at a displacement."""
 
     def miss(u: float) -> float:
         return float(model.chain().reset(u, u)) - x0
 
     below, above = miss(bounds[0]), miss(bounds[1])
-    if below > SHORT or above < -SHORT:
+    if not clip and (below > SHORT or above < -SHORT):
         s = model.scaling
         ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
         raise DataError(
             f'the wanted motion starts at {1e6 * float(s.y(x0)):.4g} um; between '
             f'{s.v(bounds[0]):g} and {s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. '
-            f'{ends[1]:.4g} um'
+            f'{ends[1]:.4g} um',
+            options='--clip',
         )
     if below >= 0.0 or above <= 0.0:
         return bounds[0] if below >= 0.0 else bounds[1]

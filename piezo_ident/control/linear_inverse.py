@@ -33,8 +33,9 @@ Array = NDArray[np.float64]
 
 #: gain of G, as a share of the static one, below which it is not made up for
 EPSILON = 3e-2
-#: what may lie outside of the filter, as a share of the sum of its magnitudes
-OUTSIDE = 1e-9
+#: what may lie outside of the filter, as a share of the sum of its magnitudes: more than what
+#: rounding leaves of poles and zeros that lie close together
+OUTSIDE = 1e-7
 #: lengths of the filter that are tried [samples]
 SHORTEST, LONGEST = 1 << 11, 1 << 19
 

@@ -42,6 +42,8 @@ WORTH = 0.7
 #: what Q may miss before the present sample, as a share of the sum of its magnitudes, and its most
 #: samples there
 OUTSIDE, LONGEST = 1e-6, 8192
+#: samples in which a step fades that another voltage leaves
+JOIN = 2000
 #: share of a delay that a preview must exceed for Q to be worth anything
 BEYOND = 1.2
 #: error of the trial [% of stroke] from which the preview is called short
@@ -287,6 +289,9 @@ class _Pass:
         self._taps = Q.taps[::-1].copy()
         self._ahead, self._behind = Q.ahead + wait, Q.behind
         self._later, self._is_first, self._is_last = left * Q.ahead, is_first, left == 0
+        # H when something else let go of it, and how the step from there fades
+        self._w0: float | None = None
+        self._step, self._since = 0.0, JOIN
 
     def reset(self, v0: float) -> float:
         """Come to rest and return the displacement there [m]."""
@@ -295,7 +300,7 @@ class _Pass:
         x0 = float(s.x(y0))
         # a bent sensor, say, makes of the rest of the chain more than a gain
         self.origin = w0 - x0 * float(self._taps.sum())
-        self._tick = self._later
+        self._tick, self._w0, self._since = self._later, None, JOIN
         n, is_first = self._ahead, self._is_first
         self._x, self._w = np.full(n, x0), np.full(n, self.origin if is_first else w0)
         self._d = np.full(self._behind + n, x0 if is_first else 0.0)
@@ -315,6 +320,7 @@ class _Pass:
         y = self._run(v, tick)
         # nothing of a wanted motion is known any more
         self._x = self._w = np.empty(0)
+        self._w0 = self._H.value
         past = self._d[: self._behind]
         self._d = np.append(past, s.x(y) if self._is_first else np.zeros(v.size))[v.size :]
         return y
@@ -346,12 +352,23 @@ class _Pass:
             nothing = np.empty(0)
             return nothing, nothing, nothing, nothing, nothing > 0.0
         x, d = x[:n], d[: n + self._taps.size - 1]
-        goal = w[:n] + np.correlate(d, self._taps, 'valid')
+        goal = self._joined(w[:n] + np.correlate(d, self._taps, 'valid'))
         u, reached = self._H.process(goal)
         if not self._is_last:
             s = self._model.scaling
             d = x - s.x(self._run(s.v0 + s.V * u, self._tick))
         return x, d, reached, u, np.abs(goal - reached) > SHORT
+
+    def _joined(self, goal: Array) -> Array:
+        """Return what H should be, without a step behind a voltage that something else applied."""
+        if self._w0 is not None:
+            slope = goal[1] - goal[0] if goal.size > 1 else 0.0
+            self._step, self._w0, self._since = self._w0 + slope - goal[0], None, 0
+        if self._since < JOIN:
+            k = np.minimum(np.arange(self._since, self._since + goal.size) / JOIN, 1.0)
+            goal = goal + self._step * (0.5 + 0.5 * np.cos(np.pi * k))
+            self._since += goal.size
+        return goal
 
     def _run(self, v: Array, tick: int) -> Array:
         self._tick = tick + v.size

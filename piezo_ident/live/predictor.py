@@ -4,21 +4,18 @@
 """
 The prediction beside a running stage: block by block, through gaps, restarts and new models.
 
-The plays remember extremes of the voltage as far back as the start of the run, but only few of
-them: a loop inside a later stroke leaves no trace (the wiping-out property).  The remaining
-turning points, with the samples just before each, and the last seconds in full bring any new model
-into the state that it would have if it had run from the start.
+`piezo_ident.live.history` brings a new model into the state that it would have if it had run from
+the start.
 """
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.live.block_clock import BlockClock
+from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.stage_model import Scaling, StageModel
 from piezo_ident.model.stream import Stream
@@ -26,16 +23,12 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Predictor', 'TurningPoints', 'warm_up']
+__all__ = ['Predictor', 'warm_up']
 
-#: time over which the voltage is kept sample by sample, for G of a new model [s]
-RECENT = 5.0
 #: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
 BRIDGE = 0.5
-#: time before each turning point of which the samples are kept [s]
-APPROACH = 0.05
-#: shortest sampling period that is accepted [s], and most blocks that are kept
-SHORTEST, MOST_BLOCKS = 1e-7, 100_000
+#: shortest sampling period that is accepted [s]
+SHORTEST = 1e-7
 #: share of the voltage range that counts as its lower end, where the memory is known
 REST = 0.01
 
@@ -57,99 +50,6 @@ def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
     return FINE
 
 
-@kernel
-def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
-    # indices of the first and last sample, and of those at which the direction changes
-    n, before = 0, 0.0
-    for k in range(v.size):
-        after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
-        if k == 0 or after != before:
-            out[n] = k
-            n += 1
-        before = after
-    return n
-
-
-class TurningPoints:
-    """
-    The part of a voltage's history that determines the memory of any play operator.
-
-    Of four turning points in a row, the inner two are dropped when they lie between the outer
-    two.  The first point always stays.
-
-    Examples
-    --------
-    >>> points = TurningPoints()
-    >>> points.add(np.arange(6.0), np.array([0.0, 4.0, 1.0, 3.0, 2.0, 5.0]))
-    >>> points.values.tolist()
-    [0.0, 5.0]
-    """
-
-    def __init__(self) -> None:
-        # value of each point, and the samples that lead to it
-        self._points: list[tuple[float, Samples]] = []
-        self._tail = Samples(np.empty(0), np.empty(0))
-
-    def __len__(self) -> int:
-        return len(self._points)
-
-    def add(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        """Add the next samples: time [s] and voltage [V]."""
-        # most samples of a block lie between two turning points
-        turns = np.empty(v.size, dtype=np.int64)
-        turns = turns[: _turns(np.array(v, dtype=np.float64), turns)]
-        before = self._tail.t.size
-        t, v = np.concatenate([self._tail.t, t]), np.concatenate([self._tail.values, v])
-        first = np.searchsorted(t, t - APPROACH)
-        points = self._points
-        for k in (before + turns).tolist():
-            x, lead = float(v[k]), Samples(t[first[k] : k + 1], v[first[k] : k + 1])
-            if points and x == points[-1][0]:
-                continue
-            if len(points) > 1 and (points[-1][0] - points[-2][0]) * (x - points[-1][0]) > 0.0:
-                points.pop()
-            points.append((x, lead))
-            while len(points) > 3:
-                a, b, c, d = (value for value, _ in points[-4:])
-                if not min(a, d) <= min(b, c) <= max(b, c) <= max(a, d):
-                    break
-                del points[-3:-1]
-        self._tail = Samples(t[first[-1] :], v[first[-1] :])
-
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """Start, turning points and last sample [V]."""
-        return np.array([x for x, _ in self._points])
-
-    def path(self, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """
-        Return time [s] and voltage [V] of a path through the turning points.
-
-        For operators that depend on the speed.  The samples before each point are those that were
-        measured; short straight lines connect them.
-
-        Parameters
-        ----------
-        period : float
-            Sampling period [s].
-        """
-        parts_t: list[NDArray[np.float64]] = []
-        parts_v: list[NDArray[np.float64]] = []
-        for _, lead in self._points:
-            t, v = lead.t, lead.values
-            if parts_t:
-                end, level = float(parts_t[-1][-1]), float(parts_v[-1][-1])
-                t, v = t[t > end], v[t > end]
-                missing = min(float(t[0]) - end, APPROACH) / period
-                if missing > 1.5:
-                    share = np.linspace(0.0, 1.0, round(missing), endpoint=False)[1:]
-                    parts_t.append(end + (t[0] - end) * share)
-                    parts_v.append(level + (v[0] - level) * share)
-            parts_t.append(t)
-            parts_v.append(v)
-        return np.concatenate(parts_t), np.concatenate(parts_v)
-
-
 class Predictor:
     """
     Predicts the displacement as blocks of voltage come.
@@ -167,8 +67,7 @@ class Predictor:
         self._clear()
 
     def _clear(self) -> None:
-        self._old = TurningPoints()
-        self._recent: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
+        self._past = History()
         self._stream: Stream | None = None
         self._lowest = float('inf')
 
@@ -213,8 +112,8 @@ class Predictor:
         if np.isfinite(self._clock.period):
             self._check_rate(model)
         self.model = model
-        self._stream = self._caught_up(model) if self._recent else None
-        if self._recent and self.problem.startswith('the stream'):
+        self._stream = self._caught_up(model) if self._past else None
+        if self._past and self.problem.startswith('the stream'):
             self.problem = ''
 
     def _check_rate(self, model: StageModel) -> None:
@@ -227,16 +126,7 @@ class Predictor:
 
     def _caught_up(self, model: StageModel) -> Stream:
         stream = model.stream()
-        # without older samples the recent ones are the whole run
-        if len(self._old):
-            if model.effects_in('input') or model.effects_in('hysteresis'):
-                t, v = self._old.path(self._clock.period)
-            else:
-                # plays alone do not depend on time
-                v = self._old.values
-                t = np.zeros(v.size)
-            stream.recall(v, t)
-        t, v = (np.concatenate(x) for x in zip(*self._recent, strict=True))
+        t, v = self._past.recall(stream, model, self._clock.period)
         stream.process(v, t)
         return stream
 
@@ -305,7 +195,7 @@ class Predictor:
         if missing * self._clock.period > BRIDGE:
             self._clear()
             return
-        v0 = float(self._recent[-1][1][-1])
+        v0 = self._past.last
         share = np.arange(1, missing + 1) / (missing + 1)
         self._advance(t0 + (t1 - t0) * share, v0 + (v1 - v0) * share)
         self._lowest = float('inf')
@@ -328,10 +218,7 @@ class Predictor:
 
     def _remember(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         self._lowest = min(self._lowest, float(v.min()))
-        self._recent.append((t, v))
-        recent = self._recent
-        while t[-1] - recent[0][0][-1] > RECENT or len(recent) > MOST_BLOCKS:
-            self._old.add(*self._recent.popleft())
+        self._past.add(t, v)
 
 
 def warm_up() -> None:

@@ -6,8 +6,9 @@
 
 import numpy as np
 from piezo_ident.common.errors import ModelError
+from piezo_ident.live.history import TurningPoints
 from piezo_ident.live.monitor import LiveError, Matcher, Preview
-from piezo_ident.live.predictor import Predictor, TurningPoints
+from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -368,8 +369,8 @@ def test_ragged_time_and_clocks_faster_than_any_card_are_left_out(t):
 
 
 def test_blocks_that_are_kept_are_bounded(monkeypatch):
-    monkeypatch.setattr('piezo_ident.live.predictor.MOST_BLOCKS', 50)
+    monkeypatch.setattr('piezo_ident.live.history.MOST_BLOCKS', 50)
     predictor = Predictor()
     for b in [block(0, 2), *(block(k, 1) for k in range(2, 200))]:
         predictor.process(b)
-    assert len(predictor._recent) == 50
+    assert predictor._past.blocks == 50

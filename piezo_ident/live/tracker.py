@@ -1,0 +1,260 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+From a reference to a voltage, block by block: joined softly, within the limits, model after model.
+
+A reference that begins, or another one, is joined from where the stage is along a raised cosine,
+in metres.  A new model takes over in the state that it would have if it had run from the start;
+the reference is then joined from where that model says that the stage is, so that the voltage does
+not jump.  What leaves has passed a guard on the voltage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.history import History
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['Drive', 'Successor', 'Tracker']
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """
+    What leaves for a block of a reference.
+
+    Attributes
+    ----------
+    t, v, wanted : ndarray, shape (n,)
+        Time of the voltage's clock [s], voltage [V], and where the stage is wanted then [m].
+    clipped : int
+        Samples at which a limit keeps the stage from there.
+    """
+
+    t: Array
+    v: Array
+    wanted: Array
+    clipped: int
+
+
+@dataclass(frozen=True, eq=False)
+class Successor:
+    """A model that has been brought up to `count` samples of voltage."""
+
+    inverse: LiveInverse
+    count: int
+
+
+class Tracker:
+    """
+    Follows a reference with a model.
+
+    The stage is at rest before the first block.
+
+    Parameters
+    ----------
+    model : StageModel
+    settings : GuardSettings
+        At the rate of the model.
+    preview : int, optional
+        Samples by which the stage follows later.
+
+    Raises
+    ------
+    DataError, ModelError
+        When the model has no inverse within these limits; see `LiveInverse`.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> tracker = Tracker(model, GuardSettings(0, 10, 40e3, 20, 0, model.sample_rate))
+    >>> drive = tracker.process(np.full(20000, 30e-6))
+    >>> y = model.simulate(drive.v)
+    >>> bool(np.abs(y - drive.wanted).max() < 1e-8), float((1e6 * y[-1]).round(3))
+    (True, 30.0)
+    """
+
+    def __init__(self, model: StageModel, settings: GuardSettings, preview: int = PREVIEW) -> None:
+        self.settings, self.preview = settings, preview
+        self._inverse = self._built(model)
+        self._guard = Guard(settings)
+        self._past = History()
+        self._begin()
+
+    def _begin(self) -> None:
+        """Start at rest."""
+        start = self._inverse.position
+        self._raw = self._wanted = np.full(self.preview, start)
+        self._join = _Join(start, self._step())
+
+    @property
+    def inverse(self) -> LiveInverse:
+        """The inverse of the model that is followed."""
+        return self._inverse
+
+    @property
+    def tick(self) -> int:
+        """Samples that have left."""
+        return self._past.count
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the voltage of rest was sent last."""
+        return self._guard.is_at_rest
+
+    def _built(self, model: StageModel) -> LiveInverse:
+        s = self.settings
+        if abs(model.sample_rate / s.sample_rate - 1.0) > 1e-6:
+            raise ModelError(
+                f'the reference is sampled at {s.sample_rate:g} Hz, the model holds for '
+                f'{model.sample_rate:g} Hz; identify a model at the rate of the reference'
+            )
+        return LiveInverse(
+            model, limits=(s.low, s.high), slew=s.slew, preview=self.preview, rest=s.rest
+        )
+
+    def _step(self) -> float:
+        """Return the largest change of a ramp from one sample to the next [m]."""
+        scaling = self._inverse.model.scaling
+        return self.settings.ramp_step * abs(scaling.Y / scaling.V)
+
+    def process(self, reference: ArrayLike, restarted: bool = False) -> Drive:
+        """
+        Return the voltage for the next samples of a reference.
+
+        A sample that is no number leaves the last one in force.
+
+        Parameters
+        ----------
+        reference : array_like, shape (n,)
+            [m]
+        restarted : bool, optional
+            Whether another stream begins here, which is to be joined.
+
+        Returns
+        -------
+        Drive
+            Of as many samples, each for the reference `preview` samples before.
+        """
+        raw = np.asarray(reference, dtype=np.float64)
+        if raw.ndim != 1 or not raw.size:
+            raise DataError('a block of a reference is a vector of at least one number')
+        if restarted:
+            self._join = _Join(self._join.last, self._step())
+        wanted = self._join.process(raw)
+        self._raw = np.append(self._raw, raw)[-self.preview :]
+        self._wanted = np.append(self._wanted, wanted)
+        driven = self._inverse.process(wanted)
+        v = self._guard.process(driven.v).voltage
+        now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
+        return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
+
+    def finish(self) -> Drive:
+        """Return the voltage for what of the reference is still ahead; its last sample stays."""
+        return self.process(np.full(self.preview, self._raw[-1]))
+
+    def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
+        """Return time and voltage of the next samples of a ramp to rest; see `Guard.idle`."""
+        v = self._guard.idle(n, longest)
+        return self._sent(v), v
+
+    def _sent(self, v: Array) -> Array:
+        t = np.arange(self.tick, self.tick + v.size) / self.settings.sample_rate
+        self._past.add(t, v)
+        return t
+
+    # another model
+
+    def successor(self, model: StageModel, past: History) -> Successor:
+        """
+        Return a model in the state that it would have by now; from any thread.
+
+        Parameters
+        ----------
+        model : StageModel
+        past : History
+            A snapshot, see `past`.
+        """
+        inverse = self._built(model)
+        if past:
+            _, v = past.recall(inverse, model, 1.0 / self.settings.sample_rate)
+            inverse.follow(v, past.count - v.size)
+        return Successor(inverse, past.count)
+
+    def past(self) -> History:
+        """Return a snapshot of the voltage so far."""
+        return self._past.snapshot()
+
+    def take_over(self, successor: Successor) -> None:
+        """Go on with another model, from where it says that the stage is."""
+        self._inverse = successor.inverse
+        if self.tick > successor.count:
+            self._inverse.follow(self._past.since(successor.count), successor.count)
+        if not self.tick:
+            self._begin()
+            return
+        # the voltage is on its way: so must the wanted motion be
+        self._join = _Join(self._inverse.position, self._step(), moves=True)
+        self._wanted = self._join.process(self._raw)
+        self._inverse.process(self._wanted)
+
+
+class _Join:
+    """
+    Joins a reference along a raised cosine.
+
+    Parameters
+    ----------
+    start : float
+        Where the stage is [m].
+    step : float
+        Largest change by the cosine from one sample to the next [m].
+    moves : bool, optional
+        Whether it is on its way along the reference: then what parts it from there fades out.
+        From rest it is the motion that fades in, which leaves no range that both are in.
+
+    Attributes
+    ----------
+    last : float
+        The last sample [m].
+    """
+
+    def __init__(self, start: float, step: float, moves: bool = False) -> None:
+        self.last = self._start = self._command = start
+        self._step, self._moves = step, moves
+        self._length, self._done = -1, 0
+        self._distance = 0.0
+
+    def process(self, x: Array) -> Array:
+        """Return the next samples; one that is no number leaves the last one in force."""
+        x = self._finite(x)
+        if self._length < 0:
+            self._distance = self._start - float(x[0])
+            self._length = math.ceil(2.0 * abs(self._distance) / self._step)
+        if self._done < self._length:
+            tau = np.minimum((self._done + np.arange(x.size)) / self._length, 1.0)
+            left = 1.0 - tau + np.sin(2.0 * np.pi * tau) / (2.0 * np.pi)
+            self._done += x.size
+            x = x + (self._distance if self._moves else self._start - x) * left
+        self.last = float(x[-1])
+        return x
+
+    def _finite(self, x: Array) -> Array:
+        good = np.isfinite(x)
+        if not good.all():
+            x = np.append(self._command, x)
+            found = np.where(np.append(True, good), np.arange(x.size), 0)
+            x = x[np.maximum.accumulate(found)][1:]
+        self._command = float(x[-1])
+        return x

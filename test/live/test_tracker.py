@@ -1,0 +1,117 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""From a reference to a voltage: joined softly, safe, and glitch-free from model to model."""
+
+from dataclasses import replace
+
+from effect_table import VISIBLE
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from paper_stage import FS, PAPER
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.tracker import Tracker
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.hysteresis import Hysteresis
+import pytest
+
+SETTINGS = GuardSettings(0.0, 10.0, 40e3, 20.0, 0.0, FS)
+CREEP = replace(PAPER, effects=(EffectSetting('creep', VISIBLE['creep']),))
+
+
+def sine(seconds=1.0, frequency=20.0):
+    return 35e-6 + 20e-6 * np.sin(2 * np.pi * frequency * np.arange(round(seconds * FS)) / FS)
+
+
+def tracked(tracker, reference, size=100):
+    """Return time, voltage and wanted motion for a reference, in blocks."""
+    drives = [tracker.process(reference[k : k + size]) for k in range(0, reference.size, size)]
+    return [np.concatenate([getattr(d, name) for d in drives]) for name in ('t', 'v', 'wanted')]
+
+
+def test_a_reference_is_joined_from_rest_and_followed_a_preview_later():
+    tracker, reference = Tracker(PAPER, SETTINGS, 300), sine()
+    t, v, wanted = tracked(tracker, reference)
+    assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
+    # from 35 um in twice the time that 20 V/s take to there
+    assert v[0] == 0.0
+    assert np.abs(np.diff(v[:4000])).max() < 2e-2
+    joined = np.flatnonzero(np.abs(wanted[300:] - reference[:-300]) > 1e-12)[-1]
+    assert 0.4 * FS < joined < 0.8 * FS
+    assert np.abs(PAPER.simulate(v) - wanted).max() < 1e-8
+    # its end is played, then it ramps to rest
+    end = tracker.finish()
+    assert np.abs(end.wanted - reference[-300:]).max() < 1e-12
+    assert end.t[0] == v.size / FS
+    while not tracker.is_at_rest:
+        tracker.idle(100)
+
+
+def test_how_it_is_cut_changes_nothing():
+    reference = sine(0.1)
+    one = tracked(Tracker(CREEP, SETTINGS), reference, 2000)
+    other = tracked(Tracker(CREEP, SETTINGS), reference, 77)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-10)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_limits_and_slew_hold_whatever_comes(seed):
+    rng = np.random.default_rng(seed)
+    guard = GuardSettings(1.0, 9.0, 10.0 ** rng.uniform(2.0, 5.0), 20.0, 2.0, FS)
+    tracker, parts, models = Tracker(PAPER, guard), [], [CREEP, PAPER]
+    for k in range(12):
+        block = 1e-4 * rng.standard_normal(int(rng.integers(1, 300)))
+        block[rng.random(block.size) < 0.05] = rng.choice([np.nan, np.inf, 1.0])
+        parts.append(tracker.process(block, restarted=bool(rng.random() < 0.2)).v)
+        if k % 5 == 4:
+            tracker.take_over(tracker.successor(models[k % 2], tracker.past()))
+    parts += [tracker.finish().v, tracker.idle(3000)[1]]
+    v = np.concatenate(parts)
+    assert v.min() >= 1.0 and v.max() <= 9.0
+    step = guard.step * (1 + 1e-9)
+    assert np.abs(np.diff(v, prepend=2.0)).max() <= step + 1e-12
+
+
+@pytest.mark.parametrize('seconds', [0.5, 7.0])
+def test_another_model_takes_over_without_a_glitch(seconds):
+    # one with other plays, creep and gain; beyond the seconds that are kept in full too
+    h = PAPER.hysteresis
+    plays = Hysteresis(h.thresholds, 0.9 * h.weights, h.p1, h.p2 + 0.05)
+    other = replace(CREEP, hysteresis=plays)
+    reference = sine(seconds + 1.5, 5.0)
+    k = round(seconds * FS)
+    plain = tracked(Tracker(PAPER, SETTINGS), reference)[1]
+    tracker = Tracker(PAPER, SETTINGS)
+    before = tracked(tracker, reference[:k])
+    successor = tracker.successor(other, tracker.past())
+    # the stream goes on while it is made
+    between = tracked(tracker, reference[k : k + 1000])
+    tracker.take_over(successor)
+    after = tracked(tracker, reference[k + 1000 :])
+    v, wanted = (np.concatenate(z) for z in list(zip(before, between, after, strict=True))[1:])
+    # 2 V a sample are allowed
+    assert np.abs(np.diff(v)).max() < np.abs(np.diff(plain)).max() + 5e-3
+    assert np.abs(v[k + 1000 :] - plain[k + 1000 :]).max() > 0.05
+    # in the end the new model is where it is wanted, with the memory of the whole voltage
+    miss = np.abs(other.simulate(v) - wanted)
+    assert miss[-4000:].max() < 1e-8 < miss[k : k + 1000].max()
+    np.testing.assert_allclose(wanted[-4000:], reference[-4400:-400], atol=1e-12)
+
+
+def test_before_the_first_block_a_model_is_merely_replaced():
+    tracker = Tracker(PAPER, SETTINGS)
+    tracker.take_over(tracker.successor(CREEP, tracker.past()))
+    _, v, wanted = tracked(tracker, sine(0.5))
+    assert np.abs(CREEP.simulate(v) - wanted).max() < 1e-8
+
+
+def test_what_does_not_fit_is_refused():
+    tracker = Tracker(PAPER, SETTINGS)
+    with pytest.raises(ModelError, match='reference is sampled at 20000 Hz, the model holds for'):
+        tracker.successor(replace(PAPER, sample_rate=10_000.0), tracker.past())
+    with pytest.raises(DataError, match='at least one number'):
+        tracker.process([])
