@@ -31,6 +31,8 @@ NONE = 1e-13
 TRIALS = 80
 #: slope of H below which a step says nothing
 FLAT = 1e-6
+#: places at which it is tried whether H rises beyond its span
+FINE = 513
 
 
 @kernel
@@ -169,10 +171,15 @@ class HysteresisInverse:
     step : float, optional
         Largest change of the voltage from one sample to the next.
 
+    Attributes
+    ----------
+    limits : tuple of float
+        Those given, as far as H rises up to them.
+
     Raises
     ------
     ModelError
-        When H falls somewhere under a rising voltage.
+        When H falls somewhere under a rising voltage, within its span.
 
     Examples
     --------
@@ -200,7 +207,8 @@ class HysteresisInverse:
         self.hysteresis = hysteresis
         lags = hysteresis.relaxations
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
-        self._bounds = (float(limits[0]), float(limits[1]), float(step))
+        self.limits = _rising(hysteresis, float(limits[0]), float(limits[1]))
+        self._bounds = (*self.limits, float(step))
         self._memory = self._last = np.zeros(0)
 
     def reset(self, u0: float) -> float:
@@ -250,3 +258,19 @@ class HysteresisInverse:
             reached,
         )
         return u, reached
+
+
+def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
+    """Return the limits, nearer where H falls before them, or a whole span is left behind."""
+    least, most = hysteresis.span
+    if not -np.inf < low < high < np.inf or least <= low < high <= most:
+        return low, high
+    width = most - least
+    v = np.linspace(least - width, most + width, FINE)
+    w = hysteresis(np.concatenate([v, v[::-1]]))
+    up, down = np.diff(w[:FINE]), -np.diff(w[FINE:])[::-1]
+    # and where all plays stand
+    still = hysteresis.p2 * v + hysteresis.p0 * v**2 + hysteresis.p1 * v**3
+    falls = (up <= 0.0) | (down <= 0.0) | (np.diff(still) <= 0.0)
+    below, above = v[1:][falls & (v[1:] <= least)], v[:-1][falls & (v[:-1] >= most)]
+    return max([low, v[0], *below]), min([high, v[-1], *above])

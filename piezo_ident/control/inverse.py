@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,7 @@ from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
+from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
 
 __all__ = ['Inverse', 'invert']
@@ -38,10 +40,17 @@ PASSES = 30
 EXACT = 1e-5
 #: share of the error that a pass must leave at most for another one
 WORTH = 0.9
-#: difference of H from what is wanted, normalised, from which a motion is out of reach
+#: difference from the wanted motion that matters, in parts of its span, or of the model's where
+#: that is smaller
+MATTERS, LARGE = 1e-3, 0.1
+#: span of a motion that stands still, normalised
+STANDS = 1e-9
+#: difference from what is wanted at rest, normalised, from which it is out of reach
 SHORT = 1e-4
 #: change of the voltage [of the span of the model] that is none
 STILL = 1e-5
+#: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
+FAR, FAINT = 30.0, 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +74,8 @@ class Inverse(Showable):
     passes : int
         Runs of the model that were needed.
     error : float
-        100 rms(wanted - predicted) / (max wanted - min wanted): what the inversion leaves.
+        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: what the
+        inversion leaves; of the span of the model where the motion stands still.
     expected : float or None
         The error of the model [% of stroke], as of its diagnosis or its identification, if it is
         known: the stage will err by about as much.
@@ -101,6 +111,7 @@ def invert(
     slew: float = np.inf,
     clip: bool = False,
     channels: Mapping[str, ArrayLike] | None = None,
+    sample_rate: float | None = None,
 ) -> Inverse:
     """
     Return the voltage under which a model moves as wanted.
@@ -109,7 +120,8 @@ def invert(
     ----------
     model : StageModel
     wanted : array_like, shape (n,)
-        Displacement [m], sampled at the rate of the model; before and after it the stage rests.
+        Displacement [m], sampled at the rate of the model.  Before and after it the stage rests,
+        at its beginning as one that came there from its lowest voltage in one stroke.
     limits : tuple of float, optional
         Lowest and highest voltage [V]; the identified range when absent.
     slew : float, optional
@@ -118,6 +130,8 @@ def invert(
         Come as near as the limits allow, instead of refusing.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
+    sample_rate : float, optional
+        Of the wanted motion [Hz], where that is known: another one than the model's is refused.
 
     Returns
     -------
@@ -142,100 +156,182 @@ def invert(
     (True, True)
     """
     y = _checked(wanted)
-    low, high = model.scaling.range if limits is None else limits
-    if not (low < high and slew > 0.0):
-        raise DataError('invert: give limits as (lowest, highest) voltage, and a slew above zero')
+    if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
+        raise DataError(
+            f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
+            f'{model.sample_rate:g} Hz; give the motion at that rate'
+        )
     s = model.scaling
-    bounds = float(s.u(low)), float(s.u(high))
+    low, high, slew = _limits(s.range if limits is None else limits, slew)
     Q = linear_inverse(model)
-    H = HysteresisInverse(model.hysteresis, bounds, slew / s.V / model.sample_rate)
-    u0 = _rest(model, float(s.x(y[0])), bounds, clip=clip)
+    ends = float(s.u(low)), float(s.u(high))
+    H = HysteresisInverse(model.hysteresis, ends, slew / s.V / model.sample_rate)
+    low, high = map(s.v, H.limits)
+    if not low < high:
+        raise DataError(
+            f'invert: the limits lie beyond what the model holds for, {s.range[0]:g} .. '
+            f'{s.range[1]:g} V; give others'
+        )
+    u0 = _rest(model, y, H.limits, clip)
     # the voltage moves before and after the motion
     lead, tail = Q.ahead, Q.behind
     x = np.pad(s.x(y), (lead, tail), mode='edge')
-    more = {
-        name: np.pad(np.asarray(z, np.float64), (lead, tail), mode='edge')
-        for name, z in (channels or {}).items()
-    }
+    more = _padded(channels or {}, y.size, (lead, tail))
     t = (np.arange(x.size) - lead) / model.sample_rate
-    span = max(float(np.ptp(x)), 1e-300)
+    span = float(np.ptp(x))
+    span = span if span > STANDS else 1.0
+    small, near = MATTERS * min(span, LARGE), 2 * Q.reach + 1
+    free = np.ones(x.size, dtype=np.bool_)
     w = H.reset(u0) + Q(x - x[0])
     least, passes = np.inf, 0
     while passes < PASSES:
         H.reset(u0)
         u, reached = H.process(w)
         e = x - s.x(model.stream().process(s.v0 + s.V * u, t, more))
+        short = np.abs(w - reached) > small
+        if passes == 0 and not short.all():
+            # what is out of reach must not hide whether the rest converges
+            within = ~maximum_filter1d(short, near)
+            free = within if within.any() else free
         passes += 1
-        rms = float(np.sqrt(np.mean(e * e))) / span
+        rms = float(np.sqrt(np.mean(e[free] ** 2))) / span
         is_worth = rms < WORTH * least
         if rms < least:
-            least, best = rms, (u, e, np.abs(w - reached) > SHORT)
+            least, best = rms, (u, e, short)
         if rms < EXACT or not is_worth:
             break
         w = reached + Q(e)
     u, e, short = best
+    miss = maximum_filter1d(np.abs(e), near)
+    short &= miss > small
     # what of the lead and the tail is at rest goes
-    moves = np.flatnonzero(np.abs(u - u0) > STILL)
+    moves = np.flatnonzero(np.abs(u - u0) > STILL * min(span, 1.0))
     first = min(lead, int(moves[0]) - 1 if moves.size else lead)
     used = slice(max(first, 0), lead + y.size)
-    u, e, t, short = u[used], e[used], t[used], short[used]
-    warnings: tuple[str, ...] = ()
+    u, e, t, short, miss = u[used], e[used], t[used], short[used], miss[used]
+    predicted = s.y(x[used] - e)
+    warnings = []
     if short.any():
-        warnings = (_unreached(t[short], s.Y * e[short], (low, high), slew),)
+        warnings.append(_unreached(t[short], abs(s.Y) * float(miss[short].max()), low, high, slew))
         if not clip:
             raise DataError(*warnings, options='--clip')
+    e = e[~maximum_filter1d(short, near)]
+    left = float(np.sqrt(np.mean(e**2))) / span if e.size else 0.0
+    if left > MATTERS:
+        warnings.append(
+            f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
+            'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
+        )
+    v = s.v0 + s.V * u
+    warnings += _extrapolated(model, v, y)
     goal = np.pad(y, (lead, 0), mode='edge')[used]
-    predicted = s.y(x[used] - e)
+    lead -= used.start
     return Inverse(
         t=t,
-        v=s.v0 + s.V * u,
+        v=v,
         wanted=goal,
         predicted=predicted,
-        lead=lead - used.start,
+        lead=lead,
         clipped=short,
         passes=passes,
-        error=percent_of_stroke(goal, predicted),
+        error=percent_of_stroke(y, predicted[lead:], span * abs(s.Y)),
         expected=expected_error(model),
-        warnings=warnings,
+        warnings=tuple(warnings),
     )
 
 
 def _checked(wanted: ArrayLike) -> Array:
-    try:
-        y = np.asarray(wanted, dtype=np.float64)
-    except (TypeError, ValueError):
-        y = np.array(np.nan)
-    if y.ndim != 1 or y.size < 2 or not np.all(np.isfinite(y)):
-        raise DataError('invert: the wanted motion must be a vector of finite numbers, in metres')
+    y = _vector(wanted)
+    if y.size < 2 or not np.all(np.isfinite(y)):
+        raise DataError(
+            'invert: the wanted motion must be a vector of finite numbers, in metres, two at least'
+        )
     return y
 
 
-def _rest(model: StageModel, x0: float, bounds: tuple[float, float], *, clip: bool) -> float:
-    """Return the normalised voltage at which the model rests at a displacement."""
+def _vector(values: ArrayLike) -> Array:
+    """Return numbers as a vector, an empty one where they are none; NaN where masked."""
+    try:
+        given: Any = np.ma.asarray(values)
+        if given.ndim == 1 and np.isrealobj(given):
+            return np.asarray(given.astype(np.float64).filled(np.nan))
+    except (TypeError, ValueError):
+        pass
+    return np.empty(0)
+
+
+def _limits(limits: tuple[float, float], slew: float) -> tuple[float, float, float]:
+    """Return lowest and highest voltage and its speed as numbers."""
+    try:
+        (low, high), speed = map(float, limits), float(slew)
+    except (TypeError, ValueError):
+        low = high = speed = np.nan
+    if not (-np.inf < low < high < np.inf and speed > 0.0):
+        raise DataError(
+            'invert: give limits as (lowest, highest) voltage, finite, and a slew above zero'
+        )
+    return low, high, speed
+
+
+def _padded(
+    channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]
+) -> dict[str, Array]:
+    """Return the further signals as long as the voltage is."""
+    found = {name: _vector(z) for name, z in channels.items()}
+    for name, z in found.items():
+        if z.shape != (n,) or not np.all(np.isfinite(z)):
+            raise DataError(
+                f'invert: the channel {name!r} must be a vector of {n} finite numbers, one for '
+                'each of the wanted motion'
+            )
+    return {name: np.pad(z, around, mode='edge') for name, z in found.items()}
+
+
+def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
+    """Return the normalised voltage at which the model rests where a motion begins."""
+    s = model.scaling
+    x0 = float(s.x(y[0]))
 
     def miss(u: float) -> float:
         return float(model.chain().reset(u, u)) - x0
 
     below, above = miss(bounds[0]), miss(bounds[1])
-    if not clip and (below > SHORT or above < -SHORT):
-        s = model.scaling
+    if (below > SHORT or above < -SHORT) and not (clip and max(below, -above) < FAR):
         ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
+        is_far = max(below, -above) > FAR
         raise DataError(
-            f'the wanted motion starts at {1e6 * float(s.y(x0)):.4g} um; between '
-            f'{s.v(bounds[0]):g} and {s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. '
-            f'{ends[1]:.4g} um',
-            options='--clip',
+            f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
+            f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'
+            + ('; is the motion in metres?' if is_far else ''),
+            options='' if is_far else '--clip',
         )
     if below >= 0.0 or above <= 0.0:
         return bounds[0] if below >= 0.0 else bounds[1]
     return float(brentq(miss, *bounds, xtol=1e-14))
 
 
-def _unreached(t: Array, e: Array, limits: tuple[float, float], slew: float) -> str:
+def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
+    """Return a warning where the model is asked for what it was not identified for."""
+    s = model.scaling
+    (low, high), told = s.range, []
+    outside = np.mean((v < low - STILL * s.V) | (v > high + STILL * s.V))
+    if outside:
+        told.append(
+            f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '
+            f'identified range {low:g} .. {high:g} V, where the model is an extrapolation'
+        )
+    if 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
+        told.append(
+            f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
+            f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
+        )
+    return told
+
+
+def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:
     """Return how much of a motion the limits do not reach, and where."""
     speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'
     return (
         f'{t.size} samples of the wanted motion, between {t[0]:.4g} and {t[-1]:.4g} s, are out of '
-        f'reach within {limits[0]:g} .. {limits[1]:g} V{speed}: by up to '
-        f'{1e6 * float(np.abs(e).max()):.3g} um'
+        f'reach within {low:g} .. {high:g} V{speed}: by up to {1e6 * miss:.3g} um'
     )

@@ -33,11 +33,16 @@ Array = NDArray[np.float64]
 
 #: gain of G, as a share of the static one, below which it is not made up for
 EPSILON = 3e-2
-#: what may lie outside of the filter, as a share of the sum of its magnitudes: more than what
-#: rounding leaves of poles and zeros that lie close together
+#: what may lie outside of the filter, as a share of the sum of its magnitudes
 OUTSIDE = 1e-7
-#: lengths of the filter that are tried [samples]
-SHORTEST, LONGEST = 1 << 11, 1 << 19
+#: the same, where rounding leaves more
+ROUNDING = 1e-5
+#: the same, of what matters
+REACH = 1e-3
+#: slope of H that is none
+FLAT = 1e-6
+#: lengths of the filter that are tried [samples], and the shortest in parts of the delay
+SHORTEST, LONGEST, OF_DELAY = 1 << 11, 1 << 19, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,13 @@ class LinearInverse:
     ahead: int
     behind: int
 
+    @property
+    def reach(self) -> int:
+        """Samples before and after which the wanted motion matters by less than `REACH`."""
+        size = np.cumsum(np.abs(self.taps))
+        first, last = np.searchsorted(size, size[-1] * np.array([REACH, 1.0 - REACH]))
+        return int(max(self.ahead - first, last - self.ahead, 0))
+
     def __call__(self, x: Array) -> Array:
         """Return the filtered signal; beyond its ends it rests.  Shape (n,)."""
         padded = np.pad(x, (self.behind, self.ahead), mode='edge')
@@ -72,31 +84,36 @@ def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse
     Raises
     ------
     ModelError
-        When G has no static gain, or rings for longer than `LONGEST` samples.
+        When G has no static gain, or rings or waits for longer than `LONGEST` samples.
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
         raise ModelError('a model without a static gain has no inverse')
     n = SHORTEST
+    # a longer delay would come round
+    while n < OF_DELAY * model.total_delay.samples:
+        n *= 2
+    left = np.inf
     while n <= LONGEST:
         G = _response(model, n)
         Q = np.conj(G) / (np.abs(G) ** 2 + (epsilon * np.abs(G[0])) ** 2)
         taps = np.roll(np.fft.irfft(Q, n), n // 2)
         size = np.abs(taps)
-        total = float(size.sum())
         before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
         # half of it stays empty, so that nothing has come round
-        if before[n // 4] + after[-(n // 4)] < OUTSIDE * total:
-            first = int(np.searchsorted(before, 0.5 * OUTSIDE * total))
-            last = n - int(np.searchsorted(after[::-1], 0.5 * OUTSIDE * total))
-            first, last = min(first, n // 2), max(last, n // 2 + 1)
-            cut = taps[first:last]
+        last, left = left, float(before[n // 4] + after[-(n // 4)]) / float(before[-1])
+        # where poles lie close together, digits are lost that no length brings back
+        if left < OUTSIDE or 0.5 * last < left < ROUNDING:
+            share = 0.5 * max(OUTSIDE, 4.0 * left) * float(before[-1])
+            start = min(int(np.searchsorted(before, share)), n // 2)
+            stop = max(n - int(np.searchsorted(after[::-1], share)), n // 2 + 1)
+            cut = taps[start:stop]
             # the static gain of the whole model without effects; what they change is small
-            return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - first, last - 1 - n // 2)
+            return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - start, stop - 1 - n // 2)
         n *= 2
     raise ModelError(
-        f'the inverse of G rings for more than {LONGEST} samples; identify again with a lower '
-        'order'
+        f'the inverse of G and its delay takes more than {LONGEST} samples; identify again with a '
+        'lower order'
     )
 
 
@@ -111,14 +128,20 @@ def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
     delay = model.total_delay
     G = model.dynamics.response(np.fft.rfftfreq(n), 1.0) * z**delay.samples
     G = G * ((1.0 - delay.fraction) + delay.fraction * z)
-    impulse = np.zeros(n)
+    impulse, none = np.zeros((2, n))
     impulse[0] = 1.0
     t = np.arange(n) / model.sample_rate
+    # what goes by H, as if H were a line; with one much steeper than H nothing would converge
+    h = model.hysteresis
+    slope = np.sqrt(np.ptp(h(h.span)) / np.ptp(h.span) * max(h.lowest_slope(), FLAT))
     for setting in model.effects:
         effect = find_effect(setting.name)
-        if not is_filter(effect):
+        if not effect.in_dynamics or effect.in_delay_line:
             continue
-        operator = effect(model.sample_rate, setting.parameters)
-        operator.reset(0.0, 0.0)
-        G = G * np.fft.rfft(operator.process(Block(t=t, v=impulse, x=impulse)).x)
+        of = []
+        for v, x in ((none, impulse), (impulse / slope, none)):
+            operator = effect(model.sample_rate, setting.parameters)
+            operator.reset(0.0, 0.0)
+            of.append(np.fft.rfft(operator.process(Block(t=t, v=v, x=x)).x))
+        G = G * of[0] + of[1]
     return np.asarray(G, dtype=np.complex128)
