@@ -24,6 +24,11 @@ docs = [
     'sphinx-design>=0.6,<1',
 ]
 
+# to compile, check and run what is exported as FMU
+fmu = [
+    'FMPy>=0.3.32,<0.4',
+]
+
 # formats of files whose readers no ROS key brings
 files = [
     'npTDMS>=1.7,<2',
@@ -42,7 +47,7 @@ setup(
     packages=find_packages(include=[package_name, f'{package_name}.*']),
     package_data={
         package_name: [
-            *('py.typed', 'export/templates/*.h', 'report/templates/*.html', 'schemas/*.json')
+            *('py.typed', 'export/templates/*.*', 'report/templates/*.html', 'schemas/*.json')
         ]
     },
     data_files=[
@@ -79,10 +84,12 @@ setup(
         'cluster': cluster,
         'docs': docs,
         'files': files,
+        'fmu': fmu,
         'test': [
             *cluster,
             *docs,
             *files,
+            *fmu,
             *lint,
             'hypothesis>=6,<7',
             'ipykernel>=6,<8',

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
+    from piezo_ident.export.fmu import export_fmu
     from piezo_ident.export.header import export_c
     from piezo_ident.identification.identify import identify
     from piezo_ident.identification.results import Identification, Settings
@@ -74,6 +75,7 @@ _HOMES = {
     'diagnose': 'diagnosis.diagnose',
     'effects': 'effects',
     'export_c': 'export.header',
+    'export_fmu': 'export.fmu',
     'free_run': 'model.free_run',
     'identify': 'identification.identify',
     'invert': 'control.inverse',
@@ -109,6 +111,7 @@ __all__ = [
     'diagnose',
     'effects',
     'export_c',
+    'export_fmu',
     'free_run',
     'identify',
     'invert',

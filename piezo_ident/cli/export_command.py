@@ -14,41 +14,53 @@ from piezo_ident.cli.outputs import check_distinct, check_file, check_suffix
 from piezo_ident.cli.records import naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import write_text
+from piezo_ident.export.fmu import export_fmu
 from piezo_ident.export.header import export_c
 from piezo_ident.model.files import load
 
 __all__ = ['export_command']
+
+SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
 
 def export_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident export``."""
     if args.out is None:
         raise ConfigError('export: no file is named', options='--out stage.h')
-    check_suffix(args.out, ('.h',), 'a header')
+    check_suffix(
+        args.out, [SUFFIXES[args.format]] if args.format else SUFFIXES.values(), 'a model'
+    )
     check_distinct(args.out, [args.model])
     check_file(args.out, overwrite=args.overwrite)
+    is_header = args.out.suffix.lower() == '.h'
+    if not is_header and (args.limits or args.slew):
+        raise ConfigError(
+            f'{args.out}: has no feed-forward, whose voltage --limits and --slew keep; leave them '
+            'out, or write a header .h'
+        )
     name = args.name or re.sub(r'\W', '_', args.out.stem, flags=re.ASCII).lower()
     model = load(args.model)
-    with naming(str(args.model)):
-        header = export_c(
-            model,
-            name,
-            limits=args.limits,
-            slew=args.slew or math.inf,
-            title=f'The stage of {args.model.name}',
-        )
-    with deferred_interrupts():
-        write_text(args.out, header)
-    has_inverse = f'{name}_feedforward_step' in header
-    console.say(f'wrote {args.out}: {name}_step' + has_inverse * f', {name}_feedforward_step')
-    if not has_inverse:
+    title = f'The stage of {args.model.name}'
+    functions = []
+    with naming(str(args.model)), deferred_interrupts():
+        if is_header:
+            header = export_c(
+                model, name, limits=args.limits, slew=args.slew or math.inf, title=title
+            )
+            write_text(args.out, header)
+            known = (f'{name}_step', f'{name}_feedforward_step')
+            functions = [function for function in known if f'{function}(' in header]
+        else:
+            export_fmu(model, args.out, name)
+    console.say(' '.join([f'wrote {args.out}', *([f'with {", ".join(functions)}'] * is_header)]))
+    if len(functions) == 1:
         console.say('  warning: there is no feed-forward; the head of the file says why')
     console.result(
         {
             'model': str(args.model),
             'out': str(args.out),
-            'format': args.format,
+            'format': 'c' if is_header else 'fmu',
             'name': name,
-            'feedforward': has_inverse,
+            'functions': functions,
         }
     )

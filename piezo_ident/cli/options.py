@@ -178,8 +178,8 @@ INVERT = [
 ]
 
 EXPORT = [
-    _option('--out', _file, 'FILE', 'Header .h.'),
-    _option('--format', click.Choice(['c']), None, 'Of the file (default: c).', default='c'),
+    _option('--out', _file, 'FILE', 'Header .h or unit .fmu.'),
+    _option('--format', click.Choice(['c', 'fmu']), None, 'Of the file (default: by its ending).'),
     _option('--name', _name, 'NAME', 'With which names in it begin (default: that of the file).'),
     OVERWRITE,
 ]

@@ -32,7 +32,7 @@ from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, links_of, Part
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['export_c']
+__all__ = ['c_number', 'export_c', 'render']
 
 #: [spans] beyond which no displacement is looked for
 FAR = 100.0
@@ -61,6 +61,7 @@ def export_c(
     limits: tuple[float, float] | None = None,
     slew: float = math.inf,
     title: str = '',
+    feedforward: bool = True,
 ) -> str:
     """
     Return a model as a C header: prediction and feed-forward, sample by sample.
@@ -76,6 +77,8 @@ def export_c(
         Largest speed of its voltage [V/s].
     title : str, optional
         First line of the header.
+    feedforward : bool, optional
+        Whether the header has a feed-forward.
 
     Returns
     -------
@@ -108,12 +111,12 @@ def export_c(
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
     channels = Part(links).channels
-    why = ''
-    feedforward = None
-    try:
-        feedforward = _feedforward(model, front, back, (low, high), slew)
-    except ModelError as error:
-        why = str(error)
+    why, ff = 'it was not asked for', None
+    if feedforward:
+        try:
+            ff = _feedforward(model, front, back, (low, high), slew)
+        except ModelError as error:
+            why = str(error)
     scaling = model.scaling
     values: dict[str, Any] = {
         'p': name,
@@ -121,27 +124,27 @@ def export_c(
         'title': textwrap.wrap(title.replace('*/', '') or repr(model), WIDTH),
         'hertz': f'{model.sample_rate:g}',
         'version': __version__,
-        'rate': _number(model.sample_rate),
-        **{k: _number(getattr(scaling, k)) for k in ('v0', 'V', 'y0', 'Y')},
+        'rate': c_number(model.sample_rate),
+        **{k: c_number(getattr(scaling, k)) for k in ('v0', 'V', 'y0', 'Y')},
         'links': links,
         'parts': {'front': front, 'linear': linear, 'back': back},
         'channels': channels,
         'why': textwrap.wrap(why, WIDTH),
-        'ff': feedforward,
+        'ff': ff,
     }
-    helpers = _render('helpers.h', still=_number(STILL), nothing=_number(NONE), trials=TRIALS)
-    if feedforward is not None:
+    helpers = render('helpers.h', still=c_number(STILL), nothing=c_number(NONE), trials=TRIALS)
+    if ff is not None:
         # oldest first, as the past lies in memory
-        listed = ', '.join(repr(float(x)) for x in feedforward.taps[::-1])
-        values['feedforward'] = _render(
+        listed = ', '.join(repr(float(x)) for x in ff.taps[::-1])
+        values['feedforward'] = render(
             'feedforward.h',
             **values,
-            inverted=feedforward.inverted,
+            inverted=ff.inverted,
             taps='\n'.join(textwrap.wrap(listed, WIDTH, break_on_hyphens=False)),
-            far=_number(FAR),
-            short=_number(SHORT),
+            far=c_number(FAR),
+            short=c_number(SHORT),
         )
-    return _render('stage.h', **values, helpers=helpers)
+    return render('stage.h', **values, helpers=helpers)
 
 
 def _feedforward(
@@ -175,10 +178,10 @@ def _feedforward(
     return _FeedForward(
         taps=Q.taps,
         ahead=Q.ahead,
-        gain=_number(model.dynamics.gain),
-        lowest=_number(low),
-        highest=_number(high),
-        step=_number(most / model.sample_rate),
+        gain=c_number(model.dynamics.gain),
+        lowest=c_number(low),
+        highest=c_number(high),
+        step=c_number(most / model.sample_rate),
         says=_says(model, front, inverted, back, Q),
         inverted=inverted,
     )
@@ -219,13 +222,15 @@ def _named(links: Sequence[Link]) -> str:
     return ', '.join(link.name for link in links if link.code.step)
 
 
-def _number(x: float) -> str:
+def c_number(x: float) -> str:
+    """Return a number as it is written in C."""
     if math.isinf(x):
         return 'HUGE_VAL' if x > 0.0 else '(-HUGE_VAL)'
     return repr(float(x)) if x >= 0.0 else f'({float(x)!r})'
 
 
-def _render(template: str, **values: Any) -> str:
+def render(template: str, **values: Any) -> str:
+    """Return a template of this room with its values filled in."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('piezo_ident.export', 'templates'),
         autoescape=False,

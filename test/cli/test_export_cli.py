@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import json
+from zipfile import ZipFile
 
 from command_line import refuse, succeed
 from paper_stage import PAPER
@@ -22,7 +23,7 @@ def model(tmp_path):
 def test_a_header_is_written(capsys, tmp_path, model):
     out = tmp_path / 'My-Stage.h'
     said = succeed(capsys, 'export', model, '--format', 'c', '--out', out, '--limits', 0, 9)
-    assert f'wrote {out}: my_stage_step, my_stage_feedforward_step' in said
+    assert f'wrote {out} with my_stage_step, my_stage_feedforward_step' in said
     header = out.read_text()
     assert 'The stage of model.yaml' in header and '#define MY_STAGE_HIGHEST 9.0' in header
     assert (
@@ -31,8 +32,17 @@ def test_a_header_is_written(capsys, tmp_path, model):
     )
     more = ['--overwrite', '--name', 'axis', '--slew', '5e3', '--json']
     result = json.loads(succeed(capsys, 'export', model, '--out', out, *more))
-    assert result['name'] == 'axis' and result['feedforward']
+    assert result['functions'] == ['axis_step', 'axis_feedforward_step']
     assert '#define AXIS_STEP 0.25' in out.read_text()
+
+
+def test_an_fmu_is_written(capsys, tmp_path, model):
+    out = tmp_path / 'stage.fmu'
+    result = json.loads(succeed(capsys, 'export', model, '--out', out, '--json'))
+    assert result['format'] == 'fmu' and result['functions'] == []
+    with ZipFile(out) as archive:
+        assert 'modelName="stage"' in archive.read('modelDescription.xml').decode()
+        assert 'sources/stage.h' in archive.namelist()
 
 
 def test_what_has_no_inverse_is_said(capsys, tmp_path, model):
@@ -44,7 +54,9 @@ def test_what_has_no_inverse_is_said(capsys, tmp_path, model):
     ('words', 'what'),
     [
         ([], '--out stage.h'),
-        (['--out', 'stage.txt'], 'choose .h'),
+        (['--out', 'stage.txt'], 'choose .h, .fmu'),
+        (['--out', 'stage.fmu', '--format', 'c'], 'choose .h'),
+        (['--out', 'stage.fmu', '--slew', '100'], 'has no feed-forward'),
         (['--out', 'stage.h', '--format', 'fortran'], 'fortran'),
         (['--out', '3.h'], '--name stage'),
         (['--out', 'stage.h', '--slew', '0'], 'no speed'),

@@ -1,0 +1,78 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A model as an FMU: the C header as a co-simulation of FMI 3.0, in source.
+
+FMI, the Functional Mock-up Interface, is a standard of the Modelica Association; its headers are
+those of the program that compiles the FMU, for example FMPy.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
+
+from piezo_ident import __version__
+from piezo_ident.common.files import temporary_output
+from piezo_ident.export.header import c_number, export_c, render
+from piezo_ident.export.links import links_of, Part
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['export_fmu']
+
+
+def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'stage') -> None:
+    """
+    Write a model as an FMU in source: FMI 3.0, co-simulation.
+
+    Its input is ``voltage`` [V], and ``x_<name>`` for each further channel; its output is
+    ``displacement`` [m].  A file that exists is replaced.
+
+    Parameters
+    ----------
+    model : StageModel
+    path : str or path-like
+    name : str, optional
+        Identifier of the model in C.
+
+    Raises
+    ------
+    ConfigError
+        When the name is none in C.
+    ModelError
+        When an effect of the model is not written in C.
+    DataError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.export_fmu(pi.SimulatedStage.load('paper').model, 'stage.fmu')
+    """
+    header = export_c(model, name, feedforward=False)
+    values = {
+        'p': name,
+        'P': name.upper(),
+        'title': name,
+        'version': __version__,
+        # another model is another FMU
+        'token': f'{{{uuid.uuid5(uuid.NAMESPACE_OID, header)}}}',
+        'period': repr(1.0 / model.sample_rate),
+        'rest': c_number(model.scaling.range[0]).strip('()'),
+        'channels': Part([link for part in links_of(model) for link in part.links]).channels,
+    }
+    files = {
+        'modelDescription.xml': render('modelDescription.xml', **values),
+        'sources/buildDescription.xml': render('buildDescription.xml', **values),
+        'sources/fmi3.c': render('fmi3.c', **values),
+        f'sources/{name}.h': header,
+    }
+    with (
+        temporary_output(os.fspath(path), overwrite=True) as target,
+        ZipFile(target, 'w') as archive,
+    ):
+        for file, text in files.items():
+            # without the time of writing the same model gives the same file
+            archive.writestr(ZipInfo(file), text, ZIP_DEFLATED)
