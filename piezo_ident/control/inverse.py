@@ -25,6 +25,8 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
+from piezo_ident.control.rate_inverse import RateInverse
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
@@ -165,7 +167,7 @@ def invert(
     low, high, slew = _limits(s.range if limits is None else limits, slew)
     Q = linear_inverse(model)
     ends = float(s.u(low)), float(s.u(high))
-    H = HysteresisInverse(model.hysteresis, ends, slew / s.V / model.sample_rate)
+    H = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
     low, high = map(s.v, H.limits)
     if not low < high:
         raise DataError(
@@ -285,6 +287,18 @@ def _padded(
                 'each of the wanted motion'
             )
     return {name: np.pad(z, around, mode='edge') for name, z in found.items()}
+
+
+def _of_hysteresis(
+    model: StageModel, ends: tuple[float, float], step: float
+) -> HysteresisInverse | RateInverse:
+    H = HysteresisInverse(model.hysteresis, ends, step)
+    for setting in model.effects:
+        if setting.name == RateDependentHysteresis.name and model.hysteresis.relaxations is None:
+            return RateInverse(
+                model.hysteresis, setting.parameters, model.sample_rate, H.limits, step
+            )
+    return H
 
 
 def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:

@@ -1,0 +1,86 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The inverse of plays that widen with speed: what is wanted comes out, cut or whole."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import FS, PAPER
+import piezo_ident as pi
+from piezo_ident.control.rate_inverse import RateInverse
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.hysteresis import Hysteresis
+import pytest
+
+LAW = {'exponent': 1.1, 'levelling': 0.02, 'cutoff': 500.0, 'stretch': 0.015, 'gain': -1e-4}
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_what_is_wanted_comes_out_and_cuts_change_nothing(seed):
+    rng = np.random.default_rng(seed)
+    m = int(rng.integers(1, 12))
+    h = Hysteresis(
+        np.sort(rng.uniform(0.02, 0.9, m)),
+        rng.uniform(0.0, 0.3, m),
+        float(rng.uniform(-0.1, 0.1)),
+        float(rng.uniform(0.5, 1.0)),
+    )
+    law = {
+        'exponent': float(rng.uniform(0.4, 1.5)),
+        'levelling': float(rng.uniform(0.0, 0.05)),
+        'cutoff': float(rng.uniform(200.0, 2000.0)),
+        'gain': float(rng.uniform(-1e-4, 1e-3)),
+        'stretch': float(rng.uniform(0.0, 0.02)),
+        'lead': float(rng.uniform(0.0, 1e-4)),
+        'lead_stretch': float(rng.uniform(0.0, 1e-3)),
+    }
+    t = np.arange(2000) / FS
+    tones = rng.uniform(1.0, 120.0, (3, 1))
+    u = 0.2 + 0.1 * np.sum(np.sin(2 * np.pi * tones * t), axis=0)
+    # what a voltage leads to is wanted again
+    w = RateDependentHysteresis(FS, law, h)
+    w.reset(u[0], u[0])
+    wanted = w.process(Block(t=t, v=u, x=u)).x
+    inverse = RateInverse(h, law, FS)
+    inverse.reset(u[0])
+    found, reached = inverse.process(wanted)
+    assert_allclose(reached, wanted, atol=1e-12)
+    again = RateDependentHysteresis(FS, law, h)
+    again.reset(u[0], u[0])
+    assert_allclose(again.process(Block(t=t, v=found, x=found)).x, wanted, atol=1e-11)
+    cut = RateInverse(h, law, FS)
+    cut.reset(u[0])
+    parts = np.split(wanted, np.sort(rng.integers(0, wanted.size, 5)))
+    assert_array_equal(np.concatenate([cut.process(part)[0] for part in parts]), found)
+
+
+@pytest.mark.parametrize('frequency', [10.0, 120.0])
+def test_a_model_with_it_is_inverted_at_once(frequency):
+    model = replace(PAPER, effects=(EffectSetting('rate_dependent_hysteresis', LAW),))
+    t = np.arange(6000) / FS
+    rise = np.minimum(1.0, t / 0.05)
+    drive = pi.invert(model, 35e-6 - 25e-6 * rise * np.cos(2 * np.pi * frequency * t))
+    assert drive.error < 0.005 and drive.passes <= 3
+    plain = pi.invert(PAPER, drive.wanted[drive.lead :])
+    told = model.simulate(plain.v)
+    assert 100 * np.std(told - plain.wanted) / np.ptp(plain.wanted) > 50 * drive.error
+
+
+def test_limits_hold():
+    h = PAPER.hysteresis
+    inverse = RateInverse(h, LAW, FS, (0.1, 0.8), 2e-3)
+    inverse.reset(0.4)
+    wanted = 0.5 + np.cumsum(np.random.default_rng(1).standard_normal(3000)) * 0.02
+    u, reached = inverse.process(wanted)
+    assert 0.1 <= u.min() and u.max() <= 0.8
+    assert np.abs(np.diff(np.append(0.4, u))).max() <= 2e-3 * (1 + 1e-9)
+    free = np.abs(np.diff(u, prepend=0.4)) < 1.9e-3
+    free &= (u > 0.101) & (u < 0.799)
+    assert_allclose(reached[free], wanted[free], atol=1e-9)
