@@ -129,6 +129,7 @@ setup(
             'model = piezo_ident.nodes.main:model',
             'recorder = piezo_ident.nodes.main:recorder',
             'player = piezo_ident.nodes.main:player',
+            'feedforward = piezo_ident.nodes.main:feedforward',
         ],
     },
 )

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+import threading
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,12 +89,13 @@ class Tracker:
     def __init__(self, model: StageModel, settings: GuardSettings, preview: int = PREVIEW) -> None:
         self.settings, self.preview = settings, preview
         self._inverse = self._built(model)
-        self._guard = Guard(settings)
-        self._past = History()
-        self._begin()
+        self._lock = threading.Lock()
+        self.reset()
 
-    def _begin(self) -> None:
-        """Start at rest."""
+    def reset(self) -> None:
+        """Be at rest, with the clock of the voltage at zero."""
+        self._guard, self._past = Guard(self.settings), History()
+        self._inverse.reset()
         start = self._inverse.position
         self._raw = self._wanted = np.full(self.preview, start)
         self._join = _Join(start, self._step())
@@ -169,9 +171,15 @@ class Tracker:
         v = self._guard.idle(n, longest)
         return self._sent(v), v
 
+    def hurry(self) -> None:
+        """Let the next ramp to rest be looked at anew, one that is under way too."""
+        self._guard = Guard(self.settings, self._guard.applied)
+
     def _sent(self, v: Array) -> Array:
         t = np.arange(self.tick, self.tick + v.size) / self.settings.sample_rate
-        self._past.add(t, v)
+        if v.size:
+            with self._lock:
+                self._past.add(t, v)
         return t
 
     # another model
@@ -193,17 +201,18 @@ class Tracker:
         return Successor(inverse, past.count)
 
     def past(self) -> History:
-        """Return a snapshot of the voltage so far."""
-        return self._past.snapshot()
+        """Return a snapshot of the voltage so far; from any thread."""
+        with self._lock:
+            return self._past.snapshot()
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from where it says that the stage is."""
         self._inverse = successor.inverse
+        if not self.tick:
+            self.reset()
+            return
         if self.tick > successor.count:
             self._inverse.follow(self._past.since(successor.count), successor.count)
-        if not self.tick:
-            self._begin()
-            return
         # the voltage is on its way: so must the wanted motion be
         self._join = _Join(self._inverse.position, self._step(), moves=True)
         self._wanted = self._join.process(self._raw)
@@ -240,7 +249,8 @@ class _Join:
         """Return the next samples; one that is no number leaves the last one in force."""
         x = self._finite(x)
         if self._length < 0:
-            self._distance = self._start - float(x[0])
+            before = 2.0 * x[0] - x[1] if self._moves and x.size > 1 else x[0]
+            self._distance = self._start - float(before)
             self._length = math.ceil(2.0 * abs(self._distance) / self._step)
         if self._done < self._length:
             tau = np.minimum((self._done + np.arange(x.size)) / self._length, 1.0)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The excitation node: plays programs on `voltage`.
+The excitation node: plays programs on `voltage`, or on `reference` for the feedforward node.
 
 Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every program; a
 block is sent when its first sample is due, counted from the first one.  `rate_factor` makes that
@@ -44,6 +44,8 @@ from std_msgs.msg import Float64MultiArray
 
 __all__ = ['ExcitationNode', 'main']
 
+#: unit of a program, and what it is in SI
+UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
 #: how long the ramp of a node that is ending may take [s]
 LAST_RAMP = 0.7
 #: most blocks that are sent at once after a delay
@@ -113,7 +115,9 @@ class ExcitationNode(LabNode):
         self._build(self.values['program'])
         # loads the kernel: the ramp of a stop, or of the end, must not wait for it
         Guard(self._guard_settings())
-        self._voltage = self.create_publisher(Float64MultiArray, 'voltage', STREAM)
+        self._quantity = self.values['quantity']
+        self._unit, self._scale = UNITS[self._quantity]
+        self._voltage = self.create_publisher(Float64MultiArray, self._quantity, STREAM)
         self._born = time.monotonic()
         self._listener: Any = None
         self.offer('start', self._start)
@@ -168,7 +172,7 @@ class ExcitationNode(LabNode):
         playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
         self._close_listener()
         self._listener = self.create_subscription(
-            Float64MultiArray, 'voltage', self._on_other, STREAM
+            Float64MultiArray, self._quantity, self._on_other, STREAM
         )
         self._playing = playing
         self._rate = Rate()
@@ -187,7 +191,7 @@ class ExcitationNode(LabNode):
         if playing is None or not self._is_playing():
             raise ConfigError('nothing is being played')
         playing.stop.set()
-        return f'ramping to {self.values["rest"]:g} V'
+        return f'ramping to {self.values["rest"]:g} {self._unit}'
 
     def _other_publishers(self) -> list[str]:
         """Return the other publishers of voltage; a namesake may be one that was killed."""
@@ -292,7 +296,7 @@ class ExcitationNode(LabNode):
         t = np.arange(playing.tick, playing.tick + v.size) / playing.sequence.sample_rate
         playing.tick += v.size
         playing.voltage, playing.segment = float(v[-1]), label
-        self._voltage.publish(to_message(Samples(t, v, label)))
+        self._voltage.publish(to_message(Samples(t, v * self._scale, label, self._quantity)))
         playing.work = time.perf_counter() - begin
 
     def _ramp(self, playing: Playing, state: str, message: str) -> None:
@@ -301,7 +305,9 @@ class ExcitationNode(LabNode):
         level = WARN if state == 'failed' else OK
         progress = math.floor(100.0 * playing.tick / playing.sequence.n)
         if playing.voltage is not None and playing.voltage != settings.rest:
-            self.report_status('stopping', progress, f'ramping to {settings.rest:g} V', level)
+            self.report_status(
+                'stopping', progress, f'ramping to {settings.rest:g} {self._unit}', level
+            )
             self._send_ramp(playing, Guard(settings, playing.voltage))
         self.report_status(state, progress, message, level)
 
@@ -328,7 +334,7 @@ class ExcitationNode(LabNode):
         if not self._is_playing():
             self._close_listener()
         foreign = self._other_publishers()
-        self._second = f'second publisher {foreign[0]} on voltage' if foreign else ''
+        self._second = f'second publisher {foreign[0]} on {self._quantity}' if foreign else ''
         values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
         if playing is None:
             return (WARN if foreign else OK), self._second or 'nothing played yet', values

@@ -14,7 +14,7 @@ import importlib
 
 from piezo_ident.nodes.ending import ENDING
 
-__all__ = ['excitation', 'identifier', 'model', 'player', 'recorder', 'stage']
+__all__ = ['excitation', 'feedforward', 'identifier', 'model', 'player', 'recorder', 'stage']
 
 
 def _run(node: str) -> None:
@@ -24,6 +24,7 @@ def _run(node: str) -> None:
 
 
 excitation = partial(_run, 'excitation')
+feedforward = partial(_run, 'feedforward')
 identifier = partial(_run, 'identifier')
 model = partial(_run, 'model')
 player = partial(_run, 'player')

@@ -5,23 +5,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import functools
 from pathlib import Path
-import queue
-import threading
 import time
 from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.common.files import parse_yaml
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
-from piezo_ident.model.files import load, model_from_dict
+from piezo_ident.model.files import load
 from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
+from piezo_ident.nodes.model_loader import ModelLoader
 from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
@@ -30,8 +28,6 @@ from std_msgs.msg import Float64MultiArray, String
 __all__ = ['ModelNode', 'main']
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
-#: where a model comes from, and what reads it
-Wish = tuple[str, Callable[[], StageModel]]
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4
 
@@ -52,12 +48,7 @@ class ModelNode(LabNode):
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
         self._models = 0
-        # models are read and compiled by a thread, the newest wish last
-        self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
-        self._loaded: queue.SimpleQueue[tuple[StageModel | None, str]] = queue.SimpleQueue()
-        self._loader: threading.Thread | None = None
-        self._is_ending = False
-        self._wake = self.create_guard_condition(self._take_loaded)
+        self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
@@ -84,45 +75,18 @@ class ModelNode(LabNode):
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, or another window."""
         if path := changed.get('model'):
-            self._load(path, lambda: load(path))
+            self._loader.load_file(path)
         if 'window' in changed:
             self._error.window = changed['window']
 
     def _on_model(self, message: String) -> None:
-        text, name = message.data, 'topic model'
-        self._load(name, lambda: model_from_dict(parse_yaml(text, name), name))
+        self._loader.load_text(message.data, 'topic model')
 
-    def _load(self, source: str, read: Callable[[], StageModel]) -> None:
-        # reading YAML and compiling take longer than a block: only the swap is done here
-        self._wishes.put((source, read))
-        if self._loader is None:
-            self._loader = threading.Thread(target=self._load_all, name='load', daemon=True)
-            self._loader.start()
-
-    def _load_all(self) -> None:
-        while True:
-            source, read = self._wishes.get()
-            while not self._wishes.empty():
-                source, read = self._wishes.get()
-            try:
-                self._loaded.put((_tried(read()), source))
-            except PiezoIdentError as error:
-                self._loaded.put((None, ' '.join(str(error).split())))
-            # a file or text from outside must not end the node, whatever is in it
-            except Exception as error:  # noqa: BLE001
-                self._loaded.put((None, f'{source}: {type(error).__name__}: {error}'))
-            if self._is_ending:
-                return
-            self._wake.trigger()
-
-    def _take_loaded(self) -> None:
-        while not self._loaded.empty():
-            model, source = self._loaded.get()
-            if model is None:
-                self._refuse_model(source)
-            else:
-                self._use(model, source)
-        self._report_state()
+    def _take_model(self, model: StageModel | None, source: str) -> None:
+        if model is None:
+            self._refuse_model(source)
+        else:
+            self._use(model, source)
 
     def _use(self, model: StageModel, source: str) -> None:
         try:
@@ -287,7 +251,7 @@ class ModelNode(LabNode):
 
     def close(self) -> None:
         """Wake nobody any more."""
-        self._is_ending = True
+        self._loader.close()
 
 
 def _tried(model: StageModel) -> StageModel:

@@ -62,6 +62,13 @@ def _rate() -> Declaration:
 EXCITATION = (
     _rate(),
     Declaration('program', 'identification', 'program to play: a name, a path, or YAML text'),
+    Declaration(
+        'quantity',
+        'voltage',
+        'topic and unit of the program: voltage in V, or reference in um',
+        choices=('voltage', 'reference'),
+        read_only=True,
+    ),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
         'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0
@@ -178,6 +185,8 @@ RECORDER = (
             'applied_voltage',
             'prediction',
             'residual',
+            'reference',
+            'tracking_error',
             'model',
             'report',
             'preview',
@@ -185,6 +194,7 @@ RECORDER = (
             'stage/status',
             'identifier/status',
             'model/status',
+            'feedforward/status',
             '/diagnostics',
         ),
         'topics to record',
@@ -217,6 +227,42 @@ PLAYER = (
     Declaration('autostart', False, 'start to replay at once', read_only=True),
 )
 
+FEEDFORWARD = (
+    _rate(),
+    Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    Declaration(
+        'preview',
+        0.02,
+        'time by which the stage follows the reference later, to know it ahead',
+        's',
+        1e-5,
+        10.0,
+        read_only=True,
+    ),
+    Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
+    Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),
+    Declaration('slew', 40000.0, 'steepest voltage that is ever sent', 'V/s', 1.0, 1e9),
+    Declaration(
+        'rest', 0.0, 'voltage before a reference, and to which a stop ramps', 'V', -1000.0, 1000.0
+    ),
+    Declaration(
+        'ramp_slew',
+        20.0,
+        'top speed of the ramps to rest and into a reference',
+        'V/s',
+        0.001,
+        1e6,
+    ),
+    Declaration(
+        'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0
+    ),
+    Declaration(
+        'subscribers', 1, 'how many must listen to voltage before the first block', '1', 0, 100
+    ),
+    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    Declaration('window', 2.0, 'time over which the tracking error is taken', 's', 0.1, 600.0),
+)
+
 #: the declarations of each node by its executable
 NODES: dict[str, tuple[Declaration, ...]] = {
     'excitation': EXCITATION,
@@ -225,4 +271,5 @@ NODES: dict[str, tuple[Declaration, ...]] = {
     'model': MODEL,
     'recorder': RECORDER,
     'player': PLAYER,
+    'feedforward': FEEDFORWARD,
 }

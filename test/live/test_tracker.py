@@ -93,8 +93,9 @@ def test_another_model_takes_over_without_a_glitch(seconds):
     tracker.take_over(successor)
     after = tracked(tracker, reference[k + 1000 :])
     v, wanted = (np.concatenate(z) for z in list(zip(before, between, after, strict=True))[1:])
-    # 2 V a sample are allowed
-    assert np.abs(np.diff(v)).max() < np.abs(np.diff(plain)).max() + 5e-3
+    # neither a step nor a kink: the motion itself bends by 0.9 mV from sample to sample
+    assert np.abs(np.diff(v)).max() < np.abs(np.diff(plain)).max() + 1e-5
+    assert np.abs(np.diff(v, 2))[k + 900 : k + 1100].max() < 3e-4
     assert np.abs(v[k + 1000 :] - plain[k + 1000 :]).max() > 0.05
     # in the end the new model is where it is wanted, with the memory of the whole voltage
     miss = np.abs(other.simulate(v) - wanted)

@@ -1,0 +1,92 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Models that come while a node works: a thread reads and compiles them, the newest wish last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import queue
+import threading
+from typing import Generic, TypeVar
+
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.common.files import parse_yaml
+from piezo_ident.model.files import load, model_from_dict
+from piezo_ident.model.stage_model import StageModel
+from rclpy.node import Node
+
+__all__ = ['ModelLoader']
+
+T = TypeVar('T')
+
+
+class ModelLoader(Generic[T]):
+    """
+    Reads models in a thread, for reading YAML and compiling take longer than a block.
+
+    Parameters
+    ----------
+    node : Node
+    prepare : callable
+        Makes of a model what the node needs; called by the thread.
+    take : callable
+        Gets that and where the model is from, or None and why there is none; called by the
+        executor of the node, one after the other.
+    done : callable
+        Called after all of them.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        prepare: Callable[[StageModel], T],
+        take: Callable[[T | None, str], None],
+        done: Callable[[], None],
+    ) -> None:
+        self._prepare, self._take, self._done = prepare, take, done
+        self._wishes: queue.SimpleQueue[tuple[str, Callable[[], StageModel]]] = queue.SimpleQueue()
+        self._loaded: queue.SimpleQueue[tuple[T | None, str]] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._is_ending = False
+        self._wake = node.create_guard_condition(self._take_loaded)
+
+    def load_file(self, path: str) -> None:
+        """Load a file."""
+        self.load(path, lambda: load(path))
+
+    def load_text(self, text: str, name: str) -> None:
+        """Load the text of a file."""
+        self.load(name, lambda: model_from_dict(parse_yaml(text, name), name))
+
+    def load(self, source: str, read: Callable[[], StageModel]) -> None:
+        """Load what a function returns."""
+        self._wishes.put((source, read))
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._load_all, name='load', daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Wake nobody any more."""
+        self._is_ending = True
+
+    def _load_all(self) -> None:
+        while True:
+            source, read = self._wishes.get()
+            while not self._wishes.empty():
+                source, read = self._wishes.get()
+            try:
+                self._loaded.put((self._prepare(read()), source))
+            except PiezoIdentError as error:
+                self._loaded.put((None, ' '.join(str(error).split())))
+            # a file or text from outside must not end the node, whatever is in it
+            except Exception as error:  # noqa: BLE001
+                self._loaded.put((None, f'{source}: {type(error).__name__}: {error}'))
+            if self._is_ending:
+                return
+            self._wake.trigger()
+
+    def _take_loaded(self) -> None:
+        while not self._loaded.empty():
+            self._take(*self._loaded.get())
+        self._done()

@@ -1,0 +1,192 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The feedforward node as a process, with a simulated stage; the reference is the test's."""
+
+import time
+
+from course import block, column, FS, paper
+from graph import best_of_three, Graph, Late
+import numpy as np
+import pytest
+from std_msgs.msg import Float64MultiArray
+
+SIZE = 200
+CREEP = {'name': 'creep', 'parameters': {'gain': [0.02], 'time_constant': [0.1]}}
+
+
+def reference(seconds=1.0, frequency=20.0):
+    """Return a sine around the middle of the stroke [m]."""
+    t = np.arange(round(seconds * FS)) / FS
+    return 35e-6 + 20e-6 * np.sin(2 * np.pi * frequency * t)
+
+
+def state(g):
+    return g.status('feedforward')['state']
+
+
+def is_in(g, wanted):
+    g.wait(lambda: state(g) == wanted, wanted)
+
+
+def sent(g, x, tick=0, pace=1.0):
+    """Send a reference in real time; return when the node has answered all of it."""
+    voltage = g.collect('voltage')
+    before, begin = sum(b.t.size for b in voltage), time.monotonic()
+    for k in range(0, x.size, SIZE):
+        time.sleep(max(0.0, begin + pace * k / FS - time.monotonic()))
+        g.publish('reference', block(tick + k, x[k : k + SIZE], 'scan', 'reference'))
+    g.wait(lambda: sum(b.t.size for b in voltage) >= before + x.size, 'the answers')
+
+
+@pytest.fixture(scope='module')
+def lab():
+    with Graph() as g:
+        for topic in ('voltage', 'displacement', 'tracking_error', 'applied_voltage'):
+            g.collect(topic)
+        g.start_all(
+            ('stage', {'seed': 3, 'silence': 60.0}),
+            ('feedforward', {'silence': 0.3, 'ramp_slew': 100.0, 'window': 0.3}),
+        )
+        g.matched('displacement')
+        g.matched('tracking_error')
+        yield g
+
+
+def given(g, text):
+    """Publish a model, and wait until the node has it."""
+    seen = int(g.status('feedforward')['models'])
+    g.publish_text('model', text)
+    g.wait(lambda: int(g.status('feedforward')['models']) > seen, 'the model')
+
+
+def armed(g):
+    """Start with the stage's own model, and wait until a reference may come."""
+    given(g, paper())
+    ok, said = g.call('feedforward/start')
+    assert ok and 'follows the reference 0.02 s later' in said, said
+    is_in(g, 'ready')
+
+
+def test_without_a_model_it_does_not_start(lab):
+    ok, said = lab.call('feedforward/start')
+    assert not ok and 'there is no model' in said
+    assert lab.call('feedforward/stop') == (False, 'the node does not drive')
+
+
+def test_the_stage_goes_where_it_is_told(lab):
+    armed(lab)
+    voltage, errors = lab.collect('voltage'), lab.collect('tracking_error')
+    assert not voltage
+    x = reference()
+    sent(lab, x)
+    is_in(lab, 'done')
+    t, v = column(voltage)
+    assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
+    assert v[0] == 0.0 == v[-1]
+    assert list(dict.fromkeys(b.segment for b in voltage)) == ['scan', 'ramp:stop']
+    # what the stage measured, where the node said
+    lab.wait(lambda: sum(b.t.size for b in errors) >= x.size + 400, 'the errors')
+    t, e = column(errors)
+    ty, y = column(lab.collect('displacement'))
+    assert t.tobytes() == ty[: t.size].tobytes()
+    np.testing.assert_allclose((e + y[: t.size])[-x.size // 2 :], x[-x.size // 2 :], atol=1e-12)
+    # converters of 16 bit, noise of 1.5 nm
+    assert 100.0 * np.sqrt(np.mean(e**2)) / np.ptp(x) < 0.02
+    assert float(lab.status('feedforward')['tracking_percent']) < 0.02
+
+
+def test_another_model_takes_over_while_the_stage_moves(lab):
+    armed(lab)
+    voltage, x = lab.collect('voltage'), reference(1.2)
+    since = len(voltage)
+    sent(lab, x[: x.size // 2])
+    given(lab, paper(effects=[CREEP]))
+    sent(lab, x[x.size // 2 :], x.size // 2)
+    assert state(lab) == 'tracking'
+    refused, why = lab.set('feedforward', 'voltage_high', 9.0)
+    assert not refused and 'while the node drives' in why
+    ok, said = lab.call('feedforward/start')
+    assert not ok and 'drives already' in said
+    assert lab.call('feedforward/stop') == (True, 'ramping to 0 V')
+    is_in(lab, 'stopped')
+    # the sine moves by 20 mV a sample
+    _, v = column([b for b in voltage[since:] if b.segment == 'scan'])
+    assert np.abs(np.diff(v)).max() < 0.03
+    _, down = column([b for b in voltage[since:] if b.segment == 'ramp:stop'])
+    assert down[-1] == 0.0 and np.all(np.diff(down) <= 0)
+    assert -np.diff(down).min() * FS <= 100.0 * (1 + 1e-9)
+
+
+def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
+    armed(lab)
+    voltage, since = lab.collect('voltage'), len(lab.statuses('feedforward'))
+    first = len(voltage)
+    bad = np.full(SIZE, 35e-6)
+    bad[5:9] = np.nan, np.inf, 1.0, -1.0
+    sent(lab, bad)
+    # 400 samples are missing, one block comes twice, one is no reference
+    sent(lab, np.full(SIZE, 35e-6), SIZE + 400)
+    for b in (
+        block(SIZE, bad, 'scan', 'reference'),
+        block(5 * SIZE, bad, 'scan', 'voltage'),
+        block(4 * SIZE, np.full(SIZE, 90e-6), 'scan', 'reference'),
+    ):
+        lab.publish('reference', b)
+    is_in(lab, 'done')
+    said = {s['text'] for s in lab.statuses('feedforward')[since:] if s['level'] == '1'}
+    for what in ('400 samples are missing', 'came', 'expected is reference', 'out of reach'):
+        assert any(what in text for text in said), (what, said)
+    t, v = column(voltage[first:])
+    assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
+    assert v.min() >= 0.0 and v.max() <= 10.0
+    assert np.abs(np.diff(v)).max() * FS <= 40_000.0 * (1 + 1e-9)
+
+
+def test_one_drives_at_a_time(lab):
+    armed(lab)
+    assert lab.call('feedforward/stop')[0]
+    is_in(lab, 'stopped')
+    # somebody else drives
+    tick = iter(range(0, 10**9, SIZE))
+    drive = lambda: lab.publish('voltage', block(next(tick), np.zeros(SIZE)))  # noqa: E731
+    drive()
+    assert lab.call('feedforward/start')[0]
+    lab.wait(lambda: state(lab) == 'failed', 'the refusal', meanwhile=drive)
+    assert 'observer drives /voltage now' in lab.status('feedforward')['text']
+    # who is silent is no hindrance, who comes later is told
+    assert lab.call('feedforward/start')[0]
+    is_in(lab, 'ready')
+    second = lab.node.create_publisher(Float64MultiArray, 'voltage', 10)
+    lab.forget(second)
+    assert lab.call('feedforward/stop')[0]
+    is_in(lab, 'stopped')
+    lab.unpublish('voltage')
+    # and nobody listens
+    assert lab.set('feedforward', 'subscribers', 5)[0]
+    assert lab.set('feedforward', 'wait_limit', 0.1)[0]
+    status = lab.finish('feedforward/start')
+    assert status['state'] == 'failed' and 'of 5 subscribers on /voltage' in status['text']
+    assert lab.set('feedforward', 'subscribers', 1)[0]
+    assert lab.set('feedforward', 'wait_limit', 10.0)[0]
+
+
+def test_a_signal_ramps_to_rest(lab):
+    def attempt():
+        handle = lab.handle('feedforward')
+        if handle.process.poll() is not None:
+            lab.restart(handle)
+            lab.matched('tracking_error')
+        armed(lab)
+        voltage, since = lab.collect('voltage'), len(lab.collect('voltage'))
+        sent(lab, reference(0.6))
+        begin = time.monotonic()
+        assert lab.handle('feedforward').stop() == 0
+        took = time.monotonic() - begin
+        lab.wait(lambda: voltage[-1].values[-1] == 0.0, 'rest')
+        _, v = column(voltage[since:])
+        assert np.abs(np.diff(v)).max() < 0.1
+        if took > 2.0:
+            raise Late(f'{took:.2f} s')
+
+    best_of_three(attempt)
