@@ -16,7 +16,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from piezo_ident import __version__
 from piezo_ident.common.files import temporary_output
-from piezo_ident.export.header import c_number, export_c, render
+from piezo_ident.export.header import c_number, export_c, plain_text, render
 from piezo_ident.export.links import links_of, Part
 from piezo_ident.model.stage_model import StageModel
 
@@ -52,6 +52,7 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
     >>> pi.export_fmu(pi.SimulatedStage.load('paper').model, 'stage.fmu')
     """
     header = export_c(model, name, feedforward=False)
+    links = [link for part in links_of(model) for link in part.links]
     values = {
         'p': name,
         'P': name.upper(),
@@ -61,7 +62,7 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
         'token': f'{{{uuid.uuid5(uuid.NAMESPACE_OID, header)}}}',
         'period': repr(1.0 / model.sample_rate),
         'rest': c_number(model.scaling.range[0]).strip('()'),
-        'channels': Part([link for part in links_of(model) for link in part.links]).channels,
+        'channels': [plain_text(name) for name in Part(links).channels],
     }
     files = {
         'modelDescription.xml': render('modelDescription.xml', **values),

@@ -32,7 +32,7 @@ from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, links_of, Part
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['c_number', 'export_c', 'render']
+__all__ = ['c_number', 'export_c', 'plain_text', 'render']
 
 #: [spans] beyond which no displacement is looked for
 FAR = 100.0
@@ -106,7 +106,7 @@ def export_c(
             options='--name stage',
         )
     low, high = model.scaling.range if limits is None else limits
-    if not (low < high and slew > 0.0):
+    if not (-math.inf < low < high < math.inf and slew > 0.0):
         raise ConfigError('export: give limits as lowest and highest voltage, and a slew above 0')
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
@@ -121,7 +121,7 @@ def export_c(
     values: dict[str, Any] = {
         'p': name,
         'P': name.upper(),
-        'title': textwrap.wrap(title.replace('*/', '') or repr(model), WIDTH),
+        'title': textwrap.wrap(plain_text(title) or repr(model), WIDTH),
         'hertz': f'{model.sample_rate:g}',
         'version': __version__,
         'rate': c_number(model.sample_rate),
@@ -129,6 +129,7 @@ def export_c(
         'links': links,
         'parts': {'front': front, 'linear': linear, 'back': back},
         'channels': channels,
+        'channel_names': [plain_text(name) for name in channels],
         'why': textwrap.wrap(why, WIDTH),
         'ff': ff,
     }
@@ -220,6 +221,11 @@ def _says(
 
 def _named(links: Sequence[Link]) -> str:
     return ', '.join(link.name for link in links if link.code.step)
+
+
+def plain_text(text: str) -> str:
+    """Return a text from a file without what would end a comment in C, or not stand in XML."""
+    return ''.join(x for x in text if x.isprintable() and x != '*')
 
 
 def c_number(x: float) -> str:

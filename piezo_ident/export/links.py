@@ -81,17 +81,10 @@ class Part:
         """Further channels that they need."""
         return list(dict.fromkeys(x.code.channel for x in self.links if x.code.channel))
 
-    @property
-    def given(self) -> list[str]:
-        """Which of v, t and c any link uses."""
-        texts = [text for link in self.links for text in (link.code.rest, link.code.step)]
-        return [name for name in 'vtc' if any(name in _words(text) for text in texts)]
-
     def statements(self, prefix: str, what: str, channels: Sequence[str]) -> Iterator[str]:
         """Give the statements that put `x` through the part; its state is ``*s``."""
-        wrapped = any('u' in _words(link.code.step) for link in self.links)
         for link in self.links:
-            if wrapped and link.tag == 'hysteresis':
+            if self.is_wrapped and link.tag == 'hysteresis':
                 yield 'u = x;'
             call = link.call(prefix, what, 's')
             if link.code.channel:

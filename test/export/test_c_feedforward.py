@@ -131,6 +131,7 @@ def test_the_header_says_what_it_does_not_do(headers):
         ({'name': '2x'}, 'no name for C'),
         ({'name': 'a b'}, 'no name for C'),
         ({'limits': (1.0, 0.0)}, 'lowest and highest'),
+        ({'limits': (0.0, np.inf)}, 'lowest and highest'),
         ({'slew': 0.0}, 'slew above 0'),
     ],
 )

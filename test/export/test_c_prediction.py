@@ -5,6 +5,8 @@
 
 from dataclasses import replace
 from itertools import pairwise
+import shutil
+import subprocess
 
 from c_compiler import Compiled, needs_compiler
 from effect_table import VISIBLE
@@ -106,7 +108,7 @@ MODELS = models()
 
 @pytest.fixture(scope='module')
 def compiled(tmp_path_factory):
-    headers = {name: pi.export_c(model, name) for name, model in MODELS.items()}
+    headers = {name: pi.export_c(model, name, feedforward=False) for name, model in MODELS.items()}
     return Compiled(tmp_path_factory.mktemp('headers'), headers)
 
 
@@ -125,6 +127,27 @@ def test_an_effect_that_is_not_written_in_c_is_refused_by_its_name(monkeypatch):
     monkeypatch.setattr(effects, 'catalogue', lambda: {'odd': Odd})
     with pytest.raises(pi.ModelError, match='effect odd: is not written in C'):
         pi.export_c(replace(PAPER, effects=(EffectSetting('odd', {}),)))
+
+
+def test_names_from_a_file_cannot_leave_the_comment():
+    name = '*/ int evil; /*\n*'
+    values = {**VISIBLE['cross_coupling'], 'channel': name}
+    model = replace(PAPER, effects=(EffectSetting('cross_coupling', values),))
+    header = pi.export_c(model, title='**// evil\n */')
+    head, _, rest = header.partition('#ifndef STAGE_H')
+    assert head.count('*/') == 1 and 'evil' in head and 'evil' not in rest
+
+
+@needs_compiler
+def test_c_plus_plus_takes_it_too(tmp_path):
+    compiler = shutil.which('c++')
+    if compiler is None:
+        pytest.skip('no C++ compiler (c++) on the path')
+    effects = [EffectSetting(name, VISIBLE[name]) for name in VISIBLE]
+    (tmp_path / 'stage.h').write_text(pi.export_c(replace(PAPER, effects=tuple(effects))))
+    (tmp_path / 'a.cpp').write_text('#include "stage.h"\n')
+    command = [compiler, '-std=c++11', '-Wall', '-Wextra', '-Werror', '-fsyntax-only', 'a.cpp']
+    subprocess.run(command, cwd=tmp_path, check=True)
 
 
 @needs_compiler

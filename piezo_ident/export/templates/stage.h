@@ -12,7 +12,7 @@
 {% if channels %}
  *
  * Before each step the caller sets what effects of the model depend on:
-{% for c in channels %}
+{% for c in channel_names %}
  *     s.channel[{{ loop.index0 }}]  {{ c }}
 {% endfor %}
 {% endif %}
