@@ -85,9 +85,9 @@ def random_effect(rng, name):
     return EffectSetting(name, values)
 
 
-def models():
+def models(seed=11):
     """Return models by name: each effect by itself, all of them, and each law of H."""
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(seed)
     made = {}
     for name in sorted(VISIBLE):
         for i, law in enumerate(('plays', 'wide')):
