@@ -40,6 +40,13 @@ ARGUMENTS = (
         None,
         'what /identifier/run and /excitation/start play: identification, survey, or a file',
     ),
+    (
+        'reference',
+        '',
+        None,
+        'a program in micrometres that the stage is to follow, instead of an identification',
+    ),
+    ('model', '', None, 'model file for the live model, and for the feedforward node'),
     ('rate_factor', '', None, 'how many times faster than real time: 0.1 .. 4'),
     ('sample_rate', '', None, 'of excitation and recording [Hz]; that of your driver'),
     ('output', 'identified', None, 'folder into which /identifier/save writes'),
@@ -79,11 +86,19 @@ def nodes(context):
         name: float(given[name]) if given[name] else None
         for name in ('rate_factor', 'sample_rate')
     }
-    found = [
-        node('excitation', program=given['program'], **rates),
-        node('identifier', program=given['program'], output=given['output']),
-        node('model'),
-    ]
+    found = [node('model', model=given['model'])]
+    if given['reference']:
+        # the limits of the program hold, in micrometres too
+        reference = {'quantity': 'reference', 'voltage_high': 1000.0, 'ramp_slew': 500.0}
+        found += [
+            node('excitation', program=given['reference'], **reference, **rates),
+            node('feedforward', model=given['model'], sample_rate=rates['sample_rate']),
+        ]
+    else:
+        found += [
+            node('excitation', program=given['program'], **rates),
+            node('identifier', program=given['program'], output=given['output']),
+        ]
     if given['use_simulated_stage'] == 'true':
         found.append(node('stage', stage=given['stage']))
     if given['record'] == 'true':

@@ -202,6 +202,18 @@ def test_arguments_reach_their_nodes(file):
         assert set(values) <= {d.name for d in NODES[name]}
 
 
+def test_a_stage_follows_a_reference_with_a_model():
+    context = {'model': 'm.yaml', 'stage': 'effects', 'record': 'true', 'sample_rate': '10e3'}
+    started = {n: v for (_, n), v in carry_out(file_of('track'), context, {}).items()}
+    assert set(started) == {'excitation', 'stage', 'model', 'feedforward', 'recorder'}
+    assert started['model']['model'] == started['feedforward']['model'] == 'm.yaml'
+    assert started['excitation']['program'] == 'scan'
+    assert started['excitation']['quantity'] == 'reference'
+    assert started['excitation']['sample_rate'] == started['feedforward']['sample_rate'] == 10e3
+    for name, values in started.items():
+        assert set(values) <= {d.name for d in NODES[name]}
+
+
 def test_what_is_not_given_stays_as_the_files_have_it(tmp_path):
     for name in NODES:
         text = (ROOT / f'config/{name}.yaml').read_text(encoding='utf-8')
