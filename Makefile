@@ -12,7 +12,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 
 .PHONY: attack docs netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash study table-one clean distclean
+.PHONY: crash limits study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -95,6 +95,10 @@ table-one: .venv/.demo
 crash: .venv/.test
 	.venv/bin/python benchmarks/reliability/crash.py
 	$(RUN_STUDY)/build.py
+
+# no voltage of the inverse leaves its limits, in 10,000 random references: some minutes
+limits: .venv/.test
+	REFERENCES=10000 .venv/bin/pytest test/control/test_inverse_properties.py -k limits_are_kept
 
 # what a ROS workspace would do, without ROS; and every node starts from there
 colcon: .venv/.colcon

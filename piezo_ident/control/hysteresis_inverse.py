@@ -102,6 +102,7 @@ def _invert(
     least: float,
     most: float,
     step: float,
+    pole: float,
     last: Array,
     out: Array,
     reached: Array,
@@ -109,20 +110,23 @@ def _invert(
     """
     Write the voltages under which H is as wanted to `out`, and what H is to `reached`.
 
-    `last` holds the voltage and H before, and a slope of H; it is carried on with `memory`.
+    `last` holds the voltage of H and H before, a slope of H, and the voltage before the lag; it is
+    carried on with `memory`.
     """
     after, one, value = memory.copy(), np.empty(1), np.empty(1)
-    u, w, slope = last[0], last[1], last[2]
+    u, w, slope, v = last[0], last[1], last[2], last[3]
     for k in range(wanted.size):
         goal, start = wanted[k], u
         f = w - goal
-        if abs(f) > NONE:
-            # between these lies the voltage, open where H was not asked yet
-            below, above = max(least, start - step), min(most, start + step)
+        lowest, highest = max(least, v - step), min(most, v + step)
+        # between these lies the voltage of H, open where H was not asked yet
+        below = pole * start + (1.0 - pole) * lowest
+        above = pole * start + (1.0 - pole) * highest
+        if abs(f) > NONE or not below <= start <= above:
             if f < 0.0:
-                below = start
+                below = max(below, min(start, above))
             else:
-                above = start
+                above = min(above, max(start, below))
             before = 2.0 * abs(f)
             for _ in range(TRIALS):
                 # Newton's step, to an end where it leads beyond, to the middle where it is slow
@@ -155,8 +159,9 @@ def _invert(
                     break
             for i in range(memory.size):
                 memory[i] = after[i]
-        out[k], reached[k] = u, w
-    last[0], last[1], last[2] = u, w, slope
+        v = min(max((u - pole * start) / (1.0 - pole), lowest), highest)
+        out[k], reached[k] = v, w
+    last[0], last[1], last[2], last[3] = u, w, slope, v
 
 
 class HysteresisInverse:
@@ -170,6 +175,8 @@ class HysteresisInverse:
         Lowest and highest voltage.
     step : float, optional
         Largest change of the voltage from one sample to the next.
+    pole : float, optional
+        Of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
 
     Attributes
     ----------
@@ -197,6 +204,7 @@ class HysteresisInverse:
         hysteresis: Hysteresis,
         limits: tuple[float, float] = (-np.inf, np.inf),
         step: float = np.inf,
+        pole: float = 0.0,
     ) -> None:
         slope = hysteresis.lowest_slope()
         if not slope > 0.0:
@@ -208,14 +216,14 @@ class HysteresisInverse:
         lags = hysteresis.relaxations
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
         self.limits = _rising(hysteresis, float(limits[0]), float(limits[1]))
-        self._bounds = (*self.limits, float(step))
+        self._bounds = (*self.limits, float(step), float(pole))
         self._memory = self._last = np.zeros(0)
 
     def reset(self, u0: float) -> float:
         """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
         h = self.hysteresis
         w, memory = h.follow(np.array([u0]), h.initial_memory(u0))
-        self._take(memory, np.array([u0, w[0], 1.0]))
+        self._take(memory, np.array([u0, w[0], 1.0, u0]))
         return float(w[0])
 
     def follow(self, u: Array) -> None:
@@ -223,7 +231,7 @@ class HysteresisInverse:
         m, lanes = self.hysteresis.thresholds.size, self._parameters[0].size
         memory = np.concatenate([self._memory[:m], self._memory[lanes:]])
         w, memory = self.hysteresis.follow(u, memory)
-        self._take(memory, np.array([u[-1], w[-1], self._last[2]]))
+        self._take(memory, np.array([u[-1], w[-1], self._last[2], u[-1]]))
 
     @property
     def value(self) -> float:

@@ -9,14 +9,15 @@ then made up for by a fixed-point iteration,
 
     w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
 
-with y(u) the whole model in free run.  It converges as long as what is left out is small beside
-the stage, which creep, lag, rate dependence and a bent sensor are; how far it came is told.
+with y(u) the whole model in free run, and shorter steps where one leads away.  It converges as
+long as what is left out is small beside the stage, which creep, rate dependence and a bent sensor
+are; how far it came is told.  The lag of an amplifier has an inverse of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.control.rate_inverse import RateInverse
+from piezo_ident.effects.amplifier_lag import AmplifierLag
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
@@ -42,6 +44,8 @@ PASSES = 30
 EXACT = 1e-5
 #: share of the error that a pass must leave at most for another one
 WORTH = 0.9
+#: least share of a step that is tried
+SHORTEST = 0.2
 #: difference from the wanted motion that matters, in parts of its span, or of the model's where
 #: that is smaller
 MATTERS, LARGE = 1e-3, 0.1
@@ -49,8 +53,9 @@ MATTERS, LARGE = 1e-3, 0.1
 STANDS = 1e-9
 #: difference from what is wanted at rest, normalised, from which it is out of reach
 SHORT = 1e-4
-#: change of the voltage [of the span of the model] that is none
-STILL = 1e-5
+#: changes of the voltage [of the span of the model] that may be none, and how far from rest the
+#: motion may then be [of its span]
+STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
 #: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
 FAR, FAINT = 30.0, 2e-3
 
@@ -165,9 +170,9 @@ def invert(
         )
     s = model.scaling
     low, high, slew = _limits(s.range if limits is None else limits, slew)
-    Q = linear_inverse(model)
     ends = float(s.u(low)), float(s.u(high))
-    H = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
+    H, linear = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
+    Q = linear_inverse(linear)
     low, high = map(s.v, H.limits)
     if not low < high:
         raise DataError(
@@ -185,7 +190,7 @@ def invert(
     small, near = MATTERS * min(span, LARGE), 2 * Q.reach + 1
     free = np.ones(x.size, dtype=np.bool_)
     w = H.reset(u0) + Q(x - x[0])
-    least, passes = np.inf, 0
+    least, passes, share = np.inf, 0, 1.0
     while passes < PASSES:
         H.reset(u0)
         u, reached = H.process(w)
@@ -199,19 +204,29 @@ def invert(
         rms = float(np.sqrt(np.mean(e[free] ** 2))) / span
         is_worth = rms < WORTH * least
         if rms < least:
-            least, best = rms, (u, e, short)
-        if rms < EXACT or not is_worth:
+            least, best = rms, (u, e, short, reached)
+        if rms < EXACT:
             break
-        w = reached + Q(e)
-    u, e, short = best
+        if not is_worth:
+            # a step that led away was too long, where much is left
+            share *= 0.5
+            if least < MATTERS or share < SHORTEST:
+                break
+        w = best[3] + share * Q(best[1])
+    u, e, short, _ = best
     miss = maximum_filter1d(np.abs(e), near)
     short &= miss > small
     # what of the lead and the tail is at rest goes
-    moves = np.flatnonzero(np.abs(u - u0) > STILL * min(span, 1.0))
-    first = min(lead, int(moves[0]) - 1 if moves.size else lead)
-    used = slice(max(first, 0), lead + y.size)
-    u, e, t, short, miss = u[used], e[used], t[used], short[used], miss[used]
-    predicted = s.y(x[used] - e)
+    for still in (*STILL, 0.0):
+        moves = np.flatnonzero(np.abs(u - u0) > still * min(span, 1.0))
+        first = min(lead, int(moves[0]) - 1 if moves.size else lead)
+        used = slice(max(first, 0), lead + y.size)
+        v = s.v0 + s.V * u[used]
+        beside = {name: z[used] for name, z in more.items()}
+        predicted = model.stream().process(v, t[used], beside)
+        if np.abs(x[used] - e[used] - s.x(predicted)).max() < RESTS * span:
+            break
+    e, t, short, miss = e[used], t[used], short[used], miss[used]
     warnings = []
     if short.any():
         warnings.append(_unreached(t[short], abs(s.Y) * float(miss[short].max()), low, high, slew))
@@ -224,7 +239,6 @@ def invert(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
-    v = s.v0 + s.V * u
     warnings += _extrapolated(model, v, y)
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     lead -= used.start
@@ -291,14 +305,19 @@ def _padded(
 
 def _of_hysteresis(
     model: StageModel, ends: tuple[float, float], step: float
-) -> HysteresisInverse | RateInverse:
-    H = HysteresisInverse(model.hysteresis, ends, step)
+) -> tuple[HysteresisInverse | RateInverse, StageModel]:
+    """Return the inverse of H, with what is done along with it, and the model of the rest."""
+    h, rate = model.hysteresis, model.sample_rate
+    H = HysteresisInverse(h, ends, step)
     for setting in model.effects:
-        if setting.name == RateDependentHysteresis.name and model.hysteresis.relaxations is None:
-            return RateInverse(
-                model.hysteresis, setting.parameters, model.sample_rate, H.limits, step
-            )
-    return H
+        if setting.name == RateDependentHysteresis.name and h.relaxations is None:
+            return RateInverse(h, setting.parameters, rate, H.limits, step), model
+    for setting in model.effects:
+        if setting.name == AmplifierLag.name:
+            others = tuple(other for other in model.effects if other is not setting)
+            pole = AmplifierLag(rate, setting.parameters).pole
+            return HysteresisInverse(h, ends, step, pole), replace(model, effects=others)
+    return H, model
 
 
 def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
@@ -328,7 +347,7 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
     """Return a warning where the model is asked for what it was not identified for."""
     s = model.scaling
     (low, high), told = s.range, []
-    outside = np.mean((v < low - STILL * s.V) | (v > high + STILL * s.V))
+    outside = np.mean((v < low - SHORT * s.V) | (v > high + SHORT * s.V))
     if outside:
         told.append(
             f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '

@@ -60,7 +60,7 @@ class AmplifierLag(Effect):
     def prepare(self) -> None:
         """Compute the pole."""
         tau = self.number('time_constant')
-        self._pole = float(np.exp(-1.0 / (self.sample_rate * tau))) if tau > 0.0 else 0.0
+        self.pole = float(np.exp(-1.0 / (self.sample_rate * tau))) if tau > 0.0 else 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -76,17 +76,17 @@ class AmplifierLag(Effect):
 
     def process(self, block: Block) -> Block:
         """Return the block with its signal lagged."""
-        if self._pole == 0.0:
+        if self.pole == 0.0:
             return block
         x = np.ascontiguousarray(block.x)
-        return block.with_signal(_follow(x, self._pole, self._state))
+        return block.with_signal(_follow(x, self.pole, self._state))
 
     def c_code(self) -> CCode:
         """Return the effect in C."""
-        if self._pole == 0.0:
+        if self.pole == 0.0:
             return CCode()
         return CCode(
-            {'share': 1.0 - self._pole},
+            {'share': 1.0 - self.pole},
             'double y;\n',
             's->y = x;\n',
             'x = s->y = piezo_alive(s->y + share * (x - s->y));\n',

@@ -1,0 +1,90 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Random models that have an inverse, and random motions."""
+
+from dataclasses import replace
+
+import numpy as np
+from paper_stage import FS, PAPER
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+
+
+def random_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
+    """Return an H of a law that rises everywhere, narrow or wide, with a bent line."""
+    while True:
+        family = HysteresisLaw(law, np.sort(rng.uniform(0.002, 0.99, rng.integers(1, 40))))
+        n = family.densities
+        theta = np.zeros(family.size)
+        theta[:n] = rng.uniform(0.0, 1.0, n) * (rng.uniform(size=n) < 0.6)
+        # what the plays add, beside the line
+        full = float(family.hysteresis(theta)([0.0, 1.0])[1])
+        theta[:n] *= rng.uniform(0.0, 1.5) / max(full, 1e-9)
+        theta[n : n + family.lags] = rng.normal(0.0, 0.01, family.lags)
+        p2 = rng.uniform(0.3, 1.5)
+        p1 = rng.uniform(-0.9, 1.0) * p2 / 3.0
+        theta[-2:] = p1, p2
+        if law != 'plays':
+            theta[-3] = rng.uniform(-0.9, 0.9) * 0.5 * (p2 + min(0.0, 3.0 * p1))
+        h = family.hysteresis(theta)
+        if h.lowest_slope() > 0.02:
+            return h
+
+
+def random_path(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Return a path within 0 .. 1: noise, a walk, a sine that grows or shrinks, or jumps."""
+    match rng.integers(4):
+        case 0:
+            return rng.uniform(0.0, 1.0, n)
+        case 1:
+            return np.clip(0.5 + np.cumsum(rng.normal(0.0, 0.02, n)), 0.0, 1.0)
+        case 2:
+            size = np.linspace(rng.uniform(), rng.uniform(), n)
+            return 0.5 - 0.5 * size * np.cos(rng.uniform(0.001, 0.5) * np.arange(n))
+        case _:
+            return np.repeat(rng.uniform(0.0, 1.0, n // 10 + 1), 10)[:n]
+
+
+def random_dynamics(rng: np.random.Generator, damped: float = 1e-3) -> Dynamics:
+    """Return a stable G: modes of some damping at least, zeros on both sides of the circle."""
+    pairs = rng.integers(0, 4)
+    w = rng.uniform(0.05, 2.5, pairs)
+    poles = np.exp(w * (-(10.0 ** rng.uniform(np.log10(damped), -0.3, pairs)) + 1j))
+    radius = rng.choice([0.5, 0.8, 1.3, 2.5], rng.integers(0, 4))
+    zeros = radius * rng.choice([-1.0, 1.0], radius.size)
+    a = np.atleast_1d(np.real(np.poly([*poles, *poles.conj()])))[1:]
+    return Dynamics(a, np.atleast_1d(np.poly(zeros))).normalised()
+
+
+def random_model(
+    rng: np.random.Generator,
+    law: str,
+    effects: tuple[EffectSetting, ...] = (),
+    damped: float = 1e-3,
+) -> StageModel:
+    """Return a model with a delay of any fraction that extends or retracts."""
+    h = random_hysteresis(rng, law)
+    Y = 50e-6 * rng.choice([-1.0, 1.0])
+    return replace(
+        PAPER,
+        hysteresis=h,
+        dynamics=random_dynamics(rng, damped),
+        delay=Delay(int(rng.integers(0, 30)), float(rng.uniform(0.0, 0.99))),
+        scaling=replace(PAPER.scaling, Y=Y, y0=float(rng.uniform(-1.0, 1.0)) * 50e-6),
+        effects=effects,
+    )
+
+
+def smooth_motion(rng: np.random.Generator, model: StageModel, n: int = 3000) -> np.ndarray:
+    """Return sines of up to 120 Hz that start and end softly, well within a model's reach."""
+    u = np.array([0.25, 0.75])
+    low, high = np.sort([float(model.without_dynamics().chain().reset(x, x)) for x in u])
+    t = np.arange(n) / FS
+    phase, f = rng.uniform(0.0, 2 * np.pi, 3), rng.uniform(1.0, 120.0, 3)
+    waves = np.sin(2 * np.pi * np.outer(t, f) + phase) @ rng.dirichlet(np.ones(3))
+    soft = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.05) ** 2
+    x = 0.5 * (low + high) + 0.5 * (high - low) * soft * waves
+    return np.asarray(model.scaling.y(x))
