@@ -33,10 +33,10 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
     check_distinct(args.out, [args.model])
     check_file(args.out, overwrite=args.overwrite)
     is_header = args.out.suffix.lower() == '.h'
-    if not is_header and (args.limits or args.slew):
+    if not is_header and (args.limits or args.slew or args.preview is not None):
         raise ConfigError(
-            f'{args.out}: has no feed-forward, whose voltage --limits and --slew keep; leave them '
-            'out, or write a header .h'
+            f'{args.out}: has no feed-forward, which --limits, --slew and --preview are for; '
+            'leave them out, or write a header .h'
         )
     name = args.name or re.sub(r'\W', '_', args.out.stem, flags=re.ASCII).lower()
     model = load(args.model)
@@ -45,7 +45,12 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
     with naming(str(args.model)), deferred_interrupts():
         if is_header:
             header = export_c(
-                model, name, limits=args.limits, slew=args.slew or math.inf, title=title
+                model,
+                name,
+                limits=args.limits,
+                slew=args.slew or math.inf,
+                preview=args.preview,
+                title=title,
             )
             write_text(args.out, header)
             known = (f'{name}_step', f'{name}_feedforward_step')

@@ -184,9 +184,9 @@ cli = Verbs(
             'Write a model for other programs: a C header with prediction and feed-forward, or an '
             'FMU in source (FMI 3.0, co-simulation).',
             [options.MODEL],
-            {'Output': options.EXPORT, 'The voltage of the feed-forward': options.KEPT},
+            {'Output': options.EXPORT, 'The feed-forward of a header': options.FEEDFORWARD},
             'export model.yaml --format c --out stage.h',
-            'export model.yaml --out stage.h --limits 0 9 --slew 5e3',
+            'export model.yaml --out stage.h --limits 0 9 --slew 5e3 --preview 40',
             'export model.yaml --format fmu --out stage.fmu',
         ),
         Verb(

@@ -179,7 +179,7 @@ INVERT = [
 
 EXPORT = [
     _option('--out', _file, 'FILE', 'Header .h or unit .fmu.'),
-    _option('--format', click.Choice(['c', 'fmu']), None, 'Of the file (default: by its ending).'),
+    _option('--format', click.Choice(['c', 'fmu']), None, 'Default: by the ending of FILE.'),
     _option('--name', _name, 'NAME', 'With which names in it begin (default: that of the file).'),
     OVERWRITE,
 ]
@@ -199,6 +199,10 @@ KEPT = [
         callback=_limits,
     ),
     _option('--slew', _speed, 'V/S', 'Largest speed of the voltage (default: any).'),
+]
+FEEDFORWARD = [
+    *KEPT,
+    _option('--preview', _whole, 'N', 'Samples that the motion is known ahead, at most.'),
 ]
 DRIVE = [
     *KEPT,

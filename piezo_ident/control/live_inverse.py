@@ -29,7 +29,7 @@ from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['PREVIEW', 'Driven', 'LiveInverse']
+__all__ = ['BEYOND', 'PREVIEW', 'Driven', 'LiveInverse', 'shortened']
 
 Array = NDArray[np.float64]
 
@@ -158,7 +158,7 @@ class LiveInverse:
         """Return passes that share the preview."""
         s, rate = self.model.scaling, self.model.sample_rate
         bounds = float(s.u(self._limits[0])), float(s.u(self._limits[1]))
-        Q = _shortened(self._filter, self.preview // passes)
+        Q = shortened(self._filter, self.preview // passes)
         waits = [self.preview - passes * Q.ahead] + [0] * (passes - 1)
         return [
             _Pass(
@@ -375,7 +375,7 @@ class _Pass:
         return self._stream.process(v, np.arange(tick, self._tick) / self._model.sample_rate)
 
 
-def _shortened(Q: LinearInverse, most: int) -> LinearInverse:
+def shortened(Q: LinearInverse, most: int) -> LinearInverse:
     """Return a filter that looks ahead by so many samples at most, of the same static gain."""
     ahead = min(Q.ahead, most)
     size = np.abs(Q.taps[::-1])

@@ -28,6 +28,7 @@ from piezo_ident.common.kernel import STILL
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, NONE, TRIALS
 from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import EPSILON, is_filter, linear_inverse, LinearInverse
+from piezo_ident.control.live_inverse import BEYOND, shortened
 from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, links_of, Part
 from piezo_ident.model.stage_model import StageModel
@@ -60,6 +61,7 @@ def export_c(
     *,
     limits: tuple[float, float] | None = None,
     slew: float = math.inf,
+    preview: int | None = None,
     title: str = '',
     feedforward: bool = True,
 ) -> str:
@@ -75,6 +77,8 @@ def export_c(
         Lowest and highest voltage of the feed-forward [V]; the identified range when absent.
     slew : float, optional
         Largest speed of its voltage [V/s].
+    preview : int, optional
+        Samples that its motion is known ahead, at most; as many as are of use when absent.
     title : str, optional
         First line of the header.
     feedforward : bool, optional
@@ -89,7 +93,7 @@ def export_c(
     Raises
     ------
     ConfigError
-        When the name is none in C, or limits or slew are impossible.
+        When the name is none in C, or limits, slew or preview are impossible.
     ModelError
         When an effect of the model is not written in C.
 
@@ -108,13 +112,18 @@ def export_c(
     low, high = model.scaling.range if limits is None else limits
     if not (-math.inf < low < high < math.inf and slew > 0.0):
         raise ConfigError('export: give limits as lowest and highest voltage, and a slew above 0')
+    if preview is not None and not preview > BEYOND * model.total_delay.total:
+        raise ConfigError(
+            f'export: a preview of {preview} samples does not reach beyond the delay of the '
+            f'model, {model.total_delay.total:g} samples; make it longer'
+        )
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
     channels = Part(links).channels
     why, ff = 'it was not asked for', None
     if feedforward:
         try:
-            ff = _feedforward(model, front, back, (low, high), slew)
+            ff = _feedforward(model, front, back, (low, high), slew, preview)
         except ModelError as error:
             why = str(error)
     scaling = model.scaling
@@ -149,7 +158,12 @@ def export_c(
 
 
 def _feedforward(
-    model: StageModel, front: Part, back: Part, limits: tuple[float, float], slew: float
+    model: StageModel,
+    front: Part,
+    back: Part,
+    limits: tuple[float, float],
+    slew: float,
+    preview: int | None,
 ) -> _FeedForward:
     """
     Return what inverts a model.
@@ -162,7 +176,9 @@ def _feedforward(
     HysteresisInverse(model.hysteresis)
     in_front = [link.name for link in front.links]
     rest = tuple(e for e in model.effects if e.name not in in_front)
-    Q = linear_inverse(replace(model, effects=rest))
+    Q = whole = linear_inverse(replace(model, effects=rest))
+    if preview is not None:
+        Q = shortened(Q, preview)
     # an effect that passes the command on does so before it is known
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
     inverted = Part([x for x in undone if x.effect and not is_filter(type(x.effect))])
@@ -183,13 +199,13 @@ def _feedforward(
         lowest=c_number(low),
         highest=c_number(high),
         step=c_number(most / model.sample_rate),
-        says=_says(model, front, inverted, back, Q),
+        says=_says(model, front, inverted, back, Q, whole.ahead),
         inverted=inverted,
     )
 
 
 def _says(
-    model: StageModel, front: Part, inverted: Part, back: Part, Q: LinearInverse
+    model: StageModel, front: Part, inverted: Part, back: Part, Q: LinearInverse, ahead: int
 ) -> list[str]:
     """Return what a feed-forward does, and what it does not make up for."""
     behind = ''
@@ -208,6 +224,8 @@ def _says(
         f'motion at which the gain of G is below {EPSILON:.0%} of the static one: there the '
         'voltage is kept small',
     ]
+    if Q.ahead < ahead:
+        lacks.append(f'what the filter would take from samples {Q.ahead + 1} to {ahead} ahead')
     for link in back.links:
         if 'v' in link.given(link.code.step):
             lacks.append(f'{link.name}: the voltage in the reading')

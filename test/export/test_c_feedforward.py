@@ -42,6 +42,7 @@ COARSE = {'backlash': 0.02, 'cross_coupling': 0.02}
 @pytest.fixture(scope='module')
 def headers():
     made = {name: pi.export_c(model, name) for name, model in MODELS.items()}
+    made['short'] = pi.export_c(PAPER, 'short', preview=60)
     made['kept'] = pi.export_c(PAPER, 'kept', limits=LIMITS, slew=SLEW)
     return made
 
@@ -77,6 +78,15 @@ def test_the_model_goes_where_it_is_told(name, compiled, headers):
     # 100 rms(wanted - reached) / (max wanted - min wanted)
     error = 100.0 * np.sqrt(np.mean((y - reached) ** 2)) / np.ptp(y)
     assert error < COARSE.get(name, 2e-3)
+
+
+@needs_compiler
+def test_a_shorter_preview_is_kept_and_costs_little(compiled, headers):
+    assert preview(headers['short']) == 60 < preview(headers['paper'])
+    assert 'samples 61 to' in headers['short'] and 'ahead' in headers['short']
+    y = wanted(size=20e-6)
+    _, v = compiled.drive('short', np.append(y, np.full(60, y[-1])))
+    assert 100.0 * np.sqrt(np.mean((y - PAPER.simulate(v)[60:]) ** 2)) / np.ptp(y) < 0.05
 
 
 @needs_compiler
@@ -133,6 +143,7 @@ def test_the_header_says_what_it_does_not_do(headers):
         ({'limits': (1.0, 0.0)}, 'lowest and highest'),
         ({'limits': (0.0, np.inf)}, 'lowest and highest'),
         ({'slew': 0.0}, 'slew above 0'),
+        ({'preview': 3}, 'does not reach beyond the delay of the model, 3 samples'),
     ],
 )
 def test_what_cannot_be_is_refused(options, what):
