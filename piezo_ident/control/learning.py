@@ -15,14 +15,16 @@ Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.control.inverse import Inverse, invert
-from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.control.inverse import FAR, Inverse, invert
+from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import gaussian_filter1d
 
@@ -49,7 +51,7 @@ class Repetition:
     measured : ndarray, shape (n,)
         Displacement under it [m].
     error : float
-        100 rms(wanted - measured) / (max wanted - min wanted).
+        100 rms(wanted - measured) / (max wanted - min wanted), of what the limits reach.
     """
 
     drive: Inverse
@@ -70,20 +72,25 @@ class Learning:
         Lowest and highest voltage [V]; the identified range when absent.
     slew : float, optional
         Largest speed of the voltage [V/s].
+    clip : bool, optional
+        Come as near as the limits allow, instead of refusing; what they do not reach is not
+        learned, nor does it count.
+    channels : mapping of str to array_like, shape (n,), optional
+        Further signals that effects of the model depend on.
     corner : float, optional
         Of F [Hz]; below the lowest mode of the model when absent.
 
     Attributes
     ----------
     drive : Inverse
-        What to play next.
+        What to play next; `wanted` of it is the motion as it was corrected.
     repetitions : list of Repetition
         So far.
 
     Raises
     ------
     DataError
-        When the motion is out of reach, see `piezo_ident.invert`.
+        When the motion is out of reach and is not to be clipped, see `piezo_ident.invert`.
 
     Examples
     --------
@@ -108,11 +115,26 @@ class Learning:
         *,
         limits: tuple[float, float] | None = None,
         slew: float = np.inf,
+        clip: bool = False,
+        channels: Mapping[str, ArrayLike] | None = None,
         corner: float | None = None,
     ) -> None:
-        self._model, self._limits, self._slew = model, limits, slew
-        self._wanted = self._reference = np.asarray(wanted, dtype=np.float64)
-        self.drive = invert(model, wanted, limits=limits, slew=slew)
+        # near a limit a correction may reach beyond
+        self._invert = partial(
+            invert, model, limits=limits, slew=slew, clip=True, channels=channels
+        )
+        self.drive = (
+            self._invert(wanted)
+            if clip
+            else invert(model, wanted, limits=limits, slew=slew, channels=channels)
+        )
+        self._wanted = self._reference = self._best_reference = self.drive.wanted[
+            self.drive.lead :
+        ]
+        reached = ~self.drive.clipped[self.drive.lead :]
+        self._counts = reached if reached.any() else ~reached
+        self._model_span = abs(model.scaling.Y)
+        self._span = float(np.ptp(self._wanted)) or self._model_span
         self.repetitions: list[Repetition] = []
         modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
         lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
@@ -146,7 +168,7 @@ class Learning:
         Raises
         ------
         DataError
-            When there are more or fewer samples, or one is not finite.
+            When there are more or fewer samples, one is not finite, or they are far off.
         """
         y, drive = np.asarray(measured, dtype=np.float64), self.drive
         if y.shape != drive.v.shape or not np.all(np.isfinite(y)):
@@ -155,15 +177,20 @@ class Learning:
                 'finite number each'
             )
         e = self._wanted - y[drive.lead :]
-        error = percent_of_stroke(self._wanted, y[drive.lead :])
+        if np.abs(e).max() > FAR * self._model_span:
+            raise DataError(
+                f'learning: the stage is {1e6 * np.abs(e).max():.4g} um off the wanted motion; is '
+                'it measured in metres?'
+            )
+        error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
         if error <= self.best.error:
+            # what is out of reach would grow from run to run
+            e = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
             correction = gaussian_filter1d(e, self._width, mode='nearest')
+            self._best_reference = self._reference
             self._reference = self._reference + correction
-            # near a limit the correction may reach beyond
-            self.drive = invert(
-                self._model, self._reference, limits=self._limits, slew=self._slew, clip=True
-            )
+            self.drive = self._invert(self._reference)
         else:
-            self.drive = self.best.drive
+            self.drive, self._reference = self.best.drive, self._best_reference
         return error
