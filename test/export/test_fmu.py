@@ -4,6 +4,8 @@
 """The FMU is valid, and what FMPy compiles and runs of it is what Python predicts."""
 
 from dataclasses import replace
+import os
+from pathlib import Path
 import subprocess
 import sys
 
@@ -49,7 +51,9 @@ def path(tmp_path_factory):
     path = tmp_path_factory.mktemp('fmu') / 'stage.fmu'
     pi.export_fmu(MODEL, path)
     command = [sys.executable, '-m', 'fmpy', 'compile', '--all-warnings', '--warning-as-error']
-    done = subprocess.run([*command, str(path)], capture_output=True, text=True)
+    # cmake is installed beside this interpreter
+    env = {**os.environ, 'PATH': f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}'}
+    done = subprocess.run([*command, str(path)], capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     return path
 
