@@ -76,6 +76,8 @@ def test_arguments_of_another_kind_cost_one_line(tmp_path):
         lambda: pi.diagnose(record, model),
         lambda: pi.diagnose(model, model),
         lambda: pi.diagnose(model, record, record),
+        lambda: pi.export_c('model.yaml'),
+        lambda: pi.export_fmu(record, tmp_path / 'stage.fmu'),
         lambda: pi.write_report(record, tmp_path / 'report'),
         lambda: model.simulate('voltage.csv'),
     ):

@@ -23,7 +23,7 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident import __version__
-from piezo_ident.common.errors import ConfigError, ModelError
+from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, NONE, TRIALS
 from piezo_ident.control.inverse import SHORT
@@ -92,6 +92,8 @@ def export_c(
 
     Raises
     ------
+    DataError
+        When it is given no model.
     ConfigError
         When the name is none in C, or limits, slew or preview are impossible.
     ModelError
@@ -104,6 +106,7 @@ def export_c(
     >>> 'static inline double stage_step(stage_state *s, double v)' in header
     True
     """
+    expect(model, StageModel, 'export, first argument', 'read a model with load')
     if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
         raise ConfigError(
             f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
