@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind
+from piezo_ident.model.metrics import percent
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin']
+__all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin', 'TrackingError']
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
@@ -193,6 +194,50 @@ class Preview:
             values = {name: (s / n, a, z) for name, (n, s, a, z) in self._bins.pop(b).items()}
             taken.append(PreviewBin(b / self.rate, values))
         return taken
+
+
+class TrackingError:
+    """
+    Wanted minus measured displacement, as blocks of both come.
+
+    Parameters
+    ----------
+    window : float
+        Time over which it is taken [s].
+
+    Attributes
+    ----------
+    live : LiveError
+    """
+
+    def __init__(self, window: float) -> None:
+        self._matcher, self.live = Matcher(), LiveError(window)
+        self._low, self._high = np.inf, -np.inf
+
+    def wanted(self, samples: Samples) -> list[Samples]:
+        """Take a block of what is wanted; return the errors that it completes."""
+        if not samples.t.size:
+            return []
+        self._low = min(self._low, float(samples.values.min()))
+        self._high = max(self._high, float(samples.values.max()))
+        return self._errors(self._matcher.predicted(samples))
+
+    def measured(self, samples: Samples) -> list[Samples]:
+        """Take a block of displacement; return the errors that it completes."""
+        return self._errors(self._matcher.measured(samples))
+
+    @property
+    def percent(self) -> float | None:
+        """Its rms [% of the span that was wanted]; None before there is one."""
+        return percent(self.live.rms, self._high - self._low) if self.live.seconds else None
+
+    def _errors(self, pairs: list[Matched]) -> list[Samples]:
+        errors = [
+            Samples(pair.t, pair.y_hat - pair.y, pair.segment, 'tracking_error') for pair in pairs
+        ]
+        for error in errors:
+            self.live.add(error.t, error.values)
+        return errors
 
 
 class LiveError:

@@ -166,6 +166,11 @@ class Tracker:
         """Return the voltage for what of the reference is still ahead; its last sample stays."""
         return self.process(np.full(self.preview, self._raw[-1]))
 
+    def play(self, v: Array) -> tuple[Array, Array]:
+        """Return time and voltage for a voltage that is given, joined and limited."""
+        v = self._guard.process(v).voltage
+        return self._sent(v), v
+
     def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
         """Return time and voltage of the next samples of a ramp to rest; see `Guard.idle`."""
         v = self._guard.idle(n, longest)

@@ -261,6 +261,8 @@ FEEDFORWARD = (
     ),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
     Declaration('window', 2.0, 'time over which the tracking error is taken', 's', 0.1, 600.0),
+    Declaration('repetitions', 8, 'most repetitions of one ~/learn', '1', 1, 100),
+    Declaration('longest', 60.0, 'longest reference that is kept for ~/learn', 's', 0.1, 3600.0),
 )
 
 #: the declarations of each node by its executable

@@ -3,6 +3,7 @@
 
 """The feedforward node as a process, with a simulated stage; the reference is the test's."""
 
+import re
 import time
 
 from course import block, column, FS, paper
@@ -45,7 +46,7 @@ def lab():
         for topic in ('voltage', 'displacement', 'tracking_error', 'applied_voltage'):
             g.collect(topic)
         g.start_all(
-            ('stage', {'seed': 3, 'silence': 60.0}),
+            ('stage', {'seed': 3, 'silence': 0.4}),
             ('feedforward', {'silence': 0.3, 'ramp_slew': 100.0, 'window': 0.3}),
         )
         g.matched('displacement')
@@ -169,6 +170,37 @@ def test_one_drives_at_a_time(lab):
     assert status['state'] == 'failed' and 'of 5 subscribers on /voltage' in status['text']
     assert lab.set('feedforward', 'subscribers', 1)[0]
     assert lab.set('feedforward', 'wait_limit', 10.0)[0]
+
+
+def test_a_reference_that_is_repeated_is_learned():
+    with Graph() as g:
+        g.collect('voltage')
+        g.start_all(
+            ('stage', {'stage': 'effects', 'seed': 3, 'silence': 0.4}),
+            ('feedforward', {'silence': 0.2, 'ramp_slew': 200.0}),
+        )
+        ok, said = g.call('feedforward/learn')
+        assert not ok and 'no reference to repeat' in said
+        # the model of the stage without its effects
+        armed(g)
+        sent(g, reference(0.25))
+        is_in(g, 'done')
+        since = len(g.collect('voltage'))
+        end = g.finish('feedforward/learn')
+        assert end['state'] == 'done', end['text']
+        told = g.status('feedforward')['text']
+        best, first = (float(x) for x in re.findall(r'([0-9.e-]+) %? ?(?:of|in)', told))
+        assert first > 1.0 and best < 0.1 * first, told
+        blocks = g.collect('voltage')[since:]
+        t, v = column(blocks)
+        assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
+        assert v[0] == 0.0 == v[-1] and v.min() >= 0.0 and v.max() <= 10.0
+        assert np.abs(np.diff(v)).max() * FS <= 40_000.0 * (1 + 1e-9)
+        assert {b.segment for b in blocks} >= {'learn:1', 'learn:2', 'learn:3', 'ramp:stop'}
+        # once more, from the best
+        assert g.finish('feedforward/learn')['state'] == 'done'
+        again = g.status('feedforward')['text']
+        assert float(again.split()[0]) <= best * 1.001
 
 
 def test_a_signal_ramps_to_rest(lab):

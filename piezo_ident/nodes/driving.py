@@ -1,0 +1,157 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A node that drives by a tracker: the right to drive, ramps to rest, faults, and a safe end."""
+
+from __future__ import annotations
+
+from collections import Counter
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.live.tracker import Tracker
+from piezo_ident.nodes.lab_node import LabNode
+from piezo_ident.nodes.voltage_output import VoltageOutput
+from piezo_ident.record.blocks import BLOCK_SIZE, Samples
+
+__all__ = ['DRIVING', 'NOW', 'PERIOD', 'DrivingNode']
+
+#: how long the ramp of a node that is ending may take [s]
+LAST_RAMP = 0.7
+#: how long a fault stays in the status [s]
+FAULT_SHOWN = 3.0
+#: period of the timer that waits, ramps and watches [s]
+PERIOD = 0.01
+#: states in which the node holds the right to drive, and what it does in them
+NOW = {
+    'waiting': 'waiting for subscribers',
+    'ready': 'waiting for a reference',
+    'tracking': 'following the reference',
+    'learning': 'learning',
+    'stopping': 'ramping to rest',
+}
+DRIVING = tuple(NOW)
+
+
+class DrivingNode(LabNode):
+    """
+    Holds the right to drive between a start and the rest after a stop.
+
+    A subclass has a tracker when it drives, does its work in `work`, and tells its state in
+    `report_state`.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._state: str = 'idle'
+        self._end = ('', '')
+        super().__init__(**kwargs)
+        self._rate_of_clock = self.values['sample_rate']
+        self._tracker: Tracker | None = None
+        # why a model was not taken
+        self._refusal = ''
+        self._counts: Counter[str] = Counter()
+        self._faults: dict[str, tuple[str, float]] = {}
+        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._output = VoltageOutput(self)
+        self._timer = self.create_timer(PERIOD, self._on_timer, autostart=False)
+        self.offer('stop', self._stop)
+
+    def report_state(self) -> None:
+        """Publish the status."""
+
+    def work(self) -> str:
+        """Do what is due; return the state to go to when the right to drive has just come."""
+        return ''
+
+    def _take_right(self, tracker: Tracker) -> None:
+        """Ask for the right to drive."""
+        tracker.reset()
+        self._counts.clear()
+        self._faults.clear()
+        self._output.open()
+        self._timer.reset()
+        self._go('waiting')
+
+    def _go(self, state: str) -> None:
+        self._state = state
+        self.report_state()
+
+    def _stop(self) -> str:
+        if self._state not in DRIVING:
+            raise ConfigError('the node does not drive')
+        self._halt('stopped', 'stopped')
+        return f'ramping to {self.values["rest"]:g} V'
+
+    def _on_timer(self) -> None:
+        try:
+            if self._state == 'waiting':
+                if self._output.poll(self.values['subscribers'], self.values['wait_limit']):
+                    self._go(self.work())
+            elif self._state == 'stopping':
+                self._ramp()
+            else:
+                self.work()
+        except PiezoIdentError as error:
+            self._halt('failed', str(error))
+
+    def _send(self, t: NDArray[np.float64], v: NDArray[np.float64], segment: str) -> None:
+        for k in range(0, t.size, BLOCK_SIZE * 10):
+            cut = slice(k, k + BLOCK_SIZE * 10)
+            self._output.send(Samples(t[cut], v[cut], segment))
+        self._counts['samples'] += t.size
+
+    def _halt(self, state: str, text: str) -> None:
+        """Ramp to rest, and end in a state."""
+        self._end = state, text
+        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._state = 'stopping'
+        self._ramp()
+
+    def _ramp(self) -> None:
+        tracker = self._tracker
+        if tracker is not None and not tracker.is_at_rest:
+            self._send_ramp(tracker)
+        if tracker is None or tracker.is_at_rest:
+            self._finish()
+        else:
+            self.report_state()
+
+    def _send_ramp(self, tracker: Tracker) -> None:
+        now = round((time.monotonic() - self._ramp_begin) * self._rate_of_clock)
+        # after a pause of this process the ramp goes on where it was, it does not catch up
+        due = min(now - self._ramped, max(1, round(5 * PERIOD * self._rate_of_clock)))
+        self._ramped = now
+        if due > 0:
+            self._send(*tracker.idle(due), 'ramp:stop')
+
+    def _finish(self) -> None:
+        self._output.close()
+        self._timer.cancel()
+        if self._tracker is not None:
+            self._tracker.reset()
+        self._go(self._end[0])
+
+    def _note_fault(self, fault: str, message: str, count: int = 1) -> None:
+        self._counts[fault] += count
+        self._faults[fault] = (message, time.monotonic() + FAULT_SHOWN)
+
+    def _problems(self) -> str:
+        now = time.monotonic()
+        self._faults = {k: fault for k, fault in self._faults.items() if fault[1] > now}
+        return '; '.join(filter(None, [self._refusal, *(m for m, _ in self._faults.values())]))
+
+    def close(self) -> None:
+        """Ramp to rest within a second."""
+        tracker, begin, sent = self._tracker, time.monotonic(), 0
+        size = max(1, round(PERIOD * self._rate_of_clock))
+        if tracker is not None:
+            # a ramp that is under way at its own pace gives way to one that ends in time
+            tracker.hurry()
+        while tracker is not None and self._output.is_open and not tracker.is_at_rest:
+            self._send(*tracker.idle(size, LAST_RAMP), 'ramp:stop')
+            sent += size
+            time.sleep(max(0.0, begin + sent / self._rate_of_clock - time.monotonic()))
+        self._output.close()
