@@ -110,7 +110,7 @@ colcon: .venv/.colcon
 
 # one environment, more of it as it is asked for
 .venv/.demo: EXTRAS := [ros]
-.venv/.test: EXTRAS := [ros,test]
+.venv/.test: EXTRAS := [ros,test,fmu]
 .venv/.colcon: EXTRAS := [colcon,ros]
 .venv-jazzy/.test: EXTRAS := [test]
 .venv-bench/.bench: EXTRAS := [bench]

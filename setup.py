@@ -24,7 +24,8 @@ docs = [
     'sphinx-design>=0.6,<1',
 ]
 
-# to compile, check and run what is exported as FMU
+# to compile, check and run what is exported as FMU; it needs a later NumPy than Jazzy has, so it
+# is none of the libraries of the tests
 fmu = [
     'FMPy>=0.3.32,<0.4',
 ]
@@ -89,7 +90,6 @@ setup(
             *cluster,
             *docs,
             *files,
-            *fmu,
             *lint,
             'hypothesis>=6,<7',
             'ipykernel>=6,<8',
