@@ -39,6 +39,7 @@ HERE = Path(__file__).resolve().parent
 ORDER = (
     'prediction',
     'export',
+    'inverse',
     'identification',
     'peers_arx',
     'peers_swarm',

@@ -128,7 +128,8 @@ def invert(
     model : StageModel
     wanted : array_like, shape (n,)
         Displacement [m], sampled at the rate of the model.  Before and after it the stage rests,
-        at its beginning as one that came there from its lowest voltage in one stroke.
+        at its beginning as one that came there from its lowest voltage in one stroke and has
+        settled: with creep, better begin where nothing creeps.
     limits : tuple of float, optional
         Lowest and highest voltage [V]; the identified range when absent.
     slew : float, optional

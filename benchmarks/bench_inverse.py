@@ -1,0 +1,150 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Inversion of a motion, for each law of H and with effects, and its growth with the motion.
+
+    .venv-bench/bin/python benchmarks/bench_inverse.py [--quick]
+
+The motion is a raster that starts and ends at rest, so that every play turns back; each model is
+asked for its own answer to one voltage.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+import piezo_ident as pi
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
+from side_by_side import markdown, ratio, seconds, show, take_turns
+
+RATE = 20_000.0
+#: plays of each law, and what they add together beside a line of slope 1
+PLAYS, SHARE = 40, 0.3
+EFFECTS = (
+    EffectSetting('amplifier_lag', {'time_constant': 2e-4}),
+    EffectSetting('creep', {'gain': [0.012, 0.02], 'time_constant': [0.1, 1.0]}),
+    EffectSetting('sensor_nonlinearity', {'square': 0.004, 'cubic': -0.002}),
+)
+RATE_DEPENDENT = EffectSetting(
+    'rate_dependent_hysteresis', {'gain': 1e-4, 'exponent': 1.0, 'cutoff': 1000.0}
+)
+
+Array = NDArray[np.float64]
+
+
+def of_law(name: LawName, plain: StageModel) -> StageModel:
+    """Return a stage with an H of a law."""
+    law = HysteresisLaw(name, np.arange(1, PLAYS + 1) / (PLAYS + 1))
+    n = law.densities
+    theta = np.zeros(law.size)
+    theta[:n] = 1.0
+    theta[:n] *= SHARE / float(law.hysteresis(theta)([0.0, 1.0])[1])
+    theta[n : n + law.lags] = 0.003 * (-1.0) ** np.arange(law.lags)
+    theta[-2:] = -0.1, 1.0
+    return replace(plain, hysteresis=law.hysteresis(theta))
+
+
+def models() -> dict[str, StageModel]:
+    """Return what is inverted, by what it is."""
+    plain = pi.SimulatedStage.load('paper').model
+    found = {f'H of the law `{name}`, {PLAYS} plays': of_law(name, plain) for name in LAWS}
+    with_effects = replace(plain, effects=EFFECTS)
+    return {
+        "the paper's stage": plain,
+        **found,
+        'with amplifier lag, creep and a bent sensor': with_effects,
+        'with plays that widen with speed': replace(plain, effects=(RATE_DEPENDENT,)),
+    }
+
+
+def motion(model: StageModel, n: int) -> Array:
+    """Return where a raster of voltage takes a model [m]."""
+    t = np.arange(n) / RATE
+    soft = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.05)
+    v = 5.0 + soft * (3.0 * np.sin(2 * np.pi * 2.0 * t) + 1.2 * np.sin(2 * np.pi * 40.0 * t))
+    return model.without_dynamics().simulate(v)
+
+
+def of_models(n: int, runs: int) -> str:
+    """Return a table over the models."""
+    rows = []
+    for name, model in models().items():
+        y = motion(model, n)
+        v = model.inverse(y).v
+        turns = take_turns(
+            {
+                'inverse': lambda k, m=model, y=y: m.inverse(y),
+                'prediction': lambda k, m=model, v=v: m.simulate(v),
+            },
+            runs,
+        )
+        inverse, prediction = turns['inverse'], turns['prediction']
+        drive = inverse.results[0]
+        rows.append(
+            [
+                name,
+                f'{1e9 * inverse.median / n:.0f}',
+                ratio(n / RATE / inverse.median),
+                ratio(inverse.over(prediction)),
+                drive.passes,
+                f'{drive.error:.2g}',
+            ]
+        )
+    heads = ['model', 'ns a sample', 'times faster than real time', 'times a prediction']
+    return markdown([*heads, 'passes', 'left, % of stroke'], rows)
+
+
+def of_length(lengths: list[int], runs: int) -> str:
+    """Return a table over the length of the motion, with the exponent."""
+    model = replace(pi.SimulatedStage.load('paper').model, effects=EFFECTS)
+    motions = {n: motion(model, n) for n in lengths}
+    turns = take_turns(
+        {str(n): lambda k, y=y: model.inverse(y) for n, y in motions.items()},
+        runs,
+        warm=(str(lengths[0]),),
+    )
+    # a pass more or less is no growth
+    times = [turns[str(n)].median for n in lengths]
+    a_pass = [t / turns[str(n)].results[0].passes for t, n in zip(times, lengths, strict=True)]
+    exponent = np.polyfit(np.log(lengths), np.log(a_pass), 1)[0]
+    rows = [
+        [
+            f'{n / RATE:g} s',
+            f'{n:,}',
+            seconds(t),
+            ratio(n / RATE / t),
+            turns[str(n)].results[0].passes,
+        ]
+        for n, t in zip(lengths, times, strict=True)
+    ]
+    heads = ['motion', 'samples', 'time', 'times faster than real time', 'passes']
+    return f'{markdown(heads, rows)}\n\nExponent of the time of a pass: {exponent:.2f}.'
+
+
+def sections(quick: bool = False) -> list[tuple[str, str]]:
+    """Return titles and texts."""
+    n, runs = (100_000, 3) if quick else (400_000, 7)
+    lengths = [20_000, 80_000, 320_000] if quick else [20_000, 80_000, 320_000, 1_280_000]
+    about = (
+        f'A raster of {n / RATE:g} s at 20 kHz, all offline: filter, passes and checks. The error '
+        'is what the inversion leaves of the model itself.'
+    )
+    return [
+        ('Inversion of a motion', f'{about}\n\n{of_models(n, runs)}'),
+        (
+            'Inversion: growth with the motion',
+            f'With amplifier lag, creep and a bent sensor.\n\n{of_length(lengths, runs)}',
+        ),
+    ]
+
+
+if __name__ == '__main__':
+    show(sections)

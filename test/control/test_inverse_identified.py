@@ -1,0 +1,73 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The inverse of models as they come from identification and diagnosis, and what they expect."""
+
+from dataclasses import replace
+
+import numpy as np
+from paper_stage import FS, PAPER
+import piezo_ident as pi
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.stage_model import EffectSetting
+from programs import identification_program
+import pytest
+
+CREEP = EffectSetting('creep', {'gain': [0.01, 0.02], 'time_constant': [0.05, 0.5]})
+TRUTH = replace(PAPER, effects=(CREEP,))
+STAGE = replace(pi.SimulatedStage.load('paper'), model=TRUTH)
+HOLDS = """
+limits: [0, 10]
+sample_rate: 20000
+slew: 100
+segments:
+  - {signal: idle, duration: 0.3}
+  - {signal: triangle, slope: 30}
+  - {signal: hold, level: 8, duration: 1.2}
+  - {signal: hold, level: 2, duration: 0.6}
+  - {signal: sine, bias: 5, amplitude: 4, frequency: 20, duration: 0.5}
+  - {signal: idle, duration: 0.6}
+"""
+
+
+@pytest.fixture(scope='module')
+def record():
+    program = parse_program(identification_program())
+    return STAGE.play(program, np.random.default_rng(0))
+
+
+@pytest.fixture(scope='module')
+def labelled(record):
+    return pi.identify(record, Settings(max_order=6)).model
+
+
+@pytest.fixture(scope='module')
+def unlabelled(record):
+    pieces = tuple(replace(piece, segments=()) for piece in record.pieces)
+    return pi.identify(replace(record, pieces=pieces), Settings(max_order=6)).model
+
+
+@pytest.fixture(scope='module')
+def refined(labelled):
+    holds = STAGE.play(parse_program(HOLDS), np.random.default_rng(1))
+    result = pi.diagnose(labelled, holds, pi.DiagnosisSettings(effects=('creep',)))
+    assert [effect.name for effect in result.model.effects] == ['creep']
+    return result.model
+
+
+@pytest.mark.parametrize('name', ['labelled', 'unlabelled', 'refined'])
+def test_an_identified_model_brings_the_stage_where_it_is_told(name, request):
+    model = request.getfixturevalue(name)
+    t = np.arange(4000) / FS
+    soft = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.05)
+    # from where nothing has crept yet
+    wanted = 2e-6 + 25e-6 * soft * (1.0 - np.cos(2 * np.pi * 30 * t))
+    drive = pi.invert(model, wanted)
+    assert drive.error < 0.01 and not drive.warnings
+    assert 0.0 < drive.expected < 1.0
+    y = TRUTH.simulate(drive.v)[drive.lead :]
+    error = 100.0 * np.sqrt(np.mean((y - wanted) ** 2)) / np.ptp(wanted)
+    assert error < (3.0 if name == 'refined' else 10.0) * drive.expected
+    if name == 'refined':
+        assert drive.expected < 0.5 * request.getfixturevalue('labelled').inverse(wanted).expected
