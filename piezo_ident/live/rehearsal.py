@@ -63,7 +63,9 @@ class Rehearsal:
         way = math.ceil(2.0 * abs(drive.v[0] - s.rest) / s.ramp_step)
         self._first = way + round(SETTLE * s.sample_rate)
         self.voltage = np.append(np.full(self._first, drive.v[0]), drive.v)
-        self.wanted = np.append(np.full(self._first, np.nan), drive.wanted)
+        # that of the drive is corrected by what was learned
+        wanted = np.pad(self.reference, (drive.lead, 0), mode='edge')
+        self.wanted = np.append(np.full(self._first, np.nan), wanted)
         self._measured = np.full(drive.v.size, np.nan)
 
     def measured(self, samples: Samples, tick: int) -> None:
