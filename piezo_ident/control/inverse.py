@@ -170,7 +170,7 @@ def invert(
             f'{model.sample_rate:g} Hz; give the motion at that rate'
         )
     s = model.scaling
-    low, high, slew = _limits(s.range if limits is None else limits, slew)
+    low, high, slew = given = _limits(s.range if limits is None else limits, slew)
     ends = float(s.u(low)), float(s.u(high))
     H, linear = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
     Q = linear_inverse(linear)
@@ -222,7 +222,8 @@ def invert(
         moves = np.flatnonzero(np.abs(u - u0) > still * min(span, 1.0))
         first = min(lead, int(moves[0]) - 1 if moves.size else lead)
         used = slice(max(first, 0), lead + y.size)
-        v = s.v0 + s.V * u[used]
+        # nor by the last digit
+        v = np.clip(s.v0 + s.V * u[used], *given[:2])
         beside = {name: z[used] for name, z in more.items()}
         predicted = model.stream().process(v, t[used], beside)
         if np.abs(x[used] - e[used] - s.x(predicted)).max() < RESTS * span:
