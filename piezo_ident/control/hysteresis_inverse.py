@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.kernels import curve, held, relaxing
+from piezo_ident.operators.kernels import curve, held
 
 __all__ = ['HysteresisInverse']
 
@@ -77,14 +77,31 @@ def _wide_plays(
 
 
 @ordered_kernel
-def _lags(u: float, up: bool, lags: Array, z: Array) -> float:
-    """Return the slope of what the lags z along the path add at u, upwards or down."""
-    slope = 0.0
+def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
+    """
+    Return what the lags along the path add at u, and its slope; `after` takes them.
+
+    As `piezo_ident.operators.kernels.relaxing`, of a single sample.
+    """
+    w, slope, before, left, last = 0.0, 0.0, 0.0, 1.0, z[lags.shape[0]]
+    way = 1.0 if u > last else -1.0
     for j in range(lags.shape[0]):
         a, d1, d2, d3 = lags[j, 0], lags[j, 1], lags[j, 2], lags[j, 3]
-        behind = u * (d1 + u * (d2 + u * d3)) - z[j]
-        slope += (a if up else -a) * behind - (d1 + u * (2.0 * d2 + u * 3.0 * d3))
-    return slope
+        # of twice the rate the square is left
+        left = left * left if a == 2.0 * before else np.exp(-a * abs(u - last))
+        before, b = a, way / a
+        # a line's own answer, in the place of phi
+        c2 = d2 - 3.0 * b * d3
+        c1 = d1 - 2.0 * b * c2
+        c0 = -b * c1
+        new = c0 + u * (c1 + u * (c2 + u * d3))
+        old = c0 + last * (c1 + last * (c2 + last * d3))
+        after[j] = new + (z[j] - old) * left
+        behind = u * (d1 + u * (d2 + u * d3)) - after[j]
+        w -= behind
+        slope += way * a * behind - (d1 + u * (2.0 * d2 + u * 3.0 * d3))
+    after[lags.shape[0]] = u
+    return w, slope
 
 
 @ordered_kernel
@@ -113,7 +130,7 @@ def _invert(
     `last` holds the voltage of H and H before, a slope of H, and the voltage before the lag; it is
     carried on with `memory`.
     """
-    after, one, value = memory.copy(), np.empty(1), np.empty(1)
+    after = memory.copy()
     u, w, slope, v = last[0], last[1], last[2], last[3]
     for k in range(wanted.size):
         goal, start = wanted[k], u
@@ -144,11 +161,8 @@ def _invert(
                 w += ((p1 * u + p0) * u + p2) * u
                 slope += (3.0 * p1 * u + 2.0 * p0) * u + p2
                 if lags.shape[0]:
-                    one[0], value[0] = u, w
-                    after[r.size :] = memory[r.size :]
-                    relaxing(one, lags, after[r.size :], value)
-                    w = value[0]
-                    slope += _lags(u, u > start, lags, after[r.size :])
+                    more, steeper = _lags(u, lags, memory[r.size :], after[r.size :])
+                    w, slope = w + more, slope + steeper
                 f = w - goal
                 slope = max(slope, FLAT)
                 if f < 0.0:

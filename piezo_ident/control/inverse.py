@@ -309,17 +309,18 @@ def _of_hysteresis(
     model: StageModel, ends: tuple[float, float], step: float
 ) -> tuple[HysteresisInverse | RateInverse, StageModel]:
     """Return the inverse of H, with what is done along with it, and the model of the rest."""
-    h, rate = model.hysteresis, model.sample_rate
-    H = HysteresisInverse(h, ends, step)
-    for setting in model.effects:
-        if setting.name == RateDependentHysteresis.name and h.relaxations is None:
-            return RateInverse(h, setting.parameters, rate, H.limits, step), model
-    for setting in model.effects:
-        if setting.name == AmplifierLag.name:
-            others = tuple(other for other in model.effects if other is not setting)
-            pole = AmplifierLag(rate, setting.parameters).pole
-            return HysteresisInverse(h, ends, step, pole), replace(model, effects=others)
-    return H, model
+    h, rate, pole, linear = model.hysteresis, model.sample_rate, 0.0, model
+    wide = [s for s in model.effects if s.name == RateDependentHysteresis.name]
+    lag = [s for s in model.effects_in('input') if s.name == AmplifierLag.name]
+    if h.relaxations is not None:
+        wide = []
+    if lag and not wide:
+        pole = AmplifierLag(rate, lag[0].parameters).pole
+        linear = replace(model, effects=tuple(s for s in model.effects if s is not lag[0]))
+    H = HysteresisInverse(h, ends, step, pole)
+    if wide:
+        return RateInverse(h, wide[0].parameters, rate, H.limits, step), linear
+    return H, linear
 
 
 def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:

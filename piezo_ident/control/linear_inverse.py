@@ -18,6 +18,8 @@ uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.804478.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
+from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.signal import oaconvolve
 
 __all__ = ['LinearInverse', 'is_filter', 'linear_inverse']
@@ -131,17 +134,20 @@ def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
     impulse, none = np.zeros((2, n))
     impulse[0] = 1.0
     t = np.arange(n) / model.sample_rate
-    # what goes by H, as if H were a line; with one much steeper than H nothing would converge
-    h = model.hysteresis
-    slope = np.sqrt(np.ptp(h(h.span)) / np.ptp(h.span) * max(h.lowest_slope(), FLAT))
     for setting in model.effects:
         effect = find_effect(setting.name)
         if not effect.in_dynamics or effect.in_delay_line:
             continue
         of = []
-        for v, x in ((none, impulse), (impulse / slope, none)):
+        for v, x in ((none, impulse), (impulse / _slope(model.hysteresis), none)):
             operator = effect(model.sample_rate, setting.parameters)
             operator.reset(0.0, 0.0)
             of.append(np.fft.rfft(operator.process(Block(t=t, v=v, x=x)).x))
         G = G * of[0] + of[1]
     return np.asarray(G, dtype=np.complex128)
+
+
+@lru_cache(maxsize=1)
+def _slope(h: Hysteresis) -> float:
+    """Return the slope of H as a line; with one much steeper than H nothing would converge."""
+    return math.sqrt(np.ptp(h(h.span)) / np.ptp(h.span) * max(h.lowest_slope(), FLAT))
