@@ -28,6 +28,7 @@ block is refused | WARN |
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 import time
@@ -68,6 +69,9 @@ class FeedforwardNode(DrivingNode):
         self._model: StageModel | None = None
         self._source, self._models = '', 0
         self._segment = ''
+        # labels of the reference, and from which sample on
+        self._labels: deque[tuple[int, str]] = deque()
+        self._heard = 0
         # the last reference, its length, and what was learned of it
         self._kept: list[NDArray[np.float64]] = []
         self._length, self._last_value = 0, 0.0
@@ -187,6 +191,8 @@ class FeedforwardNode(DrivingNode):
             reason = self._refusal or 'publish one on the topic model, or set the parameter model'
             raise ConfigError(f'there is no model: {reason}')
         self._clear()
+        self._labels.clear()
+        self._heard = 0
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._take_right(self._tracker)
         return self._tracker
@@ -227,7 +233,10 @@ class FeedforwardNode(DrivingNode):
             share = np.arange(1, verdict.missing + 1) / (verdict.missing + 1)
             before = self._last_value
             x = np.append(before + (x[0] - before) * share, x)
-        self._last, self._segment = time.monotonic(), samples.segment
+        self._last = time.monotonic()
+        if not self._labels or self._labels[-1][1] != samples.segment:
+            self._labels.append((self._heard, samples.segment))
+        self._heard += x.size
         if verdict.kind is Kind.START:
             self._kept, self._length = [], 0
         self._last_value, self._length = float(x[-1]), self._length + x.size
@@ -241,11 +250,20 @@ class FeedforwardNode(DrivingNode):
             self._state = 'tracking'
 
     def _play(self, drive: Drive) -> None:
+        self._segment = self._label(drive.t)
         self._send(drive.t, drive.v, self._segment)
         if drive.clipped:
             self._note_fault('clipped', 'the reference is out of reach', drive.clipped)
         wanted = Samples(drive.t, drive.wanted, self._segment, 'reference')
         self._tell(self._error.wanted(wanted))
+
+    def _label(self, t: NDArray[np.float64]) -> str:
+        """Return the label of what the stage is to do at the first of these times."""
+        labels, preview = self._labels, self.values['preview']
+        at = round((float(t[0]) - preview) * self._rate_of_clock)
+        while len(labels) > 1 and labels[1][0] <= at:
+            labels.popleft()
+        return labels[0][1]
 
     def _played(self, voltage: Samples, wanted: Samples) -> None:
         self._send(voltage.t, voltage.values, voltage.segment)
