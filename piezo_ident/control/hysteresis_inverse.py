@@ -14,6 +14,8 @@ European Journal of Control 9(4), 2003, doi:10.3166/ejc.9.407-418.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
@@ -33,6 +35,8 @@ TRIALS = 80
 FLAT = 1e-6
 #: places at which it is tried whether H rises beyond its span
 FINE = 513
+#: width of plays, in spans, within which H may fall behind a reversal
+NARROW = 0.02
 
 
 @kernel
@@ -221,7 +225,7 @@ class HysteresisInverse:
         pole: float = 0.0,
     ) -> None:
         slope = hysteresis.lowest_slope()
-        if not slope > 0.0:
+        if not (slope > 0.0 or _without_narrow(hysteresis).lowest_slope() > 0.0):
             raise ModelError(
                 f'the hysteresis of this model has no inverse: its slope falls to {slope:.2g} '
                 'within its range; identify again from a record with larger sweeps'
@@ -280,6 +284,14 @@ class HysteresisInverse:
             reached,
         )
         return u, reached
+
+
+def _without_narrow(h: Hysteresis) -> Hysteresis:
+    """Return H with its narrowest plays as a straight line: how it rises but for reversals."""
+    least, most = h.span
+    narrow = h.thresholds <= NARROW * (most - least)
+    weights = np.where(narrow, 0.0, h.weights)
+    return replace(h, weights=weights, p2=h.p2 + float(h.weights[narrow].sum()))
 
 
 def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:

@@ -4,11 +4,12 @@
 """
 Iterative learning: the same motion again, corrected by what was measured before.
 
-    r <- r + F (y_wanted - y),        u = inverse model of r
+    r <- r + s F (y_wanted - y),        u = inverse model of r
 
 F is a low-pass without phase: where the model is not known, above the lowest mode that rings, a
 correction may do harm.  What repeats from run to run falls by the share to which the model is
 right; noise does not, so the best run is kept and learning ends where the error falls no more.
+After a run that was worse, the step s from the best one is half as large.
 D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
 Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 """
@@ -34,6 +35,8 @@ Array = NDArray[np.float64]
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95
+#: step below which a correction that harms is not tried again
+SMALLEST = 0.2
 #: corner of F, in parts of the lowest mode that rings, and of the sampling rate
 OF_MODE, OF_RATE = 0.7, 0.1
 #: damping below which a mode rings
@@ -136,6 +139,7 @@ class Learning:
         self._model_span = abs(model.scaling.Y)
         self._span = float(np.ptp(self._wanted)) or self._model_span
         self.repetitions: list[Repetition] = []
+        self._step, self._correction = 1.0, np.zeros_like(self._wanted)
         modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
         lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
         self.corner = min(lowest, OF_RATE * model.sample_rate) if corner is None else corner
@@ -154,7 +158,10 @@ class Learning:
     def is_done(self) -> bool:
         """Whether the error falls no more."""
         errors = [r.error for r in self.repetitions]
-        return len(errors) > 1 and errors[-1] > WORTH * min(errors[:-1])
+        if len(errors) < 2 or errors[-1] <= WORTH * min(errors[:-1]):
+            return False
+        # after a harm a smaller step may still help
+        return errors[-1] <= min(errors[:-1]) / WORTH or self._step < SMALLEST
 
     def take(self, measured: ArrayLike) -> float:
         """
@@ -188,9 +195,9 @@ class Learning:
             # what is out of reach would grow from run to run
             e = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
             correction = gaussian_filter1d(e, self._width, mode='nearest')
-            self._best_reference = self._reference
-            self._reference = self._reference + correction
-            self.drive = self._invert(self._reference)
+            self._best_reference, self._correction = self._reference, correction
         else:
-            self.drive, self._reference = self.best.drive, self._best_reference
+            self._step *= 0.5
+        self._reference = self._best_reference + self._step * self._correction
+        self.drive = self._invert(self._reference)
         return error

@@ -79,3 +79,16 @@ def test_it_starts_anywhere():
     inverse = HysteresisInverse(h)
     assert inverse.reset(0.7) == h([0.7])[0]
     assert_allclose(inverse.process(h([0.7, 0.2]))[0], [0.7, 0.2], atol=1e-12)
+
+
+def test_h_may_fall_within_its_narrowest_play_alone():
+    # behind each reversal H falls by 0.0005 before the first play moves
+    h = Hysteresis([0.01, 0.4], [0.5, 0.2], 0.0, -0.05)
+    inverse = HysteresisInverse(h)
+    inverse.reset(0.0)
+    w = 0.3 * (1.0 - np.cos(np.arange(2000) / 100))
+    u, reached = inverse.process(w)
+    assert_allclose(reached, w, atol=1e-9)
+    assert_allclose(h(np.append(0.0, u))[1:], w, atol=1e-9)
+    with pytest.raises(ModelError, match='has no inverse'):
+        HysteresisInverse(Hysteresis([0.1, 0.4], [0.5, 0.2], 0.0, -0.05))

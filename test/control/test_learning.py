@@ -93,14 +93,13 @@ def test_a_mode_that_is_somewhere_else_does_no_harm(off):
 def test_what_drifts_ends_it_and_the_best_stays():
     stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning = pi.Learning(PAPER, RASTER)
-    for k in range(6):
+    for k in range(12):
         learning.take(stage.simulate(learning.drive.v) + k * 100e-9)
         if learning.is_done:
             break
     errors = [r.error for r in learning.repetitions]
     # a run errs by what the stage drifted since the one before: 0.33 %
-    assert k == 2 and errors[1] == learning.best.error < 0.4
-    assert learning.drive is learning.best.drive
+    assert k < 6 and errors[1] == learning.best.error < 0.4
 
 
 def test_a_run_that_failed_leaves_no_trace():
@@ -112,11 +111,11 @@ def test_a_run_that_failed_leaves_no_trace():
     knock = 1e-6 * np.sin(2 * np.pi * 33 * np.arange(learning.drive.v.size) / FS)
     learning.take(stage.simulate(learning.drive.v) + knock)
     best = learning.best
-    assert learning.drive is best.drive
-    # the best drive again, as by chance a little better: what comes next is made of that
-    wanted = np.append(np.full(best.drive.lead, RASTER[0]), RASTER)
-    error = learning.take(best.measured + 0.3 * (wanted - best.measured))
-    assert learning.take(stage.simulate(learning.drive.v)) < 0.5 * error < 0.5 * best.error
+    assert best is learning.repetitions[1]
+    # what comes next is made of the best run, by half of its correction
+    error = learning.take(stage.simulate(learning.drive.v))
+    assert 0.4 * best.error < error < 0.6 * best.error
+    assert learning.take(stage.simulate(learning.drive.v)) < 0.7 * error
 
 
 def test_what_is_out_of_reach_is_refused_or_left_out():
@@ -147,3 +146,14 @@ def test_a_motion_may_stand_still_and_a_model_may_need_a_channel():
     assert learning.drive.error < 0.01
     with pytest.raises(DataError, match='is it measured in metres'):
         learning.take(learning.drive.predicted * 1e6)
+
+
+def test_a_step_that_harms_is_halved():
+    # the stage moves 2.4 times as far as its model says: each whole correction overshoots
+    s = PAPER.scaling
+    far = replace(s, Y=2.4 * s.Y, y0=35e-6 - 2.4 * (35e-6 - s.y0))
+    stage = replace(PAPER, scaling=far)
+    learning = pi.Learning(PAPER, RASTER)
+    errors = repeated(stage, learning, most=16)
+    assert errors[1] > errors[0]
+    assert learning.best.error < 0.1 * errors[0]
