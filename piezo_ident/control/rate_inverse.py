@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.kernel import ordered_kernel
+from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.hysteresis import Hysteresis, POWERS
+from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, held
 from scipy.ndimage import gaussian_filter1d
 
@@ -33,13 +33,13 @@ Array = NDArray[np.float64]
 NONE = 1e-13
 #: evaluations of H for a sample, at most
 TRIALS = 100
-#: first step from the sample before
-FIRST = 1e-4
+#: first step of all, and least first step from the sample before
+FIRST, LEAST = 1e-4, 1e-7
 #: times that the speed is taken anew, and the corner of its smoothing in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
 
 
-@ordered_kernel
+@kernel
 def _widened(
     u: float,
     r: Array,
@@ -68,7 +68,11 @@ def _widened(
         most = u + r[i] * ahead_wide + ahead
         f = held(memory[i], least, most if least < most else least)
         after[i] = f
-        w += (q[i] + c[3, i] * (u - low)) * f - c[3, i] * (u - low) * low + curve(c, i, f - low)
+        w += q[i] * f
+    if c.shape[0]:
+        for i in range(r.size):
+            t = after[i] - low
+            w += c[3, i] * (u - low) * t + curve(c, i, t)
     return w
 
 
@@ -93,7 +97,7 @@ def _invert(
     reached: Array,
 ) -> None:
     """Write voltages to `out` and H to `reached`; `power`, shape (n,), is the speed^eps."""
-    after, last = memory.copy(), u0
+    after, last, move = memory.copy(), u0, FIRST
     for k in range(wanted.size):
         goal, s = wanted[k], power[k]
         lowest, highest = max(least, last - step), min(most, last + step)
@@ -101,7 +105,8 @@ def _invert(
         a = min(max(last, lowest), highest)
         w = _widened(a, r, q, p1, p2, p0, low, c, growth, s, memory, after)
         fa = w - goal
-        b, fb, move = a, fa, FIRST
+        # about as far as the voltage went before
+        b, fb, move = a, fa, max(move, LEAST)
         while abs(fa) > NONE and (fb > 0.0) == (fa > 0.0):
             a, fa = b, fb
             end = lowest if fa > 0.0 else highest
@@ -124,7 +129,7 @@ def _invert(
             b, fb = x, f
         for i in range(memory.size):
             memory[i] = after[i]
-        last = b
+        move, last = 1.1 * abs(b - last), b
         out[k], reached[k] = b, w
 
 
@@ -173,7 +178,6 @@ class RateInverse:
         self._h, self.limits, self._step = hysteresis, limits, float(step)
         self._effect = RateDependentHysteresis(sample_rate, parameters, hysteresis)
         r, q, p1, p2, p0, low, c = hysteresis.for_kernel
-        c = c if c.size else np.zeros((POWERS + 2, r.size))
         names = 'gain', 'stretch', 'lead', 'lead_stretch'
         growth = np.array([self._effect.number(name) for name in names])
         self._parameters = r, q, p1, p2, p0, low, c, growth
