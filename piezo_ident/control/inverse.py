@@ -34,7 +34,7 @@ from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
 
-__all__ = ['Inverse', 'invert']
+__all__ = ['Inverse', 'checked_limits', 'invert']
 
 Array = NDArray[np.float64]
 
@@ -170,7 +170,7 @@ def invert(
             f'{model.sample_rate:g} Hz; give the motion at that rate'
         )
     s = model.scaling
-    low, high, slew = given = _limits(s.range if limits is None else limits, slew)
+    low, high, slew = given = checked_limits(model, limits, slew)
     ends = float(s.u(low)), float(s.u(high))
     H, linear = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
     Q = linear_inverse(linear)
@@ -278,16 +278,25 @@ def _vector(values: ArrayLike) -> Array:
     return np.empty(0)
 
 
-def _limits(limits: tuple[float, float], slew: float) -> tuple[float, float, float]:
-    """Return lowest and highest voltage and its speed as numbers."""
+def checked_limits(
+    model: StageModel, limits: tuple[float, float] | None, slew: float
+) -> tuple[float, float, float]:
+    """
+    Return lowest and highest voltage and its speed as numbers; the identified range for None.
+
+    Raises
+    ------
+    DataError
+    """
     try:
-        (low, high), speed = map(float, limits), float(slew)
+        (low, high), speed = (
+            map(float, model.scaling.range if limits is None else limits),
+            float(slew),
+        )
     except (TypeError, ValueError):
         low = high = speed = np.nan
     if not (-np.inf < low < high < np.inf and speed > 0.0):
-        raise DataError(
-            'invert: give limits as (lowest, highest) voltage, finite, and a slew above zero'
-        )
+        raise DataError('limits must be (lowest, highest) voltage, finite, and a slew above zero')
     return low, high, speed
 
 

@@ -30,7 +30,7 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.signal import oaconvolve
 
-__all__ = ['LinearInverse', 'is_filter', 'linear_inverse']
+__all__ = ['LinearInverse', 'check_preview', 'is_filter', 'least_preview', 'linear_inverse']
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,11 @@ REACH = 1e-3
 FLAT = 1e-6
 #: lengths of the filter that are tried [samples], and the shortest in parts of the delay
 SHORTEST, LONGEST, OF_DELAY = 1 << 11, 1 << 19, 8
+#: what a shortened filter may miss before the present sample, as a share of the sum of its
+#: magnitudes, and its most samples there
+MISSED, MOST_BEHIND = 1e-6, 8192
+#: delays of the model that a preview must reach for the filter to be worth anything
+BEYOND = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,15 @@ class LinearInverse:
         size = np.cumsum(np.abs(self.taps))
         first, last = np.searchsorted(size, size[-1] * np.array([REACH, 1.0 - REACH]))
         return int(max(self.ahead - first, last - self.ahead, 0))
+
+    def shortened(self, most: int) -> LinearInverse:
+        """Return a filter that looks ahead by so many samples at most, of the same static gain."""
+        ahead = min(self.ahead, most)
+        size = np.abs(self.taps[::-1])
+        idle = int(np.argmax(np.cumsum(size) > MISSED * size.sum()))
+        behind = min(max(self.behind - idle, 0), MOST_BEHIND)
+        taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
+        return LinearInverse(taps * (self.taps.sum() / taps.sum()), ahead, behind)
 
     def __call__(self, x: Array) -> Array:
         """Return the filtered signal; beyond its ends it rests.  Shape (n,)."""
@@ -118,6 +132,26 @@ def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse
         f'the inverse of G and its delay takes more than {LONGEST} samples; identify again with a '
         'lower order'
     )
+
+
+def least_preview(model: StageModel) -> float:
+    """Return the samples that a motion must be known ahead, or a little more."""
+    return max(1.0, BEYOND * model.total_delay.total)
+
+
+def check_preview(model: StageModel, preview: int) -> None:
+    """
+    Refuse a preview that is too short for a model.
+
+    Raises
+    ------
+    ModelError
+    """
+    if preview < least_preview(model):
+        raise ModelError(
+            f'a preview of {preview} samples does not reach beyond the delay of the model, '
+            f'{model.total_delay.total:g} samples; make it longer'
+        )
 
 
 def is_filter(effect: type[Effect]) -> bool:

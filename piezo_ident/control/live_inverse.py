@@ -21,15 +21,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.errors import DataError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
-from piezo_ident.control.inverse import SHORT
-from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse
+from piezo_ident.control.inverse import checked_limits, SHORT
+from piezo_ident.control.linear_inverse import (
+    check_preview,
+    least_preview,
+    linear_inverse,
+    LinearInverse,
+)
 from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['BEYOND', 'PREVIEW', 'Driven', 'LiveInverse', 'shortened']
+__all__ = ['PREVIEW', 'Driven', 'LiveInverse']
 
 Array = NDArray[np.float64]
 
@@ -39,13 +44,8 @@ PREVIEW = 400
 MOST_PASSES = 4
 #: share of the error that one more pass must leave at most
 WORTH = 0.7
-#: what Q may miss before the present sample, as a share of the sum of its magnitudes, and its most
-#: samples there
-OUTSIDE, LONGEST = 1e-6, 8192
 #: samples in which a step fades that another voltage leaves
 JOIN = 2000
-#: share of a delay that a preview must exceed for Q to be worth anything
-BEYOND = 1.2
 #: error of the trial [% of stroke] from which the preview is called short
 LARGE = 0.1
 #: trial motion: samples, periods [samples] and amplitudes [of the range] of its sines
@@ -128,21 +128,14 @@ class LiveInverse:
         preview: int = PREVIEW,
         rest: float | None = None,
     ) -> None:
-        low, high = model.scaling.range if limits is None else limits
+        low, high, self._slew = checked_limits(model, limits, slew)
+        self._limits = low, high
         self._rest = low if rest is None else float(rest)
-        if not (low < high and slew > 0.0 and low <= self._rest <= high):
-            raise DataError(
-                'live inverse: give limits as (lowest, highest) voltage with rest between them, '
-                'and a slew above zero'
-            )
+        if not low <= self._rest <= high:
+            raise DataError(f'rest, {self._rest:g} V, lies outside of {low:g} .. {high:g} V')
         self.model, self.warnings = _without_channels(model)
         self.preview = int(preview)
-        self._limits, self._slew = (float(low), float(high)), float(slew)
-        if self.preview < BEYOND * model.total_delay.total or self.preview < 1:
-            raise ModelError(
-                f'a preview of {preview} samples does not reach beyond the delay of the model, '
-                f'{model.total_delay.total:g} samples; make it longer'
-            )
+        check_preview(model, self.preview)
         self._filter = linear_inverse(self.model)
         self.passes, self.error = self._tried()
         if self.error > LARGE:
@@ -158,7 +151,7 @@ class LiveInverse:
         """Return passes that share the preview."""
         s, rate = self.model.scaling, self.model.sample_rate
         bounds = float(s.u(self._limits[0])), float(s.u(self._limits[1]))
-        Q = shortened(self._filter, self.preview // passes)
+        Q = self._filter.shortened(self.preview // passes)
         waits = [self.preview - passes * Q.ahead] + [0] * (passes - 1)
         return [
             _Pass(
@@ -182,7 +175,7 @@ class LiveInverse:
         wanted = rest + fade * (0.5 * (low + high) - rest + (high - low) * motion)
         best, least = 1, np.inf
         for passes in range(1, MOST_PASSES + 1):
-            if self.preview < BEYOND * passes * self.model.total_delay.total:
+            if self.preview < passes * least_preview(self.model):
                 break
             self._passes = self._built(passes, np.inf)
             self.reset()
@@ -373,16 +366,6 @@ class _Pass:
     def _run(self, v: Array, tick: int) -> Array:
         self._tick = tick + v.size
         return self._stream.process(v, np.arange(tick, self._tick) / self._model.sample_rate)
-
-
-def shortened(Q: LinearInverse, most: int) -> LinearInverse:
-    """Return a filter that looks ahead by so many samples at most, of the same static gain."""
-    ahead = min(Q.ahead, most)
-    size = np.abs(Q.taps[::-1])
-    idle = int(np.argmax(np.cumsum(size) > OUTSIDE * size.sum()))
-    behind = min(max(Q.behind - idle, 0), LONGEST)
-    taps = Q.taps[Q.ahead - ahead : Q.ahead + 1 + behind]
-    return LinearInverse(taps * (Q.taps.sum() / taps.sum()), ahead, behind)
 
 
 def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:

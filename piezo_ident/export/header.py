@@ -26,9 +26,14 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, NONE, TRIALS
-from piezo_ident.control.inverse import SHORT
-from piezo_ident.control.linear_inverse import EPSILON, is_filter, linear_inverse, LinearInverse
-from piezo_ident.control.live_inverse import BEYOND, shortened
+from piezo_ident.control.inverse import checked_limits, SHORT
+from piezo_ident.control.linear_inverse import (
+    check_preview,
+    EPSILON,
+    is_filter,
+    linear_inverse,
+    LinearInverse,
+)
 from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, links_of, Part
 from piezo_ident.model.stage_model import StageModel
@@ -93,11 +98,11 @@ def export_c(
     Raises
     ------
     DataError
-        When it is given no model.
+        When it is given no model, or limits or slew are impossible.
     ConfigError
-        When the name is none in C, or limits, slew or preview are impossible.
+        When the name is none in C.
     ModelError
-        When an effect of the model is not written in C.
+        When an effect of the model is not written in C, or the preview is shorter than its delay.
 
     Examples
     --------
@@ -112,21 +117,16 @@ def export_c(
             f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
             options='--name stage',
         )
-    low, high = model.scaling.range if limits is None else limits
-    if not (-math.inf < low < high < math.inf and slew > 0.0):
-        raise ConfigError('export: give limits as lowest and highest voltage, and a slew above 0')
-    if preview is not None and not preview > BEYOND * model.total_delay.total:
-        raise ConfigError(
-            f'export: a preview of {preview} samples does not reach beyond the delay of the '
-            f'model, {model.total_delay.total:g} samples; make it longer'
-        )
+    kept = checked_limits(model, limits, slew)
+    if preview is not None:
+        check_preview(model, preview)
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
     channels = Part(links).channels
     why, ff = 'it was not asked for', None
     if feedforward:
         try:
-            ff = _feedforward(model, front, back, (low, high), slew, preview)
+            ff = _feedforward(model, front, back, kept, preview)
         except ModelError as error:
             why = str(error)
     scaling = model.scaling
@@ -164,8 +164,7 @@ def _feedforward(
     model: StageModel,
     front: Part,
     back: Part,
-    limits: tuple[float, float],
-    slew: float,
+    kept: tuple[float, float, float],
     preview: int | None,
 ) -> _FeedForward:
     """
@@ -181,11 +180,11 @@ def _feedforward(
     rest = tuple(e for e in model.effects if e.name not in in_front)
     Q = whole = linear_inverse(replace(model, effects=rest))
     if preview is not None:
-        Q = shortened(Q, preview)
+        Q = Q.shortened(preview)
     # an effect that passes the command on does so before it is known
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
     inverted = Part([x for x in undone if x.effect and not is_filter(type(x.effect))])
-    low, high, most = *limits, slew
+    low, high, most = kept
     for link in front.links:
         # beyond them a change of the voltage changes nothing
         if link.name == 'slew_limit' and link.effect:

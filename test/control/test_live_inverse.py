@@ -143,7 +143,7 @@ def test_a_preview_that_is_short_is_told_and_one_without_sense_refused():
     assert 'preview of 4 samples' in live.warnings[0]
     with pytest.raises(ModelError, match='reach beyond the delay of the model, 3 samples'):
         LiveInverse(PAPER, preview=3)
-    with pytest.raises(DataError, match='lowest, highest'):
+    with pytest.raises(DataError, match='rest, 11 V, lies outside'):
         LiveInverse(PAPER, rest=11.0)
     with pytest.raises(DataError, match='finite'):
         LiveInverse(PAPER).process([np.nan])

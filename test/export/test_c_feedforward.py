@@ -12,7 +12,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from paper_stage import FS, PAPER
 import piezo_ident as pi
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.model.stage_model import EffectSetting
@@ -140,12 +140,12 @@ def test_the_header_says_what_it_does_not_do(headers):
     [
         ({'name': '2x'}, 'no name for C'),
         ({'name': 'a b'}, 'no name for C'),
-        ({'limits': (1.0, 0.0)}, 'lowest and highest'),
-        ({'limits': (0.0, np.inf)}, 'lowest and highest'),
-        ({'slew': 0.0}, 'slew above 0'),
+        ({'limits': (1.0, 0.0)}, 'lowest, highest'),
+        ({'limits': (0.0, np.inf)}, 'lowest, highest'),
+        ({'slew': 0.0}, 'slew above zero'),
         ({'preview': 3}, 'does not reach beyond the delay of the model, 3 samples'),
     ],
 )
 def test_what_cannot_be_is_refused(options, what):
-    with pytest.raises(ConfigError, match=what):
+    with pytest.raises(PiezoIdentError, match=what):
         pi.export_c(PAPER, **options)
