@@ -10,7 +10,7 @@ import re
 from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_distinct, check_file, check_suffix
+from piezo_ident.cli.outputs import check_output
 from piezo_ident.cli.records import naming
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import write_text
@@ -27,11 +27,8 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident export``."""
     if args.out is None:
         raise ConfigError('export: no file is named', options='--out stage.h')
-    check_suffix(
-        args.out, [SUFFIXES[args.format]] if args.format else SUFFIXES.values(), 'a model'
-    )
-    check_distinct(args.out, [args.model])
-    check_file(args.out, overwrite=args.overwrite)
+    suffixes = [SUFFIXES[args.format]] if args.format else SUFFIXES.values()
+    check_output(args.out, suffixes, 'a model', inputs=[args.model], overwrite=args.overwrite)
     is_header = args.out.suffix.lower() == '.h'
     if not is_header and (args.limits or args.slew or args.preview is not None):
         raise ConfigError(

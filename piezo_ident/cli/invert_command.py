@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_distinct, check_file, check_suffix
+from piezo_ident.cli.outputs import check_output
 from piezo_ident.cli.predict_command import PICTURES, TABLE_FILES
 from piezo_ident.cli.records import check_order, naming, print_faults, read_all
 from piezo_ident.common.errors import DataError
@@ -33,9 +33,8 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
         (args.plot, PICTURES, 'a picture'),
     ):
         if path is not None:
-            check_suffix(path, suffixes, what)
-            check_distinct(path, [args.model, args.record])
-            check_file(path, overwrite=args.overwrite)
+            inputs = args.model, args.record
+            check_output(path, suffixes, what, inputs=inputs, overwrite=args.overwrite)
     check_order(args.model, args.record, 'invert')
     model = load(args.model)
     (reference,) = read_all([args.record], args, console, displacement_alone=True)

@@ -19,6 +19,7 @@ __all__ = [
     'check_file',
     'check_folder',
     'check_link',
+    'check_output',
     'check_suffix',
 ]
 
@@ -31,6 +32,15 @@ def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
         raise ConfigError(
             f'{path}: {what} cannot be written as {path.suffix or "a folder"}; choose {names}'
         )
+
+
+def check_output(
+    path: Path, suffixes: Iterable[str], what: str, *, inputs: Iterable[Path], overwrite: bool
+) -> None:
+    """Refuse a file whose suffix names no format, that is an input, or cannot be written."""
+    check_suffix(path, suffixes, what)
+    check_distinct(path, inputs)
+    check_file(path, overwrite=overwrite)
 
 
 def check_link(path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_distinct, check_file, check_suffix
+from piezo_ident.cli.outputs import check_output
 from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
@@ -37,9 +37,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         (args.plot, PICTURES, 'a picture'),
     ):
         if path is not None:
-            check_suffix(path, suffixes, what)
-            check_distinct(path, [args.model, args.record])
-            check_file(path, overwrite=args.overwrite)
+            inputs = args.model, args.record
+            check_output(path, suffixes, what, inputs=inputs, overwrite=args.overwrite)
     check_order(args.model, args.record, 'predict')
     model = load(args.model)
     (record,) = read_all([args.record], args, console, voltage_alone=True)
