@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Inverse, then forward, is the identity: for every law of H, any stable G, every effect.
+Inverse, then forward, is the identity: behind a lag, for any stable G, for every effect.
 
 `make limits` has limits of voltage and speed kept in 10,000 random references.
 """
@@ -37,18 +37,6 @@ EFFECTS = {
 LIMITED = ('amplifier_lag', 'rate_dependent_hysteresis', 'creep', 'backlash', 'saturation')
 #: references of random limits
 COUNT = int(os.environ.get('REFERENCES', '150'))
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=SEED, law=st.sampled_from(LAWS))
-def test_h_of_its_inverse_is_the_identity_for_every_law(seed, law):
-    rng = np.random.default_rng(seed)
-    h, u = random_hysteresis(rng, law), random_path(rng, 400)
-    inverse = HysteresisInverse(h, (0.0, 1.0))
-    inverse.reset(u[0])
-    found, reached = inverse.process(h(u))
-    assert_allclose(h(found), h(u), atol=1e-12)
-    assert_allclose(reached, h(u), atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
