@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
+import textwrap
 
 import matplotlib
 
@@ -24,13 +25,15 @@ from piezo_ident.nodes.parameters import NODES
 
 #: topic, publishers, subscribers: as in docs/graph.md
 TOPICS = (
-    ('voltage', ('excitation', 'player'), ('stage', 'identifier', 'model')),
-    ('displacement', ('stage', 'player'), ('identifier', 'model')),
+    ('voltage', ('excitation', 'player', 'feedforward'), ('stage', 'identifier', 'model')),
+    ('displacement', ('stage', 'player'), ('identifier', 'model', 'feedforward')),
     ('applied_voltage', ('stage',), ('identifier',)),
+    ('reference', (), ('feedforward',)),
+    ('tracking_error', ('feedforward',), ()),
     ('prediction', ('model',), ()),
     ('residual', ('model',), ()),
     ('preview', ('model',), ()),
-    ('model', ('identifier',), ('model',)),
+    ('model', ('identifier',), ('model', 'feedforward')),
     ('report', ('identifier',), ()),
 )
 #: where each node stands, and what it is beside its name
@@ -41,6 +44,7 @@ PLACES = {
     'identifier': (6.2, 5.0, 'captures, learns the model'),
     'model': (6.2, 2.6, 'predicts block by block'),
     'recorder': (6.2, 0.9, 'writes topics to a bag'),
+    'feedforward': (6.2, 6.8, 'follows a reference'),
 }
 #: where each topic stands; the topic `model` lies between the two nodes
 SPOTS = {
@@ -49,12 +53,16 @@ SPOTS = {
     'applied_voltage': (3.6, 2.6),
     'model': (6.2, 3.8),
     'report': (9.0, 4.8),
+    'reference': (3.6, 6.8),
+    'tracking_error': (9.0, 6.8),
     'prediction': (9.0, 3.3),
     'residual': (9.0, 2.6),
     'preview': (9.0, 1.9),
 }
 NODE, TOPIC = '#2b5c8a', '#555555'
 WIDTH, HEIGHT = 1.9, 0.72
+#: lines that pass another node: from, to, and their bend
+BENDS = {('feedforward', 'model'): ((6.56, 3.9), (7.15, 6.6), 'arc3,rad=0.5')}
 #: what is recorded lies in these frames: left, bottom, width, height, and a side to leave by
 FRAMES = ((2.72, 2.25, 1.76, 2.8, (3.9, 2.25)), (8.25, 2.28, 1.5, 1.35, (8.35, 2.28)))
 
@@ -104,9 +112,9 @@ def arrow(ax: Axes, begin: tuple[float, float], end: tuple[float, float], **how:
 
 def draw() -> Figure:
     """Return the picture."""
-    figure = Figure(figsize=(10.4, 6.2), layout='constrained')
+    figure = Figure(figsize=(10.4, 7.4), layout='constrained')
     ax = figure.add_subplot()
-    ax.set(xlim=(-0.15, 10.1), ylim=(-0.4, 6.1), aspect='equal')
+    ax.set(xlim=(-0.15, 10.1), ylim=(-0.4, 7.4), aspect='equal')
     ax.axis('off')
     for name in NODES:
         box(ax, *PLACES[name][:2], name, PLACES[name][2])
@@ -118,7 +126,8 @@ def draw() -> Figure:
             arrow(ax, begin, end, ls='--' if node == 'player' else '-')
         for node in subscribers:
             begin, end = edge(node, topic)
-            arrow(ax, end, begin)
+            end, begin, bend = BENDS.get((node, topic), (end, begin, 'arc3'))
+            arrow(ax, end, begin, connectionstyle=bend)
     x, y, _ = PLACES['recorder']
     for left, bottom, width, height, leave in FRAMES:
         style = 'round,pad=0,rounding_size=0.1'
@@ -138,6 +147,10 @@ def draw() -> Figure:
         color=NODE,
     )
     ax.text(3.6, 5.8, 'sets program, calls ~/start', ha='center', fontsize=8, color=NODE)
+    u, v = SPOTS['reference']
+    told = 'from you, or from an excitation\nwith quantity: reference'
+    ax.text(1.6, v, told, ha='center', va='center', fontsize=8, color=TOPIC)
+    arrow(ax, (2.6, v), (u - 0.53, v))
     u, v = SPOTS['preview']
     ax.text(u, 1.05, 'PlotJuggler, rqt_plot,\nFoxglove', ha='center', fontsize=8, color=TOPIC)
     arrow(ax, (u, v - 0.2), (u, 1.4))
@@ -146,7 +159,8 @@ def draw() -> Figure:
         'Every node publishes its ~/status, and its /diagnostics once a second.  '
         f'Recorded by default: {", ".join(recorded)}.'
     )
-    ax.text(-0.05, -0.08, note, fontsize=7.5, color=TOPIC)
+    note = textwrap.fill(note, 165)
+    ax.text(-0.05, 0.05, note, fontsize=7.5, color=TOPIC, va='top')
     return figure
 
 

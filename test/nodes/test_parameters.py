@@ -73,3 +73,9 @@ def test_foxglove_labels_a_path_by_what_the_preview_holds():
     assert shown
     for label, path in shown.items():
         assert path == f'/preview.position[{names.index(label)}]'
+
+
+def test_the_picture_of_the_graph_shows_all_nodes_and_topics():
+    drawn = (ROOT / 'docs/images/graph.svg').read_text(encoding='utf-8')
+    topics = [name for name, *_ in table('topics') if '/' not in name]
+    assert [name for name in (*NODES, *topics) if f'>{name}</text>' not in drawn] == []
