@@ -84,9 +84,10 @@ def _whole(reference: Record, model: StageModel) -> Piece:
     """Return a reference that is one piece at the rate of the model, or refuse it."""
     (piece, *more) = reference
     if more:
+        met = '; '.join(str(fault) for fault in reference.faults if not fault.is_note)
         raise DataError(
-            f'{reference.name}: its time jumps, or its rate changes, {len(more)} times; a wanted '
-            'motion is one piece'
+            f'{reference.name}: falls into {1 + len(more)} pieces; {met}; a wanted motion is one '
+            'piece: fill in what is missing'
         )
     if not model.takes(piece):
         raise DataError(

@@ -70,7 +70,7 @@ def _thresholds(text: str) -> int | None:
 
 def _limits(ctx: Any, param: Any, limits: tuple[float, float] | None) -> Any:
     if limits is not None and not limits[0] < limits[1]:
-        raise click.BadParameter('give the lower one first')
+        raise click.BadParameter('give two numbers, the lower one first')
     return limits
 
 

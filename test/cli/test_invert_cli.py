@@ -58,12 +58,13 @@ def test_what_is_out_of_reach_is_refused_or_clipped(capsys, made, scan):
     ('t', 'y', 'reason'),
     [
         (2 * T, WANTED, 'is sampled at 1000 Hz, the model at 2000 Hz'),
-        (np.where(T > 0.5, T + 0.1, T), WANTED, 'a wanted motion is one piece'),
+        (np.where(T > 0.5, T + 0.1, T), WANTED, 'gap (1) at 0.5 s'),
+        (T, np.where(T == 0.5, np.nan, WANTED), 'not_finite (1) at 0.5 s'),
         (T, np.where(T > 0.5, np.nan, WANTED), 'NaN or infinite'),
         (T, 1e9 * WANTED, 'is no piezo stage'),
         (T, WANTED + 500, 'the wanted motion starts at 530 um; between 0 and 10 V'),
     ],
-    ids=['rate', 'gap', 'nan', 'unit', 'reach'],
+    ids=['rate', 'gap', 'hole', 'nan', 'unit', 'reach'],
 )
 def test_no_motion_costs_one_line(capsys, tmp_path, made, t, y, reason):
     path = tmp_path / 'scan.csv'
