@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.live.guard import LAST_RAMP
 from piezo_ident.live.tracker import Tracker
+from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
 from piezo_ident.nodes.lab_node import LabNode
-from piezo_ident.nodes.voltage_output import VoltageOutput
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
 __all__ = ['DRIVING', 'NOW', 'PERIOD', 'DrivingNode']
 
-#: how long the ramp of a node that is ending may take [s]
-LAST_RAMP = 0.7
 #: how long a fault stays in the status [s]
 FAULT_SHOWN = 3.0
 #: period of the timer that waits, ramps and watches [s]
@@ -55,7 +54,7 @@ class DrivingNode(LabNode):
         self._counts: Counter[str] = Counter()
         self._faults: dict[str, tuple[str, float]] = {}
         self._ramped, self._ramp_begin = 0, time.monotonic()
-        self._output = VoltageOutput(self)
+        self._output = ExclusivePublisher(self, 'voltage')
         self._timer = self.create_timer(PERIOD, self._on_timer, autostart=False)
         self.offer('stop', self._stop)
 

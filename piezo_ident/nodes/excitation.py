@@ -33,31 +33,18 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program, Sequence
-from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
+from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
-from piezo_ident.nodes.subscriptions import between_turns
-from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import cut_blocks, Samples
-from rclpy.duration import Duration
-from std_msgs.msg import Float64MultiArray
 
 __all__ = ['ExcitationNode', 'main']
 
 #: unit of a program, and what it is in SI
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
-#: how long the ramp of a node that is ending may take [s]
-LAST_RAMP = 0.7
 #: most blocks that are sent at once after a delay
 CATCH_UP = 50
-#: how long to listen whether somebody else is playing [s]
-LISTEN = 0.5
-#: how long it may take to match all publishers [s]
-MEET = 2.0
-#: how long it takes a new node to know of most others [s]
-YOUTH = 1.0
-#: between the match of a subscriber and the first block, for the other side to know of it too [s]
-SETTLE = 0.1
 
 
 def read_program(text: str) -> Program:
@@ -90,7 +77,6 @@ class Playing:
     hurry: bool = False
     tick: int = 0
     voltage: float | None = None
-    heard_other: bool = False
     clock: Schedule | None = None
     work: float = 0.0
     segment: str = ''
@@ -117,9 +103,7 @@ class ExcitationNode(LabNode):
         Guard(self._guard_settings())
         self._quantity = self.values['quantity']
         self._unit, self._scale = UNITS[self._quantity]
-        self._voltage = self.create_publisher(Float64MultiArray, self._quantity, STREAM)
-        self._born = time.monotonic()
-        self._listener: Any = None
+        self._output = ExclusivePublisher(self, self._quantity, stays=True)
         self.offer('start', self._start)
         self.offer('stop', self._stop)
 
@@ -167,13 +151,9 @@ class ExcitationNode(LabNode):
     def _start(self) -> str:
         if self._is_playing():
             raise ConfigError('a program is being played already; call ~/stop first')
-        self._refuse_others()
         sequence = self._build(self.values['program'])
         playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
-        self._close_listener()
-        self._listener = self.create_subscription(
-            Float64MultiArray, self._quantity, self._on_other, STREAM
-        )
+        self._output.open()
         self._playing = playing
         self._rate = Rate()
         self.report_status('waiting', 0.0, 'waiting for subscribers')
@@ -193,31 +173,6 @@ class ExcitationNode(LabNode):
         playing.stop.set()
         return f'ramping to {self.values["rest"]:g} {self._unit}'
 
-    def _other_publishers(self) -> list[str]:
-        """Return the other publishers of voltage; a namesake may be one that was killed."""
-        own = self.get_fully_qualified_name()
-        infos = self.get_publishers_info_by_topic(self._voltage.topic_name)
-        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
-        return [name for name in names if name != own]
-
-    def _refuse_others(self) -> None:
-        for name in self._other_publishers():
-            raise ConfigError(
-                f'{name} publishes on {self._voltage.topic_name} too; end it first: '
-                'two programs at once would tear the stage to and fro'
-            )
-
-    def _close_listener(self) -> None:
-        # it would get every block that this node sends
-        if self._listener is not None:
-            self.destroy_subscription(self._listener)
-            self._listener = None
-
-    def _on_other(self, _: Float64MultiArray) -> None:
-        playing = self._playing
-        if playing is not None and playing.tick == 0:
-            playing.heard_other = True
-
     # the thread that plays
 
     def _run(self, playing: Playing) -> None:
@@ -234,40 +189,8 @@ class ExcitationNode(LabNode):
             self.report_status('done', 100.0, f'{_name(playing.sequence)} played{behind}')
 
     def _await_graph(self, playing: Playing) -> None:
-        limit, needed = self.values['wait_limit'], self.values['subscribers']
-        self._await_publishers(playing)
-        begin = time.monotonic()
-        self._sleep(playing, begin + LISTEN)
-        self._refuse_others()
-        while True:
-            if playing.heard_other:
-                raise ConfigError(
-                    f'another {self.get_fully_qualified_name()} is playing on '
-                    f'{self._voltage.topic_name}; end it first'
-                )
-            # without our own listener
-            count = self._voltage.get_subscription_count() - 1
-            if count >= needed:
-                break
-            if time.monotonic() - begin > limit + LISTEN:
-                raise ConfigError(
-                    f'{max(0, count)} of {needed} subscribers on {self._voltage.topic_name} after '
-                    f'{limit:g} s; start the stage, or set subscribers or wait_limit'
-                )
-            self._sleep(playing, time.monotonic() + 0.02)
-        between_turns(self, self._close_listener)
-        self._sleep(playing, time.monotonic() + SETTLE)
-
-    def _await_publishers(self, playing: Playing) -> None:
-        """Wait until every publisher is matched: silence before says nothing."""
-        # a node that has just come up does not even know of them
-        self._sleep(playing, self._born + YOUTH)
-        give_up = time.monotonic() + MEET
-        while time.monotonic() < give_up:
-            listener = self._listener
-            known = self.count_publishers(self._voltage.topic_name)
-            if listener is None or listener.get_publisher_count() >= known:
-                return
+        needed, limit = self.values['subscribers'], self.values['wait_limit']
+        while not self._output.poll(needed, limit):
             self._sleep(playing, time.monotonic() + 0.02)
 
     def _sleep(self, playing: Playing, until: float) -> None:
@@ -296,7 +219,7 @@ class ExcitationNode(LabNode):
         t = np.arange(playing.tick, playing.tick + v.size) / playing.sequence.sample_rate
         playing.tick += v.size
         playing.voltage, playing.segment = float(v[-1]), label
-        self._voltage.publish(to_message(Samples(t, v * self._scale, label, self._quantity)))
+        self._output.send(Samples(t, v * self._scale, label, self._quantity))
         playing.work = time.perf_counter() - begin
 
     def _ramp(self, playing: Playing, state: str, message: str) -> None:
@@ -332,10 +255,10 @@ class ExcitationNode(LabNode):
         """Return rate, blocks, delays and head-room; watch for a second publisher."""
         playing = self._playing
         if not self._is_playing():
-            self._close_listener()
-        foreign = self._other_publishers()
+            self._output.stop_listening()
+        foreign = self._output.others()
         self._second = f'second publisher {foreign[0]} on {self._quantity}' if foreign else ''
-        values: dict[str, object] = {'publishers': self.count_publishers(self._voltage.topic_name)}
+        values: dict[str, object] = {'publishers': self.count_publishers(self._output.topic)}
         if playing is None:
             return (WARN if foreign else OK), self._second or 'nothing played yet', values
         clock = playing.clock
@@ -367,7 +290,7 @@ class ExcitationNode(LabNode):
             playing.hurry = True
             playing.stop.set()
             self._thread.join(LAST_RAMP + 0.9)
-            self._voltage.wait_for_all_acked(Duration(seconds=0.1))
+            self._output.close()
 
 
 def main(argv: Many[str] | None = None) -> int:

@@ -81,7 +81,7 @@ def test_two_excitations_on_one_topic(lab):
     assert lab.call('twin/start')[0]
     lab.wait(lambda: lab.status('other/twin')['state'] == 'failed', 'the twin to give up')
     said = lab.status('other/twin')['text']
-    assert 'another /excitation is playing on /voltage' in said
+    assert 'another /excitation drives /voltage now' in said
     assert twin.stop() == 0
     other = lab.start('excitation', {'program': HIGH}, remaps={'__node': 'other'})
     first = 'second publisher /excitation on voltage'

@@ -1,0 +1,168 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The right to drive: a publisher that sends only where nobody else does."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.nodes.subscriptions import between_turns
+from piezo_ident.nodes.wire import STREAM, to_message
+from piezo_ident.record.blocks import Samples
+from rclpy.duration import Duration
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+
+__all__ = ['ExclusivePublisher']
+
+#: how long to listen whether somebody else drives [s]
+LISTEN = 0.5
+#: how long it may take to match all publishers [s]
+MEET = 2.0
+#: how long it takes a new node to know of most others [s]
+YOUTH = 1.0
+#: between the match of a subscriber and the first block, for the other side to know of it too [s]
+SETTLE = 0.1
+
+
+class ExclusivePublisher:
+    """
+    A publisher of blocks that asks for the right to drive before it sends.
+
+    Parameters
+    ----------
+    node : Node
+    topic : str
+    stays : bool, optional
+        Whether the publisher is there between two drives too.  It then refuses any other one by
+        its name; without, one that is silent is no hindrance, as an excitation between two
+        programs, which does not start beside this one.
+
+    Attributes
+    ----------
+    topic : str
+        Its full name.
+    """
+
+    def __init__(self, node: Node, topic: str, *, stays: bool = False) -> None:
+        self._node, self._stays, self._born = node, stays, time.monotonic()
+        self.topic = node.resolve_topic_name(topic)
+        self._publisher: Any = self._created() if stays else None
+        self._listener: Any = None
+        self._begin = self._met = self._free = 0.0
+        self._heard = False
+        self._known: set[str] = set()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a publisher."""
+        return self._publisher is not None
+
+    def _created(self) -> Any:
+        return self._node.create_publisher(Float64MultiArray, self.topic, STREAM)
+
+    def open(self) -> None:
+        """
+        Ask for the right to drive, by the executor of the node; `poll` tells when it is there.
+
+        Raises
+        ------
+        ConfigError
+            When any other publisher is to be refused, and there is one.
+        """
+        self._refuse_others()
+        self.stop_listening()
+        self._begin, self._met, self._free, self._heard = time.monotonic(), 0.0, 0.0, False
+        if self._publisher is None:
+            self._publisher = self._created()
+        self._listener = self._node.create_subscription(
+            Float64MultiArray, self.topic, self._on_other, STREAM
+        )
+
+    def poll(self, subscribers: int, limit: float) -> bool:
+        """
+        Return whether blocks may be sent; from any thread.
+
+        Raises
+        ------
+        ConfigError
+            When somebody else drives, or too few listen within the limit [s].
+        """
+        now = time.monotonic()
+        if self._free:
+            return now > self._free
+        if self._heard:
+            # without a name among the others it is that of this node
+            names = ', '.join(self.others()) or f'another {self._node.get_fully_qualified_name()}'
+            raise ConfigError(f'{names} drives {self.topic} now; end it first')
+        if not self._met:
+            self._await_publishers(now)
+            return False
+        if now < self._met + LISTEN:
+            return False
+        self._refuse_others()
+        # without our own listener
+        count = self._publisher.get_subscription_count() - 1
+        if count < subscribers:
+            if now > self._met + limit + LISTEN:
+                raise ConfigError(
+                    f'{max(0, count)} of {subscribers} subscribers on {self.topic} after '
+                    f'{limit:g} s; start the stage, or set subscribers or wait_limit'
+                )
+            return False
+        between_turns(self._node, self.stop_listening)
+        self._known, self._free = set(self.others()), now + SETTLE
+        return False
+
+    def _await_publishers(self, now: float) -> None:
+        """Note when every publisher is matched: silence before says nothing."""
+        # a node that has just come up does not even know of them
+        begin = max(self._begin, self._born + YOUTH)
+        known, listener = self._node.count_publishers(self.topic), self._listener
+        is_matched = listener is None or listener.get_publisher_count() >= known
+        if now > begin and (is_matched or now > begin + MEET):
+            self._met = now
+
+    def _refuse_others(self) -> None:
+        if self._stays and (names := self.others()):
+            raise ConfigError(
+                f'{names[0]} publishes on {self.topic} too; end it first: '
+                'two programs at once would tear the stage to and fro'
+            )
+
+    def send(self, samples: Samples) -> None:
+        """Send a block."""
+        self._publisher.publish(to_message(samples))
+
+    def others(self) -> list[str]:
+        """Return the other publishers; a namesake may be one that was killed."""
+        own = self._node.get_fully_qualified_name()
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
+        return sorted({name for name in names if name != own})
+
+    def second(self) -> str:
+        """Return a publisher that came since the right was given, empty without one."""
+        new = set(self.others()) - self._known if self._free else set()
+        return min(new, default='')
+
+    def stop_listening(self) -> None:
+        """Drop the listener, by the executor: it would get every block that this node sends."""
+        if self._listener is not None:
+            self._node.destroy_subscription(self._listener)
+            self._listener = None
+
+    def close(self) -> None:
+        """Give the right to drive back."""
+        self.stop_listening()
+        if self._publisher is not None:
+            self._publisher.wait_for_all_acked(Duration(seconds=0.1))
+            if not self._stays:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
+
+    def _on_other(self, _: Float64MultiArray) -> None:
+        self._heard = True
