@@ -209,9 +209,7 @@ class FeedforwardNode(DrivingNode):
         begin = time.perf_counter()
         sequence = info.get('publication_sequence_number')
         try:
-            samples = from_message(message)
-            if samples.quantity != 'reference':
-                raise DataError(f'a block of {samples.quantity!r}, expected is reference')
+            samples = from_message(message, 'reference')
         except DataError as error:
             self._sample_clock.skip(sequence)
             self._note_fault('refused', f'a block is refused: {error}')

@@ -52,7 +52,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.simulated_stage import SimulatedStage
@@ -64,8 +64,6 @@ from std_msgs.msg import Float64MultiArray
 
 __all__ = ['StageNode', 'main']
 
-#: how long the ramp of a node that is ending may take [s]
-LAST_RAMP = 0.7
 #: how long a fault stays in the status [s]
 FAULT_SHOWN = 3.0
 #: period of the timer that ramps a silent stage [s]
@@ -158,9 +156,7 @@ class StageNode(LabNode):
         begin = time.perf_counter()
         sequence = info.get('publication_sequence_number')
         try:
-            samples = from_message(message)
-            if samples.quantity != 'voltage':
-                raise DataError(f'a block of {samples.quantity!r}, expected is voltage')
+            samples = from_message(message, 'voltage')
         except DataError as error:
             self._sample_clock.skip(sequence)
             self._note_fault('malformed', f'a block is refused: {error}')

@@ -78,14 +78,15 @@ def to_message(samples: Samples) -> Float64MultiArray:
     )
 
 
-def from_message(message: Float64MultiArray) -> Samples:
+def from_message(message: Float64MultiArray, quantity: str = '') -> Samples:
     """
-    Return the block in a message.
+    Return the block in a message, of a certain quantity where one is named.
 
     Raises
     ------
     DataError
-        When the layout is not that of a block, does not fit the data, or is larger than a block.
+        When the layout is not that of a block, does not fit the data, or is larger than a block,
+        or the quantity is another.
     """
     dims, n = message.layout.dim, len(message.data)
     if n > 2 * MOST:
@@ -94,7 +95,10 @@ def from_message(message: Float64MultiArray) -> Samples:
         raise DataError(f"{len(dims)} dimensions are not ['sample:<segment>', 't,<quantity>']")
     if any(len(d.label) > LONGEST for d in dims):
         raise DataError(f'a label of more than {LONGEST} characters')
-    return decode(message.data, message.layout.dim, message.layout.data_offset)
+    samples = decode(message.data, message.layout.dim, message.layout.data_offset)
+    if quantity and samples.quantity != quantity:
+        raise DataError(f'a block of {samples.quantity!r}, expected is {quantity}')
+    return samples
 
 
 def publisher_ids(node: Node, subscription: Subscription) -> list[bytes]:
