@@ -38,7 +38,7 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
     name = args.name or re.sub(r'\W', '_', args.out.stem, flags=re.ASCII).lower()
     model = load(args.model)
     title = f'The stage of {args.model.name}'
-    functions = []
+    header, functions = '', []
     with naming(str(args.model)), deferred_interrupts():
         if is_header:
             header = export_c(
@@ -55,6 +55,13 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
         else:
             export_fmu(model, args.out, name)
     console.say(' '.join([f'wrote {args.out}', *([f'with {", ".join(functions)}'] * is_header)]))
+    ahead = re.search(r'_PREVIEW = (\d+)', header)
+    preview = int(ahead[1]) if ahead else None
+    if preview is not None:
+        console.say(
+            f'the feed-forward knows the motion {preview} samples ahead, '
+            f'{1e3 * preview / model.sample_rate:.4g} ms; --preview N makes it shorter'
+        )
     if len(functions) == 1:
         console.say('  warning: there is no feed-forward; the head of the file says why')
     console.result(
@@ -64,5 +71,6 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
             'format': 'c' if is_header else 'fmu',
             'name': name,
             'functions': functions,
+            'preview': preview,
         }
     )

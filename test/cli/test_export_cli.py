@@ -24,6 +24,7 @@ def test_a_header_is_written(capsys, tmp_path, model):
     out = tmp_path / 'My-Stage.h'
     said = succeed(capsys, 'export', model, '--format', 'c', '--out', out, '--limits', 0, 9)
     assert f'wrote {out} with my_stage_step, my_stage_feedforward_step' in said
+    assert 'samples ahead, 15.2 ms; --preview N' in said
     header = out.read_text()
     assert 'The stage of model.yaml' in header and '#define MY_STAGE_HIGHEST 9.0' in header
     assert (
@@ -33,6 +34,7 @@ def test_a_header_is_written(capsys, tmp_path, model):
     more = ['--overwrite', '--name', 'axis', '--slew', '5e3', '--json']
     result = json.loads(succeed(capsys, 'export', model, '--out', out, *more))
     assert result['functions'] == ['axis_step', 'axis_feedforward_step']
+    assert result['preview'] == 304
     assert '#define AXIS_STEP 0.25' in out.read_text()
 
 
