@@ -18,8 +18,8 @@ the memory that it would have if it had run from the start.
 
 | in the reference | what happens | status |
 |---|---|---|
-| layout of no block, stamps off the clock, a block that came before, a second publisher | the \
-block is refused | WARN |
+| layout of no block, stamps off the clock, a block that came before, a second publisher, far \
+from the stage, as in micrometres | the block is refused | WARN |
 | a sample that is no number | the last one stays in force | |
 | a gap up to `silence` | a straight line | WARN |
 | another stream | is joined from where the first one ended | |
@@ -37,6 +37,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.control.inverse import FAR
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Rate
@@ -210,6 +211,7 @@ class FeedforwardNode(DrivingNode):
         sequence = info.get('publication_sequence_number')
         try:
             samples = from_message(message, 'reference')
+            self._check_unit(samples.values)
         except DataError as error:
             self._sample_clock.skip(sequence)
             self._note_fault('refused', f'a block is refused: {error}')
@@ -217,6 +219,18 @@ class FeedforwardNode(DrivingNode):
             self._take(samples, sequence)
             self._busy += time.perf_counter() - begin
         self.report_state()
+
+    def _check_unit(self, x: NDArray[np.float64]) -> None:
+        """Refuse a block that is nowhere near the stage."""
+        if self._model is None:
+            return
+        s = self._model.scaling
+        least = float(np.nanmin(np.abs(x - s.y0), initial=np.inf))
+        if FAR * abs(s.Y) < least < np.inf:
+            raise DataError(
+                f'it wants the stage {1e6 * least:.3g} um away, which moves by '
+                f'{1e6 * abs(s.Y):.3g} um; is the reference in metres?'
+            )
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
         verdict = self._sample_clock.judge(

@@ -131,12 +131,20 @@ def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
     for b in (
         block(SIZE, bad, 'scan', 'reference'),
         block(5 * SIZE, bad, 'scan', 'voltage'),
+        block(4 * SIZE, np.full(SIZE, 35.0), 'scan', 'reference'),
         block(4 * SIZE, np.full(SIZE, 90e-6), 'scan', 'reference'),
     ):
         lab.publish('reference', b)
     is_in(lab, 'done')
     said = {s['text'] for s in lab.statuses('feedforward')[since:] if s['level'] == '1'}
-    for what in ('400 samples are missing', 'came', 'expected is reference', 'out of reach'):
+    told = (
+        '400 samples are missing',
+        'came',
+        'expected is reference',
+        'in metres?',
+        'out of reach',
+    )
+    for what in told:
         assert any(what in text for text in said), (what, said)
     t, v = column(voltage[first:])
     assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
