@@ -28,6 +28,7 @@ from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
+from piezo_ident.effects.creep import Creep
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
@@ -56,6 +57,8 @@ SHORT = 1e-4
 #: changes of the voltage [of the span of the model] that may be none, and how far from rest the
 #: motion may then be [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
+#: time of a way to the beginning of a motion, and of a wait there [s]
+RISE, HOLD = 0.2, 1.0
 #: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
 FAR, FAINT = 30.0, 2e-3
 
@@ -241,7 +244,7 @@ def invert(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
-    warnings += _extrapolated(model, v, y)
+    warnings += _extrapolated(model, v, y) + _creeping(model, float(v[0]))
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     lead -= used.start
     return Inverse(
@@ -371,6 +374,22 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
             f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
         )
     return told
+
+
+def _creeping(model: StageModel, v0: float) -> list[str]:
+    """Return a warning where the stage takes long to rest at the beginning of a motion."""
+    low, rate = model.scaling.range[0], model.sample_rate
+    only = replace(model, effects=tuple(e for e in model.effects if e.name == Creep.name))
+    if not only.effects:
+        return []
+    rise = np.linspace(low, v0, round(RISE * rate))
+    left = only.stream().reset(v0) - only.simulate(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
+    if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
+        return []
+    told = (
+        f'the stage creeps: {HOLD:g} s after it came from {low:g} V it is still {1e6 * off:.2g} um'
+    )
+    return [f'{told} off where the motion begins; let it wait longer, or begin under {low:g} V']
 
 
 def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:

@@ -113,3 +113,12 @@ def test_a_motion_that_begins_at_once_needs_a_lead():
     assert drive.lead >= 3
     assert_allclose(drive.wanted[: drive.lead], 10e-6)
     assert drive.error < 0.01
+
+
+def test_where_a_stage_creeps_before_its_motion_is_told():
+    creep = EffectSetting('creep', {'gain': [0.02], 'time_constant': [10.0]})
+    model = replace(PAPER, effects=(creep,))
+    (told,) = pi.invert(model, sine(20.0)).warnings
+    # 2 % of the 35 um at which it begins, less what the wait makes up for
+    assert 'the stage creeps' in told and 'still 0.62 um off where' in told
+    assert not pi.invert(model, sine(20.0, size=2e-6) - 32e-6).warnings

@@ -142,7 +142,7 @@ def test_what_leaks_past_the_stage_is_part_of_the_filter():
 def test_what_is_out_of_reach_does_not_hide_the_rest():
     stage = pi.SimulatedStage.load('effects').model
     drive = pi.invert(stage, 1.4 * SINE, clip=True)
-    assert drive.clipped.any() and len(drive.warnings) == 1
+    assert drive.clipped.any() and not any('misses' in told for told in drive.warnings)
     away = np.convolve(drive.clipped, np.ones(401), 'same') == 0.0
     assert np.abs(drive.wanted - drive.predicted)[away].max() < 5e-9
 
