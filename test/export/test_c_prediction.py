@@ -18,7 +18,9 @@ from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import LAWS
 import pytest
+from random_models import random_model
 
 #: largest difference, as a share of stroke
 CLOSE = 1e-12
@@ -32,38 +34,11 @@ def random_drive(rng, n=6000):
     return np.clip(v + 0.02 * rng.standard_normal(v.size), 0.0, 10.0)
 
 
-def random_hysteresis(rng, law):
-    """Return an H of a law that rises everywhere."""
-    m = int(rng.integers(1, 40))
-    r = np.sort(rng.uniform(0.005, 0.99, m))
-    q = rng.uniform(0.0, 1.0, m) / m
-    wide = {'p0': rng.uniform(-0.1, 0.1), 'curves': rng.uniform(0.0, 0.2, (m, 3)) / m}
-    wide['bias'] = rng.uniform(0.0, 0.2, m) / m
-    rates = [1.0, 2.0, 4.0, 9.0]
-    lags = {'relaxations': np.column_stack([rates, rng.uniform(0, 0.03, (4, 3))])}
-    more = {'plays': {}, 'wide': wide, 'lags': lags, 'both': {**wide, **lags}}[law]
-    return Hysteresis(r, q, rng.uniform(-0.1, 0.2), 1.0, **more)
-
-
-def random_dynamics(rng):
-    """Return a stable G of some order."""
-    pairs, zeros = rng.integers(0, 5), rng.integers(0, 6)
-    poles = rng.uniform(0.3, 0.98, pairs) * np.exp(1j * rng.uniform(0.1, 2.5, pairs))
-    a = np.real(np.poly([*poles, *poles.conj()]))[1:] if pairs else np.empty(0)
-    b = np.real(np.poly(-rng.uniform(0.2, 2.5, zeros)))
-    return Dynamics(a, np.atleast_1d(b)).normalised()
-
-
-def random_model(rng, effects=(), law='plays'):
+def random_voltage_model(rng, law, effects=()):
+    """Return a random model whose delay may be whole, and whose voltage has an origin."""
+    model = random_model(rng, law, tuple(effects), damped=0.05)
     delay = Delay(int(rng.integers(2, 20)), float(rng.choice([0.0, rng.uniform()])))
-    return replace(
-        PAPER,
-        scaling=replace(PAPER.scaling, v0=0.3, y0=2e-6),
-        hysteresis=random_hysteresis(rng, law),
-        dynamics=random_dynamics(rng),
-        delay=delay,
-        effects=tuple(effects),
-    )
+    return replace(model, scaling=replace(model.scaling, v0=0.3), delay=delay)
 
 
 def random_effect(rng, name):
@@ -90,13 +65,17 @@ def models(seed=11):
     rng = np.random.default_rng(seed)
     made = {}
     for name in sorted(VISIBLE):
-        for i, law in enumerate(('plays', 'wide')):
-            made[f'{name}_{i}'] = random_model(rng, [random_effect(rng, name)], law)
-    for i, law in enumerate(('plays', 'wide', 'lags', 'both')):
-        made[f'h_{law}'] = random_model(rng, law=law)
-        made[f'all_{i}'] = random_model(
-            rng, [random_effect(rng, name) for name in rng.permutation(sorted(VISIBLE))], law
-        )
+        for law in ('plays', 'square'):
+            made[f'{name}_{law}'] = random_voltage_model(rng, law, [random_effect(rng, name)])
+    for law in LAWS:
+        made[f'h_{law}'] = random_voltage_model(rng, law)
+        every = [random_effect(rng, name) for name in rng.permutation(sorted(VISIBLE))]
+        made[f'all_{law}'] = random_voltage_model(rng, law, every)
+    # rates that double, and one that does not
+    lags = np.column_stack([[1.0, 2.0, 4.0, 9.0], rng.uniform(0, 0.03, (4, 3))])
+    made['h_lags'] = replace(
+        PAPER, hysteresis=Hysteresis([0.1, 0.4], [0.3, 0.1], -0.1, 0.9, relaxations=lags)
+    )
     none = Hysteresis([], [], 0.1, 1.0, p0=0.05)
     made['h_none'] = replace(PAPER, hysteresis=none, dynamics=Dynamics.unit(), delay=Delay(0))
     made['paper'] = PAPER
