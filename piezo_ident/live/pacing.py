@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 
-__all__ = ['ArrivalClock', 'Rate', 'Schedule']
+__all__ = ['ArrivalClock', 'Pace', 'Rate', 'Schedule']
 
 #: a block this much behind its time is not caught up with: readers keep only so many blocks [s]
 SLIP = 0.25
@@ -69,6 +69,31 @@ class Schedule:
     def change_speed(self, speed: float, position: float, now: float) -> None:
         """Go on at another speed, with this position due now."""
         self.speed, self.start = speed, now - position / speed
+
+
+class Pace:
+    """
+    How many samples are due in real time, from one look to the next.
+
+    After a pause of the process the stream goes on where it was.
+
+    Parameters
+    ----------
+    rate : float
+        Samples a second.
+    longest : float
+        Time that is caught up with at most [s].
+    """
+
+    def __init__(self, rate: float, longest: float) -> None:
+        self._rate, self._most = rate, max(1, round(longest * rate))
+        self._begin, self._seen = time.monotonic(), 0
+
+    def due(self) -> int:
+        """Return the samples that are due since the last look."""
+        now = round((time.monotonic() - self._begin) * self._rate)
+        due, self._seen = min(now - self._seen, self._most), now
+        return due
 
 
 class ArrivalClock:

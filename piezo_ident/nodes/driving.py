@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 import time
 from typing import Any
 
@@ -13,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.live.guard import LAST_RAMP
+from piezo_ident.live.pacing import Pace
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
+from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import LabNode
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
 __all__ = ['DRIVING', 'NOW', 'PERIOD', 'DrivingNode']
 
-#: how long a fault stays in the status [s]
-FAULT_SHOWN = 3.0
 #: period of the timer that waits, ramps and watches [s]
 PERIOD = 0.01
 #: states in which the node holds the right to drive, and what it does in them
@@ -51,9 +50,9 @@ class DrivingNode(LabNode):
         self._tracker: Tracker | None = None
         # why a model was not taken
         self._refusal = ''
-        self._counts: Counter[str] = Counter()
-        self._faults: dict[str, tuple[str, float]] = {}
-        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._faults = RecentFaults()
+        self._counts = self._faults.counts
+        self._begin_ramp()
         self._output = ExclusivePublisher(self, 'voltage')
         self._timer = self.create_timer(PERIOD, self._on_timer, autostart=False)
         self.offer('stop', self._stop)
@@ -68,7 +67,6 @@ class DrivingNode(LabNode):
     def _take_right(self, tracker: Tracker) -> None:
         """Ask for the right to drive."""
         tracker.reset()
-        self._counts.clear()
         self._faults.clear()
         self._output.open()
         self._timer.reset()
@@ -105,9 +103,12 @@ class DrivingNode(LabNode):
     def _halt(self, state: str, text: str) -> None:
         """Ramp to rest, and end in a state."""
         self._end = state, text
-        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._begin_ramp()
         self._state = 'stopping'
         self._ramp()
+
+    def _begin_ramp(self) -> None:
+        self._pace = Pace(self._rate_of_clock, 5 * PERIOD)
 
     def _ramp(self) -> None:
         tracker = self._tracker
@@ -119,11 +120,7 @@ class DrivingNode(LabNode):
             self.report_state()
 
     def _send_ramp(self, tracker: Tracker) -> None:
-        now = round((time.monotonic() - self._ramp_begin) * self._rate_of_clock)
-        # after a pause of this process the ramp goes on where it was, it does not catch up
-        due = min(now - self._ramped, max(1, round(5 * PERIOD * self._rate_of_clock)))
-        self._ramped = now
-        if due > 0:
+        if (due := self._pace.due()) > 0:
             self._send(*tracker.idle(due), 'ramp:stop')
 
     def _finish(self) -> None:
@@ -133,14 +130,8 @@ class DrivingNode(LabNode):
             self._tracker.reset()
         self._go(self._end[0])
 
-    def _note_fault(self, fault: str, message: str, count: int = 1) -> None:
-        self._counts[fault] += count
-        self._faults[fault] = (message, time.monotonic() + FAULT_SHOWN)
-
     def _problems(self) -> str:
-        now = time.monotonic()
-        self._faults = {k: fault for k, fault in self._faults.items() if fault[1] > now}
-        return '; '.join(filter(None, [self._refusal, *(m for m, _ in self._faults.values())]))
+        return '; '.join(filter(None, [self._refusal, self._faults.text]))
 
     def close(self) -> None:
         """Ramp to rest within a second."""

@@ -214,7 +214,7 @@ class FeedforwardNode(DrivingNode):
             self._check_unit(samples.values)
         except DataError as error:
             self._sample_clock.skip(sequence)
-            self._note_fault('refused', f'a block is refused: {error}')
+            self._faults.note('refused', f'a block is refused: {error}')
         else:
             self._take(samples, sequence)
             self._busy += time.perf_counter() - begin
@@ -237,11 +237,11 @@ class FeedforwardNode(DrivingNode):
             samples, sequence, lambda: publisher_ids(self, self._reference)
         )
         if not verdict.is_taken:
-            self._note_fault('refused', f'a block is refused: {verdict.reason}')
+            self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
         x = samples.values
         if verdict.kind is Kind.GAP:
-            self._note_fault('lost', verdict.reason, verdict.missing)
+            self._faults.note('lost', verdict.reason, verdict.missing)
             share = np.arange(1, verdict.missing + 1) / (verdict.missing + 1)
             before = self._last_value
             x = np.append(before + (x[0] - before) * share, x)
@@ -265,7 +265,7 @@ class FeedforwardNode(DrivingNode):
         self._segment = self._label(drive.t)
         self._send(drive.t, drive.v, self._segment)
         if drive.clipped:
-            self._note_fault('clipped', 'the reference is out of reach', drive.clipped)
+            self._faults.note('clipped', 'the reference is out of reach', drive.clipped)
         wanted = Samples(drive.t, drive.wanted, self._segment, 'reference')
         self._tell(self._error.wanted(wanted))
 
@@ -288,7 +288,7 @@ class FeedforwardNode(DrivingNode):
         try:
             samples = from_message(message)
         except DataError as error:
-            self._note_fault('refused', f'a block of displacement is refused: {error}')
+            self._faults.note('refused', f'a block of displacement is refused: {error}')
             return
         if samples.t.size and np.isfinite(samples.t).all():
             self._tell(self._error.measured(samples))
@@ -322,7 +322,7 @@ class FeedforwardNode(DrivingNode):
         elif learner.is_played and not tracker.is_at_rest:
             self._send_ramp(tracker)
         else:
-            self._ramped, self._ramp_begin = 0, time.monotonic()
+            self._begin_ramp()
         self.report_state()
 
     # reports
@@ -372,7 +372,7 @@ class FeedforwardNode(DrivingNode):
             values['tracking_percent'] = f'{self._told:.4g}'
         second = self._output.second() if self._output.is_open else ''
         if second:
-            self._note_fault('second', f'second publisher {second} on voltage', 0)
+            self._faults.note('second', f'second publisher {second} on voltage', 0)
         problems = self._problems()
         return (WARN if problems else OK), problems or self._state, values
 

@@ -1,10 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a node writes to its log, and so to ``/rosout``: what is new, and not what goes on."""
+"""What a node writes to its log and tells in its status: what is new, and not what goes on."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 import logging
 import re
@@ -14,12 +15,14 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-__all__ = ['FromPackage', 'Journal', 'one_line', 'shortened', 'shown']
+__all__ = ['FromPackage', 'Journal', 'RecentFaults', 'one_line', 'shortened', 'shown']
 
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
 #: for how long the very same line is left out [s]
 ECHO = 1.0
+#: how long a fault stays in the status [s]
+FAULT_SHOWN = 3.0
 #: how many lines are remembered; what comes beyond them, as under a flood, is left out
 MOST = 50
 #: longest line, as of a parameter that holds a program
@@ -29,6 +32,38 @@ PATH = 40
 
 _PATH = re.compile(r'(?:/[^\s/:;,]+){2,}')
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?')
+
+
+class RecentFaults:
+    """
+    What went wrong in a stream: how often, and of each fault the last message for some seconds.
+
+    Attributes
+    ----------
+    counts : Counter
+        By fault.
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._latest: dict[str, tuple[str, float]] = {}
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self.counts.clear()
+        self._latest.clear()
+
+    def note(self, fault: str, message: str, count: int = 1) -> None:
+        """Take note of a fault that was met so often."""
+        self.counts[fault] += count
+        self._latest[fault] = (message, time.monotonic() + FAULT_SHOWN)
+
+    @property
+    def text(self) -> str:
+        """The messages of the last seconds; empty without any."""
+        now = time.monotonic()
+        self._latest = {k: fault for k, fault in self._latest.items() if fault[1] > now}
+        return '; '.join(message for message, _ in self._latest.values())
 
 
 class Journal:

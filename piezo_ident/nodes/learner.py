@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.rehearsal import Rehearsal
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
@@ -52,7 +53,9 @@ class Learner:
         self.rehearsal: Rehearsal | None = None
         self.text, self.is_over = 'inverts the reference', False
         self._most, self._play = most, play
-        self._count, self._sent, self._tick, self._begin = 0, 0, 0, 0.0
+        self._count, self._sent, self._tick = 0, 0, 0
+        # while a repetition is on its way
+        self._pace: Pace | None = None
         self._resting = 0.0
         self._failure = ''
         self._thread = self._started(lambda: setattr(self, 'rehearsal', make()))
@@ -78,7 +81,7 @@ class Learner:
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement."""
-        if self.rehearsal is not None and self._begin:
+        if self.rehearsal is not None and self._pace:
             self.rehearsal.measured(samples, self._tick)
 
     def step(self, tracker: Tracker) -> None:
@@ -95,19 +98,21 @@ class Learner:
         if self._failure or self.rehearsal is None:
             raise ConfigError(self._failure)
         rehearsal, now = self.rehearsal, time.monotonic()
-        if not self._begin:
+        if self._pace is None:
             if self._count:
                 self._judge(rehearsal)
             if not self.is_over:
-                self._begin, self._sent, self._tick = now, 0, tracker.tick
+                self._pace = Pace(tracker.settings.sample_rate, SLIP)
+                self._sent, self._tick = 0, tracker.tick
                 self._resting = 0.0
                 done = ', '.join(f'{e:.3g}' for e in rehearsal.errors[-5:])
                 self.text = f'repetition {self._count + 1}' + (f' after {done} %' if done else '')
         elif self._sent < rehearsal.voltage.size:
-            self._send(tracker, rehearsal, now)
+            self._send(tracker, rehearsal, self._pace.due())
+            self._resting = now
         elif rehearsal.is_complete and tracker.is_at_rest:
             self._count += 1
-            self._begin = 0.0
+            self._pace = None
             self._thread = self._started(rehearsal.take)
         elif tracker.is_at_rest and now - self._resting > PATIENCE:
             raise ConfigError(
@@ -119,7 +124,7 @@ class Learner:
     def is_played(self) -> bool:
         """Whether a repetition was sent in full, and the stage is to go to rest."""
         rehearsal = self.rehearsal
-        return bool(self._begin and rehearsal and self._sent >= rehearsal.voltage.size)
+        return bool(self._pace and rehearsal and self._sent >= rehearsal.voltage.size)
 
     def _judge(self, rehearsal: Rehearsal) -> None:
         errors = rehearsal.errors
@@ -131,14 +136,8 @@ class Learner:
                 f'{errors[first]:.3g} % in the first'
             )
 
-    def _send(self, tracker: Tracker, rehearsal: Rehearsal, now: float) -> None:
-        rate = tracker.settings.sample_rate
-        due = min(round((now - self._begin) * rate), rehearsal.voltage.size)
-        # after a pause of this process it goes on where it was
-        if due - self._sent > 0.25 * rate:
-            late = due - self._sent - round(0.25 * rate)
-            self._begin += late / rate
-            due -= late
+    def _send(self, tracker: Tracker, rehearsal: Rehearsal, due: int) -> None:
+        due = min(self._sent + due, rehearsal.voltage.size)
         segment = f'learn:{len(rehearsal.errors) + 1}'
         while self._sent < due:
             cut = slice(self._sent, min(due, self._sent + 10 * BLOCK_SIZE))
@@ -148,4 +147,3 @@ class Learner:
             goal = Samples(t[known], wanted[known], segment, 'reference')
             self._play(Samples(t, v, segment), goal)
             self._sent = cut.stop
-        self._resting = now

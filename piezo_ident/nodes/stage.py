@@ -42,7 +42,6 @@ longer.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
@@ -53,9 +52,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
-from piezo_ident.live.pacing import Rate
+from piezo_ident.live.pacing import Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
@@ -64,8 +64,6 @@ from std_msgs.msg import Float64MultiArray
 
 __all__ = ['StageNode', 'main']
 
-#: how long a fault stays in the status [s]
-FAULT_SHOWN = 3.0
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
 #: longest gap through which a voltage is held [s]
@@ -99,12 +97,11 @@ class StageNode(LabNode):
         # tick of the next sample applied, whatever it comes from
         self._tick = 0
         self._segment = ''
-        self._counts: Counter[str] = Counter()
-        # the latest of each fault, and how long it stays in the status
-        self._faults: dict[str, tuple[str, float]] = {}
+        self._faults = RecentFaults()
+        self._counts = self._faults.counts
         self._state = 'idle'
-        self._last = self._ramp_begin = time.monotonic()
-        self._ramped = 0
+        self._last = time.monotonic()
+        self._pace = self._new_pace()
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
         self._displacement = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
         self._applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
@@ -159,7 +156,7 @@ class StageNode(LabNode):
             samples = from_message(message, 'voltage')
         except DataError as error:
             self._sample_clock.skip(sequence)
-            self._note_fault('malformed', f'a block is refused: {error}')
+            self._faults.note('malformed', f'a block is refused: {error}')
         else:
             self._take(samples, sequence)
             self._busy += time.perf_counter() - begin
@@ -171,12 +168,12 @@ class StageNode(LabNode):
         )
         kind = verdict.kind
         if not verdict.is_taken:
-            self._note_fault(kind.value, f'a block is refused: {verdict.reason}')
+            self._faults.note(kind.value, f'a block is refused: {verdict.reason}')
             return
         self._last = time.monotonic()
         if verdict.missing:
             self._counts['lost'] += verdict.missing
-            self._note_fault('gap', verdict.reason)
+            self._faults.note('gap', verdict.reason)
         if kind is Kind.START:
             self._ramp_timer.cancel()
             self._counts['streams'] += 1
@@ -184,7 +181,7 @@ class StageNode(LabNode):
             self._move(self._guard.hold(verdict.missing), 'hold:gap')
         applied = self._guard.process(samples.values, restarted=kind is Kind.START)
         for why, n in applied.altered.items():
-            self._note_fault(why, f'{n} {_WHY[why]}', n)
+            self._faults.note(why, f'{n} {_WHY[why]}', n)
         y = self._run.process(applied.voltage)
         self._displacement.publish(
             to_message(Samples(samples.t, y, samples.segment, 'displacement'))
@@ -214,43 +211,32 @@ class StageNode(LabNode):
                 self._sample_clock.end()
                 self._state = 'idle'
             else:
-                self._note_fault('silence', f'no voltage for {silent:.2f} s: ramping to rest')
+                self._faults.note('silence', f'no voltage for {silent:.2f} s: ramping to rest')
                 self._begin_ramp()
         self._report_state()
 
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', 'ramp:silence'
-        self._ramped, self._ramp_begin = 0, time.monotonic()
+        self._pace = self._new_pace()
         self._ramp_timer.reset()
 
+    def _new_pace(self) -> Pace:
+        return Pace(self.sample_rate, 5 * RAMP_PERIOD)
+
     def _on_ramp(self) -> None:
-        now = round((time.monotonic() - self._ramp_begin) * self.sample_rate)
-        # after a pause of this process the ramp goes on where it was, it does not catch up
-        due = min(now - self._ramped, max(1, round(5 * RAMP_PERIOD * self.sample_rate)))
-        self._ramped = now
-        if due > 0:
+        if (due := self._pace.due()) > 0:
             self._move(self._guard.idle(due), 'ramp:silence')
         if self._guard.is_at_rest:
             self._ramp_timer.cancel()
             self._sample_clock.end()
             self._state = 'idle'
-            self._note_fault('silence', 'no voltage: ramped to rest', 0)
+            self._faults.note('silence', 'no voltage: ramped to rest', 0)
         self._report_state()
 
     # reports
 
-    def _note_fault(self, fault: str, message: str, count: int = 1) -> None:
-        self._counts[fault] += count
-        self._faults[fault] = (message, time.monotonic() + FAULT_SHOWN)
-
-    def _recent_faults(self) -> str:
-        """Return the faults of the last seconds, empty when there were none."""
-        now = time.monotonic()
-        self._faults = {k: fault for k, fault in self._faults.items() if fault[1] > now}
-        return '; '.join(message for message, _ in self._faults.values())
-
     def _report_state(self) -> None:
-        faults = self._recent_faults()
+        faults = self._faults.text
         segment = f'segment {self._segment}'
         now = {'running': segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
         text = f'{faults}; {now}' if faults else now
@@ -261,7 +247,7 @@ class StageNode(LabNode):
         """Return rate, what was lost, altered and refused, and head-room."""
         samples = self._counts['samples']
         rate, worked = self._rate.of(samples), self._work_rate.of(self._busy)
-        faults = self._recent_faults()
+        faults = self._faults.text
         refused = ('malformed', 'repeat', 'late', 'second')
         altered = ('not_finite', 'outside_limits', 'too_fast', 'joining')
         values: dict[str, object] = {

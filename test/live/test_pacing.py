@@ -4,7 +4,7 @@
 """When blocks are due, and when they arrived."""
 
 import numpy as np
-from piezo_ident.live.pacing import ArrivalClock, Schedule, SLIP
+from piezo_ident.live.pacing import ArrivalClock, Pace, Schedule, SLIP
 import pytest
 
 FS = 20_000.0
@@ -80,3 +80,12 @@ def test_log_times_are_those_of_arrival_while_nobody_sets_the_clock():
     machine.ahead += 400_000
     clock.look()
     assert clock.stamp(machine.wall()) == machine.wall() and clock.set_by == 0
+
+
+def test_a_pace_goes_on_where_it_was_after_a_pause(monkeypatch):
+    looks = iter([5.0, 5.0, 5.01, 5.0101, 7.0, 7.01])
+    with monkeypatch.context() as patch:
+        patch.setattr('time.monotonic', lambda: next(looks))
+        pace = Pace(FS, 0.05)
+        due = [pace.due() for _ in range(5)]
+    assert due == [0, 200, 2, 1000, 200]
