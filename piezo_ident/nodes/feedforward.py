@@ -39,9 +39,9 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.control.inverse import FAR
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Rate
-from piezo_ident.live.rehearsal import Rehearsal
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import Drive, Successor, Tracker
 from piezo_ident.model.files import load
@@ -77,7 +77,7 @@ class FeedforwardNode(DrivingNode):
         self._kept: list[NDArray[np.float64]] = []
         self._length, self._last_value = 0, 0.0
         self._learner: Learner | None = None
-        self._rehearsal: Rehearsal | None = None
+        self._learned: LiveLearning | None = None
         self._last = time.monotonic()
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._clear()
@@ -174,12 +174,12 @@ class FeedforwardNode(DrivingNode):
                 'the last reference is longer than what is kept of it; raise the parameter longest'
             )
         self._begin()
-        x, before = np.concatenate(self._kept), self._rehearsal
+        x, before = np.concatenate(self._kept), self._learned
 
-        def make() -> Rehearsal:
+        def make() -> LiveLearning:
             if before and before.model is model and np.array_equal(before.reference, x):
                 return before
-            return Rehearsal(model, x, settings)
+            return LiveLearning(model, x, settings)
 
         self._learner = Learner(make, self.values['repetitions'], self._played)
         return f'the last reference, {x.size / self._rate_of_clock:.3g} s, is repeated'
@@ -317,7 +317,7 @@ class FeedforwardNode(DrivingNode):
     def _repeat(self, tracker: Tracker, learner: Learner) -> None:
         learner.step(tracker)
         if learner.is_over:
-            self._rehearsal = learner.rehearsal
+            self._learned = learner.learning
             self._halt('done', learner.text)
         elif learner.is_played and not tracker.is_at_rest:
             self._send_ramp(tracker)

@@ -11,8 +11,8 @@ import time
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.pacing import Pace, SLIP
-from piezo_ident.live.rehearsal import Rehearsal
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
@@ -24,12 +24,12 @@ PATIENCE = 2.0
 
 class Learner:
     """
-    Plays the repetitions of a rehearsal.
+    Plays the repetitions that a `LiveLearning` plans.
 
     Parameters
     ----------
     make : callable
-        Returns the rehearsal; called by a thread.
+        Returns that; called by a thread.
     most : int
         Repetitions, at most.
     play : callable
@@ -37,7 +37,7 @@ class Learner:
 
     Attributes
     ----------
-    rehearsal : Rehearsal or None
+    learning : LiveLearning or None
         None until it is made.
     text : str
         How far it is.
@@ -46,11 +46,11 @@ class Learner:
 
     def __init__(
         self,
-        make: Callable[[], Rehearsal],
+        make: Callable[[], LiveLearning],
         most: int,
         play: Callable[[Samples, Samples], None],
     ) -> None:
-        self.rehearsal: Rehearsal | None = None
+        self.learning: LiveLearning | None = None
         self.text, self.is_over = 'inverts the reference', False
         self._most, self._play = most, play
         self._count, self._sent, self._tick = 0, 0, 0
@@ -58,7 +58,7 @@ class Learner:
         self._pace: Pace | None = None
         self._resting = 0.0
         self._failure = ''
-        self._thread = self._started(lambda: setattr(self, 'rehearsal', make()))
+        self._thread = self._started(lambda: setattr(self, 'learning', make()))
 
     def _started(self, work: Callable[[], None]) -> threading.Thread:
         def safely() -> None:
@@ -81,8 +81,8 @@ class Learner:
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement."""
-        if self.rehearsal is not None and self._pace:
-            self.rehearsal.measured(samples, self._tick)
+        if self.learning is not None and self._pace:
+            self.learning.measured(samples, self._tick)
 
     def step(self, tracker: Tracker) -> None:
         """
@@ -95,25 +95,25 @@ class Learner:
         """
         if self._thread.is_alive():
             return
-        if self._failure or self.rehearsal is None:
+        if self._failure or self.learning is None:
             raise ConfigError(self._failure)
-        rehearsal, now = self.rehearsal, time.monotonic()
+        learning, now = self.learning, time.monotonic()
         if self._pace is None:
             if self._count:
-                self._judge(rehearsal)
+                self._judge(learning)
             if not self.is_over:
                 self._pace = Pace(tracker.settings.sample_rate, SLIP)
                 self._sent, self._tick = 0, tracker.tick
                 self._resting = 0.0
-                done = ', '.join(f'{e:.3g}' for e in rehearsal.errors[-5:])
+                done = ', '.join(f'{e:.3g}' for e in learning.errors[-5:])
                 self.text = f'repetition {self._count + 1}' + (f' after {done} %' if done else '')
-        elif self._sent < rehearsal.voltage.size:
-            self._send(tracker, rehearsal, self._pace.due())
+        elif self._sent < learning.voltage.size:
+            self._send(tracker, learning, self._pace.due())
             self._resting = now
-        elif rehearsal.is_complete and tracker.is_at_rest:
+        elif learning.is_complete and tracker.is_at_rest:
             self._count += 1
             self._pace = None
-            self._thread = self._started(rehearsal.take)
+            self._thread = self._started(learning.take)
         elif tracker.is_at_rest and now - self._resting > PATIENCE:
             raise ConfigError(
                 f'the displacement of repetition {self._count + 1} did not come in full; is '
@@ -123,12 +123,12 @@ class Learner:
     @property
     def is_played(self) -> bool:
         """Whether a repetition was sent in full, and the stage is to go to rest."""
-        rehearsal = self.rehearsal
-        return bool(self._pace and rehearsal and self._sent >= rehearsal.voltage.size)
+        learning = self.learning
+        return bool(self._pace and learning and self._sent >= learning.voltage.size)
 
-    def _judge(self, rehearsal: Rehearsal) -> None:
-        errors = rehearsal.errors
-        if rehearsal.is_done or self._count >= self._most:
+    def _judge(self, learning: LiveLearning) -> None:
+        errors = learning.errors
+        if learning.is_done or self._count >= self._most:
             self.is_over = True
             first = len(errors) - self._count
             self.text = (
@@ -136,13 +136,13 @@ class Learner:
                 f'{errors[first]:.3g} % in the first'
             )
 
-    def _send(self, tracker: Tracker, rehearsal: Rehearsal, due: int) -> None:
-        due = min(self._sent + due, rehearsal.voltage.size)
-        segment = f'learn:{len(rehearsal.errors) + 1}'
+    def _send(self, tracker: Tracker, learning: LiveLearning, due: int) -> None:
+        due = min(self._sent + due, learning.voltage.size)
+        segment = f'learn:{len(learning.errors) + 1}'
         while self._sent < due:
             cut = slice(self._sent, min(due, self._sent + 10 * BLOCK_SIZE))
-            t, v = tracker.play(rehearsal.voltage[cut])
-            wanted = rehearsal.wanted[cut]
+            t, v = tracker.play(learning.voltage[cut])
+            wanted = learning.wanted[cut]
             known = np.isfinite(wanted)
             goal = Samples(t[known], wanted[known], segment, 'reference')
             self._play(Samples(t, v, segment), goal)

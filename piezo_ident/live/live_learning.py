@@ -14,7 +14,7 @@ from piezo_ident.live.guard import GuardSettings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Rehearsal']
+__all__ = ['LiveLearning']
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SETTLE = 0.05
 
 
-class Rehearsal:
+class LiveLearning:
     """
     The repetitions of one reference.
 

@@ -9,7 +9,7 @@ from effect_table import VISIBLE
 import numpy as np
 from paper_stage import FS, PAPER
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.rehearsal import Rehearsal
+from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.record.blocks import Samples
 
@@ -19,23 +19,23 @@ SETTINGS = GuardSettings(0.0, 10.0, 40e3, 200.0, 0.0, FS)
 def test_it_learns_from_blocks_of_any_clock_and_knows_when_they_are_complete():
     stage = replace(PAPER, effects=(EffectSetting('creep', VISIBLE['creep']),))
     reference = 35e-6 - 15e-6 * np.cos(np.arange(2000) / 100.0)
-    rehearsal = Rehearsal(PAPER, reference, SETTINGS)
+    learning = LiveLearning(PAPER, reference, SETTINGS)
     for tick in (0, 777, 5000):
         # the guard makes the way from rest
-        v = Guard(SETTINGS).process(rehearsal.voltage).voltage
-        assert v[0] == 0.0 and v.size == rehearsal.wanted.size
-        moving = np.isfinite(rehearsal.wanted)
-        np.testing.assert_array_equal(rehearsal.wanted[moving][-2000:], reference)
-        np.testing.assert_array_equal(v[moving], rehearsal.voltage[moving])
+        v = Guard(SETTINGS).process(learning.voltage).voltage
+        assert v[0] == 0.0 and v.size == learning.wanted.size
+        moving = np.isfinite(learning.wanted)
+        np.testing.assert_array_equal(learning.wanted[moving][-2000:], reference)
+        np.testing.assert_array_equal(v[moving], learning.voltage[moving])
         y = stage.simulate(v)
         t = (tick + np.arange(v.size)) / FS
         # the last block comes first
         for part in (slice(2500, None), slice(0, 2400)):
-            rehearsal.measured(Samples(t[part], y[part]), tick)
-        assert not rehearsal.is_complete
-        rehearsal.measured(Samples(t[2390:2510], y[2390:2510]), tick)
-        assert rehearsal.is_complete
-        rehearsal.take()
-        assert not rehearsal.is_complete
-    assert len(rehearsal.errors) == 3
-    assert rehearsal.errors[2] < 0.1 * rehearsal.errors[0]
+            learning.measured(Samples(t[part], y[part]), tick)
+        assert not learning.is_complete
+        learning.measured(Samples(t[2390:2510], y[2390:2510]), tick)
+        assert learning.is_complete
+        learning.take()
+        assert not learning.is_complete
+    assert len(learning.errors) == 3
+    assert learning.errors[2] < 0.1 * learning.errors[0]
