@@ -47,15 +47,15 @@ EXACT = 1e-5
 WORTH = 0.9
 #: least share of a step that is tried
 SHORTEST = 0.2
-#: difference from the wanted motion that matters, in parts of its span, or of the model's where
-#: that is smaller
+#: difference from the wanted motion that counts as a miss, as a share of its span, and the largest
+#: span of which it is a share, in spans of the model
 MATTERS, LARGE = 1e-3, 0.1
 #: span of a motion that stands still, normalised
 STANDS = 1e-9
 #: difference from what is wanted at rest, normalised, from which it is out of reach
 SHORT = 1e-4
-#: changes of the voltage [of the span of the model] that may be none, and how far from rest the
-#: motion may then be [of its span]
+#: changes of the voltage [of the span of the model] below which the lead may be cut off, the
+#: largest first, and how far that may move the motion [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
 #: time of a way to the beginning of a motion, and of a wait there [s]
 RISE, HOLD = 0.2, 1.0

@@ -44,11 +44,11 @@ PREVIEW = 400
 MOST_PASSES = 4
 #: share of the error that one more pass must leave at most
 WORTH = 0.7
-#: samples in which a step fades that another voltage leaves
+#: samples in which the step fades that is left where another voltage ends
 JOIN = 2000
 #: error of the trial [% of stroke] from which the preview is called short
 LARGE = 0.1
-#: trial motion: samples, periods [samples] and amplitudes [of the range] of its sines
+#: trial motion: its samples; periods [samples] and amplitudes [of the range] of its sines
 TRIAL, SINES = 6000, ((2000.0, 0.3), (400.0, 0.08))
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
-from piezo_ident.control.hysteresis_inverse import HysteresisInverse, NONE, TRIALS
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse, TOLERANCE, TRIALS
 from piezo_ident.control.inverse import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
@@ -145,14 +145,15 @@ def export_c(
         'why': textwrap.wrap(why, WIDTH),
         'ff': ff,
     }
-    helpers = render('helpers.h', still=c_number(STILL), nothing=c_number(NONE), trials=TRIALS)
+    helpers = render(
+        'helpers.h', still=c_number(STILL), tolerance=c_number(TOLERANCE), trials=TRIALS
+    )
     if ff is not None:
         # oldest first, as the past lies in memory
         listed = ', '.join(repr(float(x)) for x in ff.taps[::-1])
         values['feedforward'] = render(
             'feedforward.h',
             **values,
-            inverted=ff.inverted,
             taps='\n'.join(textwrap.wrap(listed, WIDTH, break_on_hyphens=False)),
             far=c_number(FAR),
             short=c_number(SHORT),

@@ -4,7 +4,7 @@
 enum { {{ P }}_PREVIEW = {{ ff.ahead }}, {{ P }}_TAPS = {{ ff.taps | length }} };
 
 typedef struct {
-{% for link in inverted.links if link.code.state %}
+{% for link in ff.inverted.links if link.code.state %}
     {{ p }}_{{ link.tag }} {{ link.tag }};
 {% else %}
     char nothing;
@@ -16,7 +16,7 @@ typedef struct {
 static inline double {{ p }}_behind_{{ what }}({{ p }}_behind *s, double x, double t, const double *channel)
 {
     (void)s; (void)t; (void)channel;
-{% for line in inverted.statements(p, what, channels) %}
+{% for line in ff.inverted.statements(p, what, channels) %}
     {{ line }}
 {% endfor %}
     return x;

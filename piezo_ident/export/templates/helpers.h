@@ -30,7 +30,7 @@ static inline double piezo_root(double (*f)(const void *, double), const void *o
     int i;
     x = piezo_held(x, low, high);
     fx = f(of, x) - goal;
-    if (!(fabs(fx) > {{ nothing }}))
+    if (!(fabs(fx) > {{ tolerance }}))
         return x;
     width = -fx;
     for (;;) {
@@ -45,7 +45,7 @@ static inline double piezo_root(double (*f)(const void *, double), const void *o
         width *= 2.0;
     }
     /* `other` is the newer end */
-    for (i = 0; i < {{ trials }} && fabs(f_other) > {{ nothing }} && other != x; i++) {
+    for (i = 0; i < {{ trials }} && fabs(f_other) > {{ tolerance }} && other != x; i++) {
         const double next = other - f_other * (other - x) / (f_other - fx);
         const double f_next = f(of, next) - goal;
         if (f_next * f_other < 0.0) {
