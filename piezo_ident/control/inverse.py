@@ -291,11 +291,9 @@ def checked_limits(
     ------
     DataError
     """
+    given = model.scaling.range if limits is None else limits
     try:
-        (low, high), speed = (
-            map(float, model.scaling.range if limits is None else limits),
-            float(slew),
-        )
+        (low, high), speed = map(float, given), float(slew)
     except (TypeError, ValueError):
         low = high = speed = np.nan
     if not (-np.inf < low < high < np.inf and speed > 0.0):

@@ -99,13 +99,6 @@ def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
         pi.invert(PAPER, np.full(10, 100e-6))
 
 
-def test_a_stage_that_retracts_is_inverted_too():
-    scaling = replace(PAPER.scaling, Y=-PAPER.scaling.Y, y0=80e-6)
-    model = replace(PAPER, scaling=scaling)
-    wanted = 80e-6 - sine(20.0)
-    assert pi.invert(model, wanted).error < 0.002
-
-
 def test_a_motion_that_begins_at_once_needs_a_lead():
     wanted = np.concatenate([np.linspace(10e-6, 40e-6, 400), np.full(400, 40e-6)])
     drive = pi.invert(PAPER, wanted)
