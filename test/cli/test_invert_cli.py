@@ -80,3 +80,6 @@ def test_a_drive_shows_itself(made):
     labels = [text for axes in drive.plot().axes for text in axes.get_legend_handles_labels()[1]]
     assert labels[:2] == ['wanted', 'model under the voltage']
     assert '<table' in drive._repr_html_()
+    # what rounding leaves is drawn as none
+    error = pi.load(made / 'model.yaml').inverse(np.full(200, 30e-6)).plot().axes[2]
+    assert error.get_ylim() == (-1.0, 1.0)

@@ -73,6 +73,8 @@ POINTS = 3000
 DPI = 160
 #: an axis ends at this many times the usual error, if the largest one is this much further out
 USUAL, ROOM, FAR = 0.995, 2.5, 1.6
+#: largest error, in the unit of its axis, that is that of floating-point numbers
+ROUNDING = 1e-6
 
 
 class NothingToDraw(Exception):
@@ -172,7 +174,7 @@ def axis_limit(errors: NDArray[np.float64]) -> tuple[float, float]:
 
 def symmetric(axes: Axes, limit: float) -> None:
     """Let an axis of errors end at `limit` to both sides, and mark zero."""
-    end = 1.08 * limit if limit > 0.0 else 1.0
+    end = 1.08 * limit if limit > ROUNDING else 1.0
     axes.set_ylim(-end, end)
     axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
 
