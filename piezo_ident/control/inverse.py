@@ -384,10 +384,8 @@ def _creeping(model: StageModel, v0: float) -> list[str]:
     left = only.stream().reset(v0) - only.simulate(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
     if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
         return []
-    told = (
-        f'the stage creeps: {HOLD:g} s after it came from {low:g} V it is still {1e6 * off:.2g} um'
-    )
-    return [f'{told} off where the motion begins; let it wait longer, or begin under {low:g} V']
+    told = f'the stage creeps: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
+    return [f'{told} left to where the motion begins; wait longer, or begin it under {low:g} V']
 
 
 def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:
