@@ -37,6 +37,8 @@ TRIALS = 100
 FIRST, LEAST = 1e-4, 1e-7
 #: times that the speed is taken anew, and the corner of its smoothing in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
+#: share of the square of what a pass misses that it must leave at most for another one
+WORTH = 0.7
 
 
 @kernel
@@ -185,7 +187,7 @@ class RateInverse:
         corner = SMOOTH * self._effect.number('cutoff')
         # the gain is a half at the corner
         self._width = np.sqrt(2.0 * np.log(2.0)) * sample_rate / (2 * np.pi * corner)
-        self._u0 = 0.0
+        self._u0, self._before = 0.0, np.empty(0)
 
     def reset(self, u0: float) -> float:
         """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
@@ -208,11 +210,15 @@ class RateInverse:
         """
         u, reached = self._still.process(w)
         best = self._left(u, w), u, reached
+        passes = PASSES
+        if self._before.size == w.size:
+            # of nearly the same motion
+            u, passes = self._before, 1
         r = self._parameters[0]
         rest = self._h.initial_memory(self._u0)
         rest = np.append(rest, np.zeros(r.size - rest.size))
         limits = float(self.limits[0]), float(self.limits[1]), self._step
-        for _ in range(PASSES):
+        for _ in range(passes):
             power = self._effect.power(gaussian_filter1d(u, self._width, mode='nearest'), self._u0)
             u, reached = np.empty(w.size), np.empty(w.size)
             _invert(
@@ -225,7 +231,12 @@ class RateInverse:
                 u,
                 reached,
             )
-            best = min(best, (self._left(u, w), u, reached), key=lambda found: found[0])
+            left, before = self._left(u, w), best[0]
+            if left < before:
+                best = left, u, reached
+            if not left < WORTH * before:
+                break
+        self._before = best[1]
         return best[1:]
 
     def _left(self, u: Array, w: Array) -> float:
