@@ -63,6 +63,11 @@ bench-live: .venv/.demo
 study-identification: .venv/.demo
 	.venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
+# how near stages come to wanted motions, with and without what a diagnosis finds: ten minutes
+track: .venv/.demo
+	.venv/bin/python benchmarks/study_tracking.py docs/tracking.md \
+	    --picture docs/images/tracking.png
+
 # how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
 # cores; goes on where it was stopped
 study: .venv/.demo
