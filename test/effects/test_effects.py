@@ -384,3 +384,11 @@ def test_the_page_has_a_row_for_each_name_with_what_it_needs():
         name: catalogue()[name].needs for name in VISIBLE
     }
     assert all(imitated for _, _, _, imitated in rows)
+
+
+def test_a_slew_limit_is_tried_little_below_the_fastest_motion():
+    speeds = np.array([1.0, 2.0, 5.0, 100.0])
+    view = View(FS, 0.0, 0.0, speeds, 1.0)
+    tried = [trial.values['limit'] for trial in find_effect('slew_limit').trials(view)]
+    assert {70.0, 80.0, 90.0} <= {round(limit, 9) for limit in tried}
+    assert max(tried) >= 0.5 * view.span * FS
