@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import FAR, Inverse, invert
+from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
-from scipy.ndimage import gaussian_filter1d
 
 __all__ = ['Learning', 'Repetition']
 
@@ -143,9 +143,9 @@ class Learning:
         modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
         lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
         self.corner = min(lowest, OF_RATE * model.sample_rate) if corner is None else corner
-        # the gain is a half at the corner
-        self._width = math.sqrt(2.0 * math.log(2.0)) * model.sample_rate / (2 * math.pi)
-        self._width /= self.corner
+        if not 0.0 < self.corner < math.inf:
+            raise DataError(f'learning: a corner of {corner} Hz; give one above zero')
+        self._rate = model.sample_rate
 
     @property
     def best(self) -> Repetition:
@@ -177,7 +177,11 @@ class Learning:
         DataError
             When there are more or fewer samples, one is not finite, or they are far off.
         """
-        y, drive = np.asarray(measured, dtype=np.float64), self.drive
+        drive = self.drive
+        try:
+            y = np.asarray(measured, dtype=np.float64)
+        except (TypeError, ValueError):
+            y = np.empty(0)
         if y.shape != drive.v.shape or not np.all(np.isfinite(y)):
             raise DataError(
                 f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '
@@ -194,7 +198,7 @@ class Learning:
         if error <= self.best.error:
             # what is out of reach would grow from run to run
             e = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
-            correction = gaussian_filter1d(e, self._width, mode='nearest')
+            correction = smoothed(e, self.corner, self._rate)
             self._best_reference, self._correction = self._reference, correction
         else:
             self._step *= 0.5

@@ -28,9 +28,17 @@ from piezo_ident.effects import Effect, find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import oaconvolve
 
-__all__ = ['LinearInverse', 'check_preview', 'is_filter', 'least_preview', 'linear_inverse']
+__all__ = [
+    'LinearInverse',
+    'check_preview',
+    'is_filter',
+    'least_preview',
+    'linear_inverse',
+    'smoothed',
+]
 
 Array = NDArray[np.float64]
 
@@ -152,6 +160,12 @@ def check_preview(model: StageModel, preview: int) -> None:
             f'a preview of {preview} samples does not reach beyond the delay of the model, '
             f'{model.total_delay.total:g} samples; make it longer'
         )
+
+
+def smoothed(x: Array, corner: float, sample_rate: float) -> Array:
+    """Return a signal behind a Gaussian low-pass without phase, a half at the corner [Hz]."""
+    width = math.sqrt(2.0 * math.log(2.0)) * sample_rate / (2.0 * math.pi * corner)
+    return np.asarray(gaussian_filter1d(x, width, mode='nearest'))
 
 
 def is_filter(effect: type[Effect]) -> bool:

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, held
-from scipy.ndimage import gaussian_filter1d
 
 __all__ = ['RateInverse']
 
@@ -185,8 +185,7 @@ class RateInverse:
         self._parameters = r, q, p1, p2, p0, low, c, growth
         self._still = HysteresisInverse(hysteresis, limits, step)
         corner = SMOOTH * self._effect.number('cutoff')
-        # the gain is a half at the corner
-        self._width = np.sqrt(2.0 * np.log(2.0)) * sample_rate / (2 * np.pi * corner)
+        self._smoothing = corner, sample_rate
         self._u0, self._before = 0.0, np.empty(0)
 
     def reset(self, u0: float) -> float:
@@ -219,7 +218,7 @@ class RateInverse:
         rest = np.append(rest, np.zeros(r.size - rest.size))
         limits = float(self.limits[0]), float(self.limits[1]), self._step
         for _ in range(passes):
-            power = self._effect.power(gaussian_filter1d(u, self._width, mode='nearest'), self._u0)
+            power = self._effect.power(smoothed(u, *self._smoothing), self._u0)
             u, reached = np.empty(w.size), np.empty(w.size)
             _invert(
                 np.ascontiguousarray(w),

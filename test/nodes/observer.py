@@ -342,8 +342,9 @@ class Observer:
         self._publishers[topic].publish(String(data=text))
 
     def unpublish(self, topic: str) -> None:
-        """Take back the publisher of a topic."""
-        self.forget(self._publishers.pop(topic))
+        """Take back the publisher of a topic, if there is one."""
+        if topic in self._publishers:
+            self.forget(self._publishers.pop(topic))
 
     def forget(self, entity: Publisher | Subscription) -> None:
         """Take back a publisher or a subscription, between two turns of the observer."""

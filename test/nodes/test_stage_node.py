@@ -257,9 +257,11 @@ def test_a_second_publisher_is_refused_until_the_first_is_silent_and_at_rest(lab
         assert column(got[applied:])[1].max() == 0.0
         idle(lab)
         # while the stage ramps behind a silence of the first
-        for b in [*level(0.0, 1), block(100, np.linspace(0, 9, 9000)), *level(9.0, 1, 9100)]:
+        (last,) = level(9.0, 1, 9100)
+        for b in [*level(0.0, 1), block(100, np.linspace(0, 9, 9000)), last]:
             lab.publish('voltage', b)
         lab.wait(lambda: got[-1].values[-1] == 9.0, '9 V')
+        lab.wait(lambda: seen[-1].t[0] >= last.t[0], 'the answer to it')
         before, told = len(seen), len(lab.statuses('stage'))
         assert lab.set('stage', 'ramp_slew', 2.0)[0]
         assert lab.set('stage', 'silence', 0.05)[0]
