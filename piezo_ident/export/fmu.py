@@ -17,7 +17,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 from piezo_ident import __version__
 from piezo_ident.common.files import temporary_output
 from piezo_ident.export.header import c_number, export_c, plain_text, render
-from piezo_ident.export.links import links_of, Part
+from piezo_ident.export.links import LinkGroup, links_of
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['export_fmu']
@@ -62,7 +62,7 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
         'token': f'{{{uuid.uuid5(uuid.NAMESPACE_OID, header)}}}',
         'period': repr(1.0 / model.sample_rate),
         'rest': c_number(model.scaling.range[0]).strip('()'),
-        'channels': [plain_text(name) for name in Part(links).channels],
+        'channels': [plain_text(name) for name in LinkGroup(links).channels],
     }
     files = {
         'modelDescription.xml': render('modelDescription.xml', **values),

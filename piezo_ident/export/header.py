@@ -35,7 +35,7 @@ from piezo_ident.control.linear_inverse import (
     LinearInverse,
 )
 from piezo_ident.effects import find_effect
-from piezo_ident.export.links import Link, links_of, Part
+from piezo_ident.export.links import Link, LinkGroup, links_of
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['c_number', 'export_c', 'plain_text', 'render']
@@ -57,7 +57,7 @@ class _FeedForward:
     highest: str
     step: str
     says: Sequence[str]
-    inverted: Part
+    inverted: LinkGroup
 
 
 def export_c(
@@ -122,7 +122,7 @@ def export_c(
         check_preview(model, preview)
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
-    channels = Part(links).channels
+    channels = LinkGroup(links).channels
     why, ff = 'it was not asked for', None
     if feedforward:
         try:
@@ -163,8 +163,8 @@ def export_c(
 
 def _feedforward(
     model: StageModel,
-    front: Part,
-    back: Part,
+    front: LinkGroup,
+    back: LinkGroup,
     kept: tuple[float, float, float],
     preview: int | None,
 ) -> _FeedForward:
@@ -184,7 +184,7 @@ def _feedforward(
         Q = Q.shortened(preview)
     # an effect that passes the command on does so before it is known
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
-    inverted = Part([x for x in undone if x.effect and not is_filter(type(x.effect))])
+    inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept
     for link in front.links:
         # beyond them a change of the voltage changes nothing
@@ -208,7 +208,12 @@ def _feedforward(
 
 
 def _says(
-    model: StageModel, front: Part, inverted: Part, back: Part, Q: LinearInverse, ahead: int
+    model: StageModel,
+    front: LinkGroup,
+    inverted: LinkGroup,
+    back: LinkGroup,
+    Q: LinearInverse,
+    ahead: int,
 ) -> list[str]:
     """Return what a feed-forward does, and what it does not make up for."""
     behind = ''

@@ -18,7 +18,7 @@ from piezo_ident.operators.chain import Operator
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 
-__all__ = ['Link', 'Part', 'links_of']
+__all__ = ['Link', 'LinkGroup', 'links_of']
 
 #: what the statements of a link may be given
 _GIVEN = ('u', 'v', 't', 'c')
@@ -71,7 +71,7 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class LinkGroup:
     """Neighbouring links, of which those of the slot ``hysteresis`` share the signal into H."""
 
     links: Sequence[Link]
@@ -98,7 +98,7 @@ class Part:
         return any('u' in _words(link.code.step) for link in self.links)
 
 
-def links_of(model: StageModel) -> tuple[Part, Part, Part]:
+def links_of(model: StageModel) -> tuple[LinkGroup, LinkGroup, LinkGroup]:
     """
     Return the links in front of G, G with its delay, and those behind, in their order.
 
@@ -124,7 +124,7 @@ def links_of(model: StageModel) -> tuple[Part, Part, Part]:
             case Effect():
                 tag = f'{operator.name}_{len(front) + len(linear) + len(back)}'
                 part.append(Link(operator.name, tag, operator.c_code(), operator))
-    return Part(front), Part(linear), Part(back)
+    return LinkGroup(front), LinkGroup(linear), LinkGroup(back)
 
 
 def _unwrapped(operators: Iterable[Operator]) -> Iterator[Operator]:
