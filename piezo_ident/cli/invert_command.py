@@ -11,8 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_output
-from piezo_ident.cli.predict_command import PICTURES, TABLE_FILES
+from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, naming, print_faults, read_all
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
@@ -28,13 +27,13 @@ __all__ = ['invert_command']
 
 def invert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident invert``."""
-    for path, suffixes, what in (
-        (args.out, TABLE_FILES, 'a voltage'),
-        (args.plot, PICTURES, 'a picture'),
-    ):
-        if path is not None:
-            inputs = args.model, args.record
-            check_output(path, suffixes, what, inputs=inputs, overwrite=args.overwrite)
+    check_table_and_picture(
+        args.out,
+        'a voltage',
+        args.plot,
+        inputs=(args.model, args.record),
+        overwrite=args.overwrite,
+    )
     check_order(args.model, args.record, 'invert')
     model = load(args.model)
     (reference,) = read_all([args.record], args, console, displacement_alone=True)

@@ -21,7 +21,11 @@ __all__ = [
     'check_link',
     'check_output',
     'check_suffix',
+    'check_table_and_picture',
 ]
+
+TABLE_FILES = ('.csv', '.npz')
+PICTURES = ('.png', '.pdf', '.svg')
 
 
 def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
@@ -41,6 +45,16 @@ def check_output(
     check_suffix(path, suffixes, what)
     check_distinct(path, inputs)
     check_file(path, overwrite=overwrite)
+
+
+def check_table_and_picture(
+    table: Path | None, what: str, picture: Path | None, *, inputs: Iterable[Path], overwrite: bool
+) -> None:
+    """Refuse the files of ``--out`` and ``--plot`` where they are given, as `check_output` does."""
+    named = (table, TABLE_FILES, what), (picture, PICTURES, 'a picture')
+    for path, suffixes, content in named:
+        if path is not None:
+            check_output(path, suffixes, content, inputs=inputs, overwrite=overwrite)
 
 
 def check_link(path: Path) -> None:

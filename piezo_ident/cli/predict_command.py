@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_output
+from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
@@ -26,19 +26,16 @@ from piezo_ident.record.tables import blocks_of
 
 __all__ = ['error_data', 'predict_command', 'print_errors']
 
-TABLE_FILES = ('.csv', '.npz')
-PICTURES = ('.png', '.pdf', '.svg')
-
 
 def predict_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident predict``."""
-    for path, suffixes, what in (
-        (args.out, TABLE_FILES, 'a prediction'),
-        (args.plot, PICTURES, 'a picture'),
-    ):
-        if path is not None:
-            inputs = args.model, args.record
-            check_output(path, suffixes, what, inputs=inputs, overwrite=args.overwrite)
+    check_table_and_picture(
+        args.out,
+        'a prediction',
+        args.plot,
+        inputs=(args.model, args.record),
+        overwrite=args.overwrite,
+    )
     check_order(args.model, args.record, 'predict')
     model = load(args.model)
     (record,) = read_all([args.record], args, console, voltage_alone=True)
