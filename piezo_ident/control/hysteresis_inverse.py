@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -42,15 +42,19 @@ NARROW = 0.02
 @kernel
 def _plays(
     u: float,
-    r: Array,
+    band: Array,
     q: Array,
     memory: Array,
     after: Array,
 ) -> tuple[float, float]:
-    """Return what the plays of H add at u, and its slope; `after` takes their outputs."""
+    """
+    Return what the plays of H add at u, and its slope; `after` takes their outputs.
+
+    Each may lag u by ``band[0]`` and lead it by ``band[1]``.
+    """
     w, slope = 0.0, 0.0
-    for i in range(r.size):
-        f = held(memory[i], u - r[i], u)
+    for i in range(q.size):
+        f = held(memory[i], u - band[0, i], u + band[1, i])
         after[i] = f
         w += q[i] * f
         slope += 0.0 if f == memory[i] else q[i]
@@ -60,7 +64,7 @@ def _plays(
 @kernel
 def _wide_plays(
     u: float,
-    r: Array,
+    band: Array,
     q: Array,
     low: float,
     c: Array,
@@ -69,8 +73,8 @@ def _wide_plays(
 ) -> tuple[float, float]:
     """Do as `_plays`, with curves and bias; in one loop, which is a third faster than two."""
     w, slope = 0.0, 0.0
-    for i in range(r.size):
-        f = held(memory[i], u - r[i], u)
+    for i in range(q.size):
+        f = held(memory[i], u - band[0, i], u + band[1, i])
         after[i] = f
         t = f - low
         w += q[i] * f + c[3, i] * (u - low) * t + curve(c, i, t)
@@ -111,6 +115,8 @@ def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
 @ordered_kernel
 def _invert(
     wanted: Array,
+    power: Array,
+    growth: Array,
     r: Array,
     q: Array,
     p1: float,
@@ -132,49 +138,55 @@ def _invert(
     Write the voltages under which H is as wanted to `out`, and what H is to `reached`.
 
     `last` holds the voltage of H and H before, a slope of H, and the voltage before the lag; it is
-    carried on with `memory`.
+    carried on with `memory`.  With `power`, shape (n,), the plays of each sample are as wide as
+    `growth` says.
     """
-    after = memory.copy()
+    after, grows = memory.copy(), power.size > 0
+    band = np.zeros((2, r.size))
+    band[0] = r
     u, w, slope, v = last[0], last[1], last[2], last[3]
     for k in range(wanted.size):
         goal, start = wanted[k], u
-        f = w - goal
+        if grows:
+            s = power[k]
+            for i in range(r.size):
+                width = r[i] * (1.0 + growth[1] * s) + growth[0] * s
+                band[0, i] = max(width, 0.0)
+                band[1, i] = max(r[i] * (growth[3] * s) + growth[2] * s, -band[0, i])
         lowest, highest = max(least, v - step), min(most, v + step)
         # between these lies the voltage of H, open where H was not asked yet
         below = pole * start + (1.0 - pole) * lowest
         above = pole * start + (1.0 - pole) * highest
-        if abs(f) > TOLERANCE or not below <= start <= above:
-            if f < 0.0:
-                below = max(below, min(start, above))
-            else:
-                above = min(above, max(start, below))
-            before = 2.0 * abs(f)
-            for _ in range(TRIALS):
-                # Newton's step, to an end where it leads beyond, to the middle where it is slow
-                new = u - f / slope
-                if abs(f) > 0.5 * before and above - below < np.inf:
-                    new = 0.5 * (below + above)
-                new = min(max(new, below), above)
-                if new == u:
-                    break
-                before, u = abs(f), new
+        before, asked = np.inf, False
+        for trial in range(TRIALS + 1):
+            # H moves with the plays, though the voltage does not
+            if trial or grows:
                 if c.shape[0] == 0:
-                    w, slope = _plays(u, r, q, memory, after)
+                    w, slope = _plays(u, band, q, memory, after)
                 else:
-                    w, slope = _wide_plays(u, r, q, low, c, memory, after)
+                    w, slope = _wide_plays(u, band, q, low, c, memory, after)
                 w += ((p1 * u + p0) * u + p2) * u
                 slope += (3.0 * p1 * u + 2.0 * p0) * u + p2
                 if lags.shape[0]:
-                    more, steeper = _lags(u, lags, memory[r.size :], after[r.size :])
+                    more, steeper = _lags(u, lags, memory[q.size :], after[q.size :])
                     w, slope = w + more, slope + steeper
-                f = w - goal
-                slope = max(slope, FLAT)
-                if f < 0.0:
-                    below = u
-                else:
-                    above = u
-                if abs(f) <= TOLERANCE:
-                    break
+                slope, asked = max(slope, FLAT), True
+            f = w - goal
+            if abs(f) <= TOLERANCE and below <= u <= above:
+                break
+            if f < 0.0:
+                below = max(below, min(u, above))
+            else:
+                above = min(above, max(u, below))
+            # Newton's step, to an end where it leads beyond, to the middle where it is slow
+            new = u - f / slope
+            if abs(f) > 0.5 * before and above - below < np.inf:
+                new = 0.5 * (below + above)
+            new = min(max(new, below), above)
+            if new == u or trial == TRIALS:
+                break
+            before, u = abs(f), new
+        if asked:
             for i in range(memory.size):
                 memory[i] = after[i]
         v = min(max((u - pole * start) / (1.0 - pole), lowest), highest)
@@ -195,6 +207,9 @@ class HysteresisInverse:
         Largest change of the voltage from one sample to the next.
     pole : float, optional
         Of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
+    growth : array_like, shape (4,), optional
+        Of the plays with a power of the speed: of all, relative, and both of the upper edge, see
+        `rate_dependent_hysteresis`.
 
     Attributes
     ----------
@@ -223,6 +238,7 @@ class HysteresisInverse:
         limits: tuple[float, float] = (-np.inf, np.inf),
         step: float = np.inf,
         pole: float = 0.0,
+        growth: ArrayLike = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
         slope = hysteresis.lowest_slope()
         if not (slope > 0.0 or _without_narrow(hysteresis).lowest_slope() > 0.0):
@@ -235,6 +251,7 @@ class HysteresisInverse:
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
         self.limits = _rising(hysteresis, float(limits[0]), float(limits[1]))
         self._bounds = (*self.limits, float(step), float(pole))
+        self._growth = np.array(growth, dtype=np.float64)
         self._memory = self._last = np.zeros(0)
 
     def reset(self, u0: float) -> float:
@@ -261,13 +278,15 @@ class HysteresisInverse:
         self._memory = np.concatenate([memory[:m], np.zeros(lanes - m), memory[m:]])
         self._last = last
 
-    def process(self, w: Array) -> tuple[Array, Array]:
+    def process(self, w: Array, power: Array | None = None) -> tuple[Array, Array]:
         """
         Return the voltages under which H comes as near to w as they may, and what H is then.
 
         Parameters
         ----------
         w : ndarray, shape (n,)
+        power : ndarray, shape (n,), optional
+            Of the speed, by which the plays grow; they keep their widths when absent.
 
         Returns
         -------
@@ -276,6 +295,8 @@ class HysteresisInverse:
         u, reached = np.empty(w.size), np.empty(w.size)
         _invert(
             np.ascontiguousarray(w),
+            np.empty(0) if power is None else power,
+            self._growth,
             *self._parameters,
             self._memory,
             *self._bounds,

@@ -327,10 +327,9 @@ def _of_hysteresis(
     if lag and not wide:
         pole = AmplifierLag(rate, lag[0].parameters).pole
         linear = replace(model, effects=tuple(s for s in model.effects if s is not lag[0]))
-    H = HysteresisInverse(h, ends, step, pole)
     if wide:
-        return RateInverse(h, wide[0].parameters, rate, H.limits, step), linear
-    return H, linear
+        return RateInverse(h, wide[0].parameters, rate, ends, step), linear
+    return HysteresisInverse(h, ends, step, pole), linear
 
 
 def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
