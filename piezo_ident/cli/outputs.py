@@ -50,7 +50,7 @@ def check_output(
 def check_table_and_picture(
     table: Path | None, what: str, picture: Path | None, *, inputs: Iterable[Path], overwrite: bool
 ) -> None:
-    """Refuse the files of ``--out`` and ``--plot`` where they are given, as `check_output` does."""
+    """Refuse the files of ``--out`` and ``--plot`` that are given, as `check_output` does."""
     named = (table, TABLE_FILES, what), (picture, PICTURES, 'a picture')
     for path, suffixes, content in named:
         if path is not None:
