@@ -40,7 +40,8 @@ class Stream:
         self._cascade: _Cascade | None = None
         match self._chain.operators:
             case (HysteresisOperator() as H, DynamicsOperator() as G, DelayOperator() as z):
-                self._cascade = _Cascade(model, H, G, z)
+                if model.dynamics.sections is None:
+                    self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:
         """Come to rest at a voltage [V] and return the displacement there [m]."""

@@ -179,10 +179,39 @@ _G_BACK_AT_REST = """
 """
 
 
+_SECTIONS = """
+double (*z)[2] = s->z;
+const double *g = sections;
+int i;
+for (i = 0; i < n; i++, g += 5) {
+    const double y = g[0] * x + z[i][0];
+    z[i][0] = piezo_alive((g[1] * x + z[i][1]) - g[3] * y);
+    z[i][1] = piezo_alive(g[2] * x - g[4] * y);
+    x = y;
+}
+"""
+_SECTIONS_AT_REST = """
+{
+    const double *g = sections;
+    int i;
+    for (i = 0; i < n; i++, g += 5) {
+        const double y = x * (g[0] + g[1] + g[2]) / (1.0 + g[3] + g[4]);
+        s->z[i][0] = y - g[0] * x;
+        s->z[i][1] = g[2] * x - g[4] * y;
+        x = y;
+    }
+}
+"""
+
+
 def dynamics_in_c(g: Dynamics) -> CCode:
-    """Return G, as `dynamics` has it: sums from the oldest sample to the newest."""
+    """Return G, as `dynamics` or `run_sections` have it, in their order of operations."""
+    if g.sections is not None:
+        n = len(g.sections)
+        numbers: Numbers = {'n': n, 'sections': g.sections.ravel()}
+        return CCode(numbers, f'double z[{n}][2];\n', _SECTIONS_AT_REST, _SECTIONS)
     na, nb = g.a.size, g.b.size
-    numbers: Numbers = {'nb': nb, 'b': g.b[::-1], 'na': na, 'a': g.a[::-1], 'gain': g.gain}
+    numbers = {'nb': nb, 'b': g.b[::-1], 'na': na, 'a': g.a[::-1], 'gain': g.gain}
     # every sample stands twice, so that the past is always in one piece
     state = f'double w[{2 * nb}];\nint at_w;\n'
     if not na:

@@ -12,6 +12,7 @@ of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import numpy as np
@@ -21,6 +22,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import dynamics as run_dynamics
+from piezo_ident.operators.sections import run_sections, sections_at_rest, sections_of
 
 __all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'Mode', 'filter_arx']
 
@@ -88,6 +90,11 @@ class Dynamics:
     def gain(self) -> float:
         """Static gain G(1), infinite for an integrator."""
         return _static_gain(self.b, self.a)
+
+    @cached_property
+    def sections(self) -> NDArray[np.float64] | None:
+        """Sections of second order where eq. (5) would lose digits, shape (n, 5), or nothing."""
+        return sections_of(self.a, self.b, self.gain)
 
     @property
     def poles(self) -> NDArray[np.complex128]:
@@ -284,9 +291,15 @@ class DynamicsOperator:
         self.dynamics = dynamics
         self.b, self.a = dynamics.b[::-1].copy(), dynamics.a[::-1].copy()
         self._past_w, self._past_y = np.zeros(self.b.size - 1), np.zeros(self.a.size)
+        self._sections, self._z = dynamics.sections, np.zeros((0, 2))
+        if self._sections is not None:
+            self._z = np.zeros((self._sections.shape[0], 2))
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to equilibrium with a constant signal."""
+        if self._sections is not None:
+            self._z, rest = sections_at_rest(self._sections, x0)
+            return rest
         rest = x0 * self.dynamics.gain
         self._past_w[:], self._past_y[:] = x0, rest
         return rest
@@ -294,6 +307,10 @@ class DynamicsOperator:
     def process(self, block: Block) -> Block:
         """Return the block filtered."""
         n, na = block.x.size, self.a.size
+        if self._sections is not None:
+            out = np.empty(n)
+            run_sections(np.ascontiguousarray(block.x), self._sections, self._z, out)
+            return block.with_signal(out)
         w = np.concatenate([self._past_w, block.x])
         y = np.empty(na + n)
         y[:na] = self._past_y

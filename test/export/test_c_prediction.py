@@ -60,6 +60,19 @@ def random_effect(rng, name):
     return EffectSetting(name, values)
 
 
+def refined_dynamics(rng):
+    """Return a G of orders 18 and 13 with lightly damped modes, as a refit may have it."""
+
+    def modes(w, damping):
+        poles = np.exp(w * (-damping + 1j))
+        return np.real(np.poly([*poles, *poles.conj()]))
+
+    w = np.sort(np.concatenate([rng.uniform(0.1, 0.6, 4), rng.uniform(0.6, 3.0, 5)]))
+    beside = rng.choice(w, 6, replace=False) * rng.uniform(1.0, 1.1, 6)
+    zeros = modes(beside, 10.0 ** rng.uniform(-2.3, -1.0, 6))
+    return Dynamics(modes(w, 10.0 ** rng.uniform(-2.3, -1.0, 9))[1:], zeros).normalised()
+
+
 def models(seed=11):
     """Return models by name: each effect by itself, all of them, and each law of H."""
     rng = np.random.default_rng(seed)
@@ -76,6 +89,10 @@ def models(seed=11):
     made['h_lags'] = replace(
         PAPER, hysteresis=Hysteresis([0.1, 0.4], [0.3, 0.1], -0.1, 0.9, relaxations=lags)
     )
+    for k in range(4):
+        refined = ('creep', 'rate_dependent_hysteresis') if k % 2 else ()
+        model = random_voltage_model(rng, LAWS[k % 2], [random_effect(rng, x) for x in refined])
+        made[f'refined_{k}'] = replace(model, dynamics=refined_dynamics(rng))
     none = Hysteresis([], [], 0.1, 1.0, p0=0.05)
     made['h_none'] = replace(PAPER, hysteresis=none, dynamics=Dynamics.unit(), delay=Delay(0))
     made['paper'] = PAPER

@@ -1,0 +1,102 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+G as a cascade of sections of second order, where eq. (5) would lose digits.
+
+Each output of eq. (5) is rounded, and what is rounded off passes through 1/A like a noise: a G
+with many lightly damped modes makes 1e-10 of stroke of it.  What a section rounds off passes
+through two poles and the sections behind alone: the same G then keeps 1e-13.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.kernel import alive, ordered_kernel
+from scipy.signal import zpk2sos
+
+__all__ = ['rounding_of', 'run_sections', 'sections_at_rest', 'sections_of']
+
+#: share of the output that eq. (5) may lose by rounding
+LOST = 2e-14
+#: difference of the static gain of sections from that of G, as a share, beyond which their roots
+#: are not to be trusted
+NEAR = 1e-2
+
+
+def rounding_of(a: NDArray[np.float64]) -> float:
+    """
+    Return the rounding error of eq. (5) as a share of its output, rms, about.
+
+    That of one output times the rms gain of 1/A, which is the product of 1 / sqrt(1 - k^2) over
+    its reflection coefficients k; infinite for an unstable G.
+    """
+    size, power, rest = 1.0 + float(a @ a), 1.0, a
+    while rest.size:
+        last, rest = float(rest[-1]), rest[:-1]
+        if not abs(last) < 1.0:
+            return math.inf
+        share = 1.0 / (1.0 - last * last)
+        power *= share
+        rest = share * (rest - last * rest[::-1])
+    return float(np.finfo(np.float64).eps) * math.sqrt(size * power)
+
+
+def sections_of(
+    a: NDArray[np.float64], b: NDArray[np.float64], gain: float
+) -> NDArray[np.float64] | None:
+    """
+    Return G as sections, or nothing where eq. (5) serves.
+
+    Parameters
+    ----------
+    a, b : ndarray, shape (na,) and (nb,)
+        Of `piezo_ident.operators.dynamics.Dynamics`.
+    gain : float
+        The static gain, which the sections keep to the last digit.
+
+    Returns
+    -------
+    ndarray, shape (n, 5), or None
+        b_0, b_1, b_2, a_1 and a_2 of each.
+    """
+    if b[0] == 0.0 or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:
+        return None
+    made = zpk2sos(np.roots(b), np.roots(np.concatenate([[1.0], a])), b[0])
+    static = float(np.prod(made[:, :3].sum(axis=1) / made[:, 3:].sum(axis=1)))
+    # roots beside each other may be too rough themselves
+    if not abs(gain - static) < NEAR * abs(static):
+        return None
+    made[0, :3] *= gain / static
+    return np.ascontiguousarray(made[:, [0, 1, 2, 4, 5]])
+
+
+def sections_at_rest(c: NDArray[np.float64], x: float) -> tuple[NDArray[np.float64], float]:
+    """Return the state of sections at rest under x, shape (n, 2), and what goes out."""
+    z = np.empty((c.shape[0], 2))
+    for i, (b0, b1, b2, a1, a2) in enumerate(c):
+        y = x * (b0 + b1 + b2) / (1.0 + a1 + a2)
+        z[i] = y - b0 * x, b2 * x - a2 * y
+        x = float(y)
+    return z, x
+
+
+@ordered_kernel
+def run_sections(
+    x: NDArray[np.float64],
+    c: NDArray[np.float64],
+    z: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Write what sections make of x to `out`, shape (n,), and carry z on, shape (n, 2)."""
+    for k in range(x.size):
+        u = x[k]
+        for i in range(c.shape[0]):
+            y = c[i, 0] * u + z[i, 0]
+            z[i, 0] = alive((c[i, 1] * u + z[i, 1]) - c[i, 3] * y)
+            z[i, 1] = alive(c[i, 2] * u - c[i, 4] * y)
+            u = y
+        out[k] = u
