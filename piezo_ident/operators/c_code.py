@@ -6,7 +6,8 @@ Operators in C: the text that `piezo_ident.export` makes a header of.
 
 An operator says in C what it does to one sample, beside the loop that does it in Python; its
 numbers are those of the loop.  The loops of `piezo_ident.operators.kernels` are here, in their
-order of operations: G and z^-d give the same bits, and H differs by the order of a sum.
+order of operations but for that of sums: what that changes is of the last digit, since a G that
+would amplify it runs as sections.
 """
 
 from __future__ import annotations
@@ -60,10 +61,10 @@ class CCode:
 _PLAYS = """
 int i;
 double w = 0.0;
-for (i = 0; i < m; i++)
+for (i = 0; i < m; i++) {
     s->f[i] = piezo_held(s->f[i], x - r[i], x);
-for (i = 0; i < m; i++)
     w += q[i] * s->f[i];
+}
 """
 _WIDE = """
 for (i = 0; i < m; i++)
@@ -142,21 +143,30 @@ def hysteresis_in_c(h: Hysteresis) -> CCode:
     return CCode(numbers, state, f'{rest}{{\n{step}}}\n', step)
 
 
+# each sum as two, of which neither waits for the other
 _G = """
 const double *past;
-double y = 0.0;
+double y = 0.0, other = 0.0;
 int i;
 s->w[s->at_w] = s->w[s->at_w + nb] = x;
 s->at_w = s->at_w + 1 < nb ? s->at_w + 1 : 0;
 past = s->w + s->at_w;
-for (i = 0; i < nb; i++)
-    y += b[i] * past[i];
+for (i = nb % 2; i < nb; i += 2) {
+    other += b[i] * past[i];
+    y += b[i + 1] * past[i + 1];
+}
+if (nb % 2)
+    y += b[0] * past[0];
 """
 _G_BACK = """
 past = s->y + s->at_y;
-for (i = 0; i < na; i++)
-    y -= a[i] * past[i];
-y = piezo_alive(y);
+for (i = na % 2; i < na; i += 2) {
+    other -= a[i] * past[i];
+    y -= a[i + 1] * past[i + 1];
+}
+if (na % 2)
+    other -= a[0] * past[0];
+y = piezo_alive(y + other);
 s->y[s->at_y] = s->y[s->at_y + na] = y;
 s->at_y = s->at_y + 1 < na ? s->at_y + 1 : 0;
 """
@@ -205,7 +215,7 @@ _SECTIONS_AT_REST = """
 
 
 def dynamics_in_c(g: Dynamics) -> CCode:
-    """Return G, as `dynamics` or `run_sections` have it, in their order of operations."""
+    """Return G, as `dynamics` or `run_sections` have it."""
     if g.sections is not None:
         n = len(g.sections)
         numbers: Numbers = {'n': n, 'sections': g.sections.ravel()}
@@ -215,7 +225,7 @@ def dynamics_in_c(g: Dynamics) -> CCode:
     # every sample stands twice, so that the past is always in one piece
     state = f'double w[{2 * nb}];\nint at_w;\n'
     if not na:
-        return CCode(numbers, state, _G_AT_REST, f'{_G}x = y;\n')
+        return CCode(numbers, state, _G_AT_REST, f'{_G}x = y + other;\n')
     state += f'double y[{2 * na}];\nint at_y;\n'
     return CCode(numbers, state, _G_AT_REST + _G_BACK_AT_REST, f'{_G}{_G_BACK}x = y;\n')
 
