@@ -38,6 +38,8 @@ FINE = 2.5
 TRIALS = 4.0
 #: a line is the same everywhere: in each half of the data this share of its amplitude, at least
 STEADY = 0.5
+#: two no less than this share of each other, and as close by, are a resonance that rings
+COMPARABLE, BESIDE = 0.5, 0.02
 #: harmonics that are grouped under their base
 HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
 
@@ -125,6 +127,10 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
         if amplitude >= negligible and search.is_steady(frequency, best):
             found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
+            crowd = _crowd(found)
+            if crowd:
+                found = [line for line in found if line not in crowd]
+                keep &= np.abs(f - frequency) > BESIDE * frequency
         keep &= np.abs(f - frequency) > 2.0 / longest
     return LineSearch(_grouped(found, 2.0 / longest), searched, tested)
 
@@ -294,6 +300,18 @@ def _log_chance(total: Array, n: int) -> Array:
     with np.errstate(divide='ignore', invalid='ignore'):
         far = total - (n - 1) * np.log(np.maximum(total, 1.0)) + float(gammaln(n))
         return np.asarray(np.where(total > 500.0, far, -np.log(np.maximum(p, 1e-300))))
+
+
+def _crowd(found: Sequence[Line]) -> list[Line]:
+    """Return the last line and those like it close by, if there are any."""
+    last = found[-1]
+    near = [
+        line
+        for line in found
+        if abs(line.frequency - last.frequency) <= BESIDE * last.frequency
+        and COMPARABLE <= last.amplitude / line.amplitude <= 1.0 / COMPARABLE
+    ]
+    return near if len(near) > 1 else []
 
 
 def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:

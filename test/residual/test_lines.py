@@ -11,6 +11,7 @@ from piezo_ident.residual import all_stretches, find_lines, ResidualPart, withou
 import pytest
 from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
 from residual_stages import drives, foreign
+from scipy.signal import lfilter
 
 DRIVES = drives()
 
@@ -132,3 +133,14 @@ def test_too_short_for_a_search():
     assert found.lines == ()
     assert not found.searched
     assert search(part_of(np.zeros(V.size))).searched
+
+
+def test_a_mode_that_rings_at_every_step_is_no_line():
+    rng = np.random.default_rng(9)
+    kicks = np.zeros(V.size)
+    kicks[::2000] = 1e-7 * (1.0 + 0.1 * rng.standard_normal(kicks[::2000].size))
+    pole = np.exp((-0.01 + 1j) * 2 * np.pi * 256.0 / RATE)
+    ring = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], pole.imag * kicks)
+    hum = 2e-8 * np.sin(2 * np.pi * 50.03 * T)
+    (line,) = search(part_of(noise(rng) + ring + hum)).lines
+    assert line.frequency == pytest.approx(50.03, abs=0.002)
