@@ -129,6 +129,9 @@ class ForwardSelection:
             state = replace(retuned.state, retuning=())
             base = fit_jointly(self._simulator, state, base.base)
         explainable = max(base.mean_square - self._noise, 1e-300)
+        if shown and self._beyond_noise(retuned) < self._least:
+            # they were there at the identification, too: it takes no more for G to be off
+            return self._from(retuned, self._round(retuned), shown)
         news = [effect for effect in self._allowed if effect.in_dynamics]
         if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
             return self._from(retuned, self._round(retuned), shown)
