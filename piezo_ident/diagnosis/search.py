@@ -38,6 +38,7 @@ from piezo_ident.diagnosis.cross_validation import (
     with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
@@ -158,13 +159,17 @@ def search_round(
     least = WORTH_FIT * max(total - noise * n, 1e-300)
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
+    chosen = promising[:JOINT_FITS]
+    # a small step does not tell from its like what an effect does in full
+    alike = look_alikes(chosen[0][0].effect.name) if chosen else ()
+    chosen += [scores for scores in promising[JOINT_FITS:] if scores[0].effect.name in alike]
     starts = [
         (
             scores[0].effect,
             # a law that looks best while it is small need not be the one that fits best
             [before.state.with_effect(started(simulator.rows, s)) for s in scores[:STARTS]],
         )
-        for scores in promising[:JOINT_FITS]
+        for scores in chosen
     ]
     _add_plain_starts(simulator, before, starts, lines)
     contenders, warnings = _contenders(simulator, before, starts, noise, tick)
