@@ -122,6 +122,8 @@ def sentence(
     elif findings.verdict == 'partly_explained':
         text = f'{names} explains {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
         text += f'{fall}.'
+        if findings.group:
+            text += f' Whether it is {_or(findings.group)}, these data do not tell.'
     elif findings.verdict == 'refitted':
         text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}.'
         if is_given:

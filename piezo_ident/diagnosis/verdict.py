@@ -104,7 +104,7 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
     `noise` is the mean square of the noise of a row.  What could have bent G at the identification
     is a rival of the first effect that was added.
     """
-    fitted, taken, bent = selected.fitted, selected.taken, selected.bent
+    fitted, taken = selected.fitted, selected.taken
     explainable = max(base.mean_square - noise, 0.0)
     left = max(fitted.mean_square - noise, 0.0)
     if not taken:
@@ -119,21 +119,26 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / max(explainable, 1e-300), 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
-    rest = rows.percent(left)
+    rest, group = rows.percent(left), _alike(rows, base, selected, noise)
     if share < criteria.NAMED:
-        return Findings('partly_explained', share, effects, None, rest)
-    for i, this in enumerate(taken):
-        contenders = (*this.contenders, *(bent.contenders[:1] if bent and i == 0 else ()))
+        return Findings('partly_explained', share, effects, group, rest)
+    return Findings('class' if group else 'named', share, effects, group, rest)
+
+
+def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class | None:
+    """Return the first of the effects added that others explain as well, with those."""
+    for i, this in enumerate(selected.taken):
+        bent = selected.bent.contenders[:1] if selected.bent and i == 0 else ()
+        contenders = (*this.contenders, *bent)
         # what the effects after it account for is held against none of them
-        rest_of = max(this.contenders[0].mean_square - fitted.mean_square, 0.0) + noise
+        rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0) + noise
         whole = (base if i == 0 else this.before).mean_square
-        rivals = rivals_of(rows, contenders, rest_of, whole - rest_of)
-        names = tuple(dict.fromkeys((effects[i], *(c.name for c in rivals))))
+        rivals = rivals_of(rows, contenders, rest, whole - rest)
+        names = tuple(dict.fromkeys(c.name for c in (contenders[0], *rivals)))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
-            names = (*names, *untried)[: criteria.CLASS_SIZE]
-            return Findings('class', share, effects, _class(names, untried), rest)
-    return Findings('named', share, effects, None, rest)
+            return _class((*names, *untried)[: criteria.CLASS_SIZE], untried)
+    return None
 
 
 def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:
