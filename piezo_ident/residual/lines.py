@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
 from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of, true_runs
 from scipy import fft
+from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
 
 __all__ = ['Line', 'LineSearch', 'find_lines', 'without_lines']
@@ -38,6 +39,8 @@ FINE = 2.5
 TRIALS = 4.0
 #: a line is the same everywhere: in each half of the data this share of its amplitude, at least
 STEADY = 0.5
+#: share of the largest gain on the grid from which the line may be there
+LOBE = 0.4
 #: two no less than this share of each other, and as close by, are a resonance that rings
 COMPARABLE, BESIDE = 0.5, 0.02
 #: harmonics that are grouped under their base
@@ -121,7 +124,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
         if len(found) == LINES or not significant.any():
             break
         best = int(np.argmax(np.where(significant, gain, -1.0)))
-        frequency = search.refined(search.top_near(best), best)
+        frequency = search.refined(best)
         sines = [(name, *search.sine(frequency, name, best)) for name in search.records]
         amplitude = max(a for _, a, _ in sines)
         if amplitude >= negligible and search.is_steady(frequency, best):
@@ -203,18 +206,40 @@ class _Search:
             known[self.records.index(s.series.record)] += response**2 / s.noise
         return np.asarray(known.max(axis=0))
 
-    def top_near(self, best: int) -> int:
+    def refined(self, best: int) -> float:
         """
-        Return where the gain is largest around a frequency, all with the noise at that one.
+        Return the frequency of the least squared error around one, all with the noise at that one.
 
         A strong line counts as noise of the bins beside it, and the least of that is not its
-        frequency.
+        frequency.  Stretches far apart agree at many frequencies nearly as well, which are closer
+        to each other than the grid is fine.
         """
+
+        def gain(frequency: float) -> float:
+            fits = [self._fit(frequency, name, best) for name in self.records]
+            return sum(abs(a) ** 2 * information for a, information in fits)
+
+        def summit(k: int) -> float:
+            centre = float(self._f[k])
+            for width in (0.5 * step, 0.1 * step):
+                left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
+                bend = left - 2.0 * middle + right
+                if bend < 0.0:
+                    centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
+            return centre
+
+        step = float(self._f[1])
+        near, gains = self._gains_near(best)
+        tops = near[(gains == maximum_filter1d(gains, 3)) & (gains > LOBE * gains.max())]
+        return max(map(summit, tops), key=gain)
+
+    def _gains_near(self, best: int) -> tuple[NDArray[np.int64], Array]:
+        """Return the indices of the frequencies around one, and the gains there."""
         power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
         series = self._spectra[int(np.argmax(power))].series
         reach = round(3.0 * series.rate / series.x.size / float(self._f[1]))
         near = np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
-        gain = np.zeros(near.size)
+        gains = np.zeros(near.size)
         for name in self.records:
             top, information = np.zeros(near.size, np.complex128), np.zeros(near.size)
             for s in self._spectra:
@@ -222,24 +247,8 @@ class _Search:
                     response = s.series.gain(self._f[near]) * (0.5 * s.series.window.sum())
                     top += np.conj(response) * s.values[near] / s.noise[best]
                     information += np.abs(response) ** 2 / s.noise[best]
-            gain += np.abs(top) ** 2 / np.maximum(information, np.finfo(float).tiny)
-        return int(near[np.argmax(gain)])
-
-    def refined(self, top: int, best: int) -> float:
-        """Return the frequency of the least squared error near one, with the noise at another."""
-
-        def gain(frequency: float) -> float:
-            fits = [self._fit(frequency, name, best) for name in self.records]
-            return sum(abs(a) ** 2 * information for a, information in fits)
-
-        step = float(self._f[1])
-        centre = float(self._f[top])
-        for width in (0.5 * step, 0.1 * step):
-            left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
-            bend = left - 2.0 * middle + right
-            if bend < 0.0:
-                centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
-        return centre
+            gains += np.abs(top) ** 2 / np.maximum(information, np.finfo(float).tiny)
+        return near, gains
 
     def sine(self, frequency: float, record: str, best: int) -> tuple[float, float]:
         """Return amplitude and phase of A sin(2 pi f t + phase)."""

@@ -144,3 +144,18 @@ def test_a_mode_that_rings_at_every_step_is_no_line():
     hum = 2e-8 * np.sin(2 * np.pi * 50.03 * T)
     (line,) = search(part_of(noise(rng) + ring + hum)).lines
     assert line.frequency == pytest.approx(50.03, abs=0.002)
+
+
+@pytest.mark.parametrize('hertz', [49.98, 50.03, 50.087])
+def test_two_rests_far_apart_agree_on_one_frequency(hertz):
+    rng = np.random.default_rng(10)
+    v = np.zeros(130_000)
+    # a motion of many periods, too loud to tell where the phase is
+    moving = slice(10_000, 120_000)
+    n = np.arange(110_000)
+    v[moving] = 5.0 - 5.0 * np.cos(2e-4 * n * (1.0 + 1e-5 * n))
+    t = np.arange(v.size) / RATE
+    e = 1e-10 * rng.standard_normal(t.size) + 3e-8 * np.sin(2 * np.pi * hertz * t + 1.0)
+    e[moving] += 3e-8 * rng.standard_normal(n.size)
+    line, *_ = search(ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)).lines
+    assert line.frequency == pytest.approx(hertz, abs=0.002)
