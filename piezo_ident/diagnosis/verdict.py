@@ -127,13 +127,15 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
 
 def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class | None:
     """Return the first of the effects added that others explain as well, with those."""
+    law = selected.fitted.state.law
+    plays = law is None or law.name == 'plays'
     for i, this in enumerate(selected.taken):
         bent = selected.bent.contenders[:1] if selected.bent and i == 0 else ()
         contenders = (*this.contenders, *bent)
         # what the effects after it account for is held against none of them
         rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0) + noise
         whole = (base if i == 0 else this.before).mean_square
-        rivals = rivals_of(rows, contenders, rest, whole - rest)
+        rivals = rivals_of(rows, contenders, rest, whole - rest, plays=plays)
         names = tuple(dict.fromkeys(c.name for c in (contenders[0], *rivals)))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
@@ -151,16 +153,38 @@ def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:
 
 
 def rivals_of(
-    rows: Rows, contenders: Sequence[Fitted], noise: float, explainable: float
+    rows: Rows, contenders: Sequence[Fitted], noise: float, explainable: float, *, plays: bool
 ) -> tuple[Fitted, ...]:
     """
     Return the contenders that the data do not separate from the first one, which was added.
 
-    `noise` and `explainable` are mean squares: of the noise, and of what there was to explain.
+    `noise` and `explainable` are mean squares: of the noise, and of what there was to explain;
+    `plays` says whether the hysteresis is a sum of them.
     """
     best, *others = contenders
-    floor = (criteria.INDISTINCT * rows.stroke / 100.0) ** 2
-    return tuple(c for c in others if _as_good(c, best, noise, explainable, floor))
+    floor, least = (
+        (size * rows.stroke / 100.0) ** 2
+        for size in (criteria.INDISTINCT, criteria.SMALLEST_EFFECT)
+    )
+    # what another hysteresis leaves may favour one look-alike
+    doubtful = not plays and best.mean_square - noise > least
+    alike = look_alikes(best.name) if doubtful else ()
+    return tuple(
+        c
+        for c in others
+        if _as_good(c, best, noise, explainable, floor)
+        or (c.name in alike and _may_be(c, best, noise, explainable))
+    )
+
+
+def _may_be(rival: Fitted, best: Fitted, noise: float, explainable: float) -> bool:
+    """Return whether a look-alike with no more parameters would be named, were it alone."""
+    left, other = (max(c.mean_square - noise, 0.0) for c in (best, rival))
+    return (
+        len(rival.parameters) <= len(best.parameters)
+        and other <= (1.0 - criteria.NAMED) * explainable
+        and other <= criteria.FORM_RATIO * left
+    )
 
 
 def _as_good(rival: Fitted, best: Fitted, noise: float, explainable: float, floor: float) -> bool:

@@ -42,6 +42,7 @@ def fitted(mean_square, shape=FLAT, parameters=3):
     return SimpleNamespace(
         errors=errors,
         mean_square=errors.sum() / (BLOCKS * SIZE),
+        state=SimpleNamespace(law=None),
         parameters=(None,) * parameters,
     )
 
@@ -54,8 +55,8 @@ def a_round(*contenders, before=WHOLE):
     return SimpleNamespace(before=fitted(before), contenders=contenders, chance={}, best={})
 
 
-def rivals(rows, *contenders):
-    return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE)]
+def rivals(rows, *contenders, plays=True):
+    return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE, plays=plays)]
 
 
 def test_a_refit_that_is_not_kept_is_said():
@@ -109,6 +110,17 @@ def test_a_lead_that_one_block_makes_is_no_lead(rows):
     assert not rivals(rows, best, contender('backlash', 0.12, shape=one))
 
 
+def test_beside_a_foreign_hysteresis_a_look_alike_has_to_leave_twice_as_much(rows):
+    best = contender('amplifier_lag', 0.02, parameters=1)
+    delay = contender('delay_change', 0.05, parameters=1)
+    assert not rivals(rows, best, delay)
+    assert rivals(rows, best, delay, plays=False) == ['delay_change']
+    # one that would not be named itself, and one that leaves more, are none
+    assert not rivals(rows, best, contender('delay_change', 0.09, parameters=1), plays=False)
+    best = contender('amplifier_lag', 0.01, parameters=1)
+    assert not rivals(rows, best, delay, plays=False)
+
+
 def test_standard_errors_pair_the_blocks():
     assert standard_errors(np.zeros(5)) == 0.0
     assert standard_errors(np.ones(5)) == np.inf
@@ -146,6 +158,16 @@ def test_what_a_later_effect_explains_is_held_against_no_candidate_of_the_first(
     assert verdict(rows, [first], 0.07).verdict == 'named'
     close = a_round(contender('creep', 0.06), contender('thermal_drift', 0.08))
     assert verdict(rows, [close], 0.06).group.names == ('creep', 'thermal_drift')
+
+
+def test_what_explains_a_part_may_be_a_class_too(rows):
+    this = a_round(contender('creep', 0.09), contender('thermal_drift', 0.12))
+    found = verdict(rows, [this], 0.09)
+    assert found.verdict == 'partly_explained' and found.effects == ('creep',)
+    assert found.group.names == ('creep', 'thermal_drift')
+    errors = tuple(Errors(x, {}, {}) for x in (1.0, 1.0, 0.3))
+    said = sentence(found, errors, Unexplained(0.09, 0.3, 'rest'), 0.05, False)
+    assert said.endswith('Whether it is creep or thermal drift, these data do not tell.')
 
 
 def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):
