@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import TUNED
-from piezo_ident.diagnosis.refined_model import lasting, Refined
+from piezo_ident.diagnosis.refined_model import Refined
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.simulator import Added
 from piezo_ident.diagnosis.verdict import Findings
@@ -52,7 +52,7 @@ def warnings_of(
 
     `bent` is the share of the explainable part that goes with a retuned G alone.
     """
-    state, stays = refined.state, lasting(findings.effects)
+    state = refined.state
     found = []
     if not floor.known:
         found.append(f'{floor.source}: every share counts the noise as unexplained')
@@ -62,7 +62,9 @@ def warnings_of(
             f'{100.0 * max(bent, 0.0):.0f} % of what a refit of the hysteresis leaves goes with '
             'that alone: an effect bent them at the identification, or they have changed since'
         )
-    found += [_of_time_driven(a, bool(stays)) for a in state.effects if a.effect.time_driven]
+    found += [
+        _of_time_driven(a, refined.h_is_given) for a in state.effects if a.effect.time_driven
+    ]
     for shift in refined.shifts[refined.shifts != 0.0]:
         found.append(
             f'the zero of the displacement has moved by {1e6 * shift:.3g} um in a record; that is '
@@ -77,12 +79,12 @@ def warnings_of(
     return found
 
 
-def _of_time_driven(added: Added, beside_lasting: bool) -> str:
+def _of_time_driven(added: Added, h_is_given: bool) -> str:
     effect = added.effect
     is_off = all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
-    # with a lasting effect H was fitted to the mean of what wanders
-    kept = 'its mean' if beside_lasting and not is_off else 'it switched off'
-    if not beside_lasting:
+    # a refitted H was fitted to the mean of what wanders
+    kept = 'it switched off' if h_is_given or is_off else 'its mean'
+    if h_is_given:
         kept += ', and the hysteresis as it was given'
     return (
         f'{added.name} follows time and not the voltage: what was found holds in its own '

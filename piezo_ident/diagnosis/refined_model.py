@@ -13,7 +13,7 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FORMULA
-from piezo_ident.diagnosis.rows import means, Rows
+from piezo_ident.diagnosis.rows import centred, means, Rows
 from piezo_ident.diagnosis.simulator import Added, Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
@@ -30,7 +30,7 @@ NOTHING = 1e-9
 @dataclass(frozen=True, eq=False)
 class Refined:
     """
-    The refined model, the fit that it comes from, and whether it stays as it was given.
+    The refined model, the fit that it comes from, and whether it, or H, stays as it was given.
 
     `shifts` is how far the sensor's zero has moved in each record [m], shape (records,).
     """
@@ -39,6 +39,7 @@ class Refined:
     state: State
     shifts: Array
     is_given: bool = False
+    h_is_given: bool = False
 
 
 def lasting(effects: tuple[str, ...]) -> list[str]:
@@ -73,22 +74,39 @@ def refine(
     if shifts.any():
         offsets = fitted.state.offsets - shifts
         fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
-    if findings.effects and not lasting(findings.effects):
-        # H was refitted together with a drift that another record will not repeat
-        effects = tuple(
-            Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
-            for added in fitted.state.effects
-        )
-        state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
-        return Refined(
-            # what the model leaves out was there, and will be
-            _model(simulator, state, findings, model.scaling.range, errors[:1]),
-            fitted.state,
-            metres,
-        )
-    return Refined(
-        _model(simulator, fitted.state, findings, _range(simulator), errors), fitted.state, metres
+    if not findings.effects or lasting(findings.effects):
+        refined = _model(simulator, fitted.state, findings, _range(simulator), errors)
+        return Refined(refined, fitted.state, metres)
+    # what the model leaves out was there, and will be
+    if _is_finding(simulator, given, fitted):
+        refined = _model(simulator, fitted.state, findings, _range(simulator), errors[:1])
+        return Refined(refined, fitted.state, metres)
+    # H was refitted together with a drift that another record will not repeat
+    effects = tuple(
+        Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
+        for added in fitted.state.effects
     )
+    state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
+    refined = _model(simulator, state, findings, model.scaling.range, errors[:1])
+    return Refined(refined, fitted.state, metres, h_is_given=True)
+
+
+def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:
+    """
+    Return whether a refit of H is one beside effects that follow time, not a gain that wanders.
+
+    It takes the larger part of what these leave of the model as given, also of motion held out.
+    """
+    rows, state = simulator.rows, fitted.state
+    x = simulator.run(given)
+    of_time = simulator.run(state) - simulator.run(replace(state, effects=()))
+    e = centred(rows.x - x - of_time, rows.of_record)
+    before, after = float(np.mean(e * e)), float(fitted.transfer.sum()) / rows.n
+    if rows.percent(before - after) < criteria.REFIT_FINDING or after > 0.5 * before:
+        return False
+    h = centred(x, rows.of_record)
+    by_gain = float((h @ e) ** 2 / (h @ h)) / rows.n
+    return by_gain <= criteria.ADDED * (before - after) and refit_holds(rows, e, fitted.transfer)
 
 
 def _is_worth(rows: Rows, refit: Fitted, e: Array) -> bool:

@@ -272,6 +272,20 @@ def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
     assert after < 0.7 * before
 
 
+def test_a_refit_of_h_is_kept_beside_hum(truths):
+    model, record, unseen = measured('periodic_disturbance', 0.3, 1)
+    h = model.hysteresis
+    other = replace(h, thresholds=h.thresholds**0.7, weights=1.1 * h.weights)
+    off = replace(model, hysteresis=other)
+    few = DiagnosisSettings(effects=('periodic_disturbance',))
+    result = diagnose(off, record, few)
+    assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
+    assert 'it switched off;' not in ' '.join(result.warnings)
+    before, after = unseen_errors(result, unseen)
+    # nearly all that is left is hum
+    assert before > 3.0 and after < 0.4
+
+
 def test_hum_stays_in_its_record(truths):
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     result = diagnose(model, record, FEW)
