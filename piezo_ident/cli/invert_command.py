@@ -72,7 +72,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
             'lead': drive.lead,
             'clipped': int(np.count_nonzero(drive.clipped)),
             'voltage_range': [float(drive.v.min()), float(drive.v.max())],
-            'steepest': float(np.abs(np.diff(drive.v)).max()) * model.sample_rate,
+            'steepest': float(np.abs(np.diff(drive.v)).max()) * piece.sample_rate,
             'warnings': list(drive.warnings),
             **{key: path and str(path) for key, path in files.items()},
         }

@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.inputs import checked_limits, checked_motion, padded
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
@@ -35,7 +35,7 @@ from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
 
-__all__ = ['Inverse', 'checked_limits', 'invert']
+__all__ = ['Inverse', 'invert']
 
 Array = NDArray[np.float64]
 
@@ -59,6 +59,8 @@ SHORT = 1e-4
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
 #: time of a way to the beginning of a motion, and of a wait there [s]
 RISE, HOLD = 0.2, 1.0
+#: how the warning of that begins
+CREEPS = 'the stage creeps'
 #: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
 FAR, FAINT = 30.0, 2e-3
 
@@ -122,6 +124,7 @@ def invert(
     clip: bool = False,
     channels: Mapping[str, ArrayLike] | None = None,
     sample_rate: float | None = None,
+    like: Inverse | None = None,
 ) -> Inverse:
     """
     Return the voltage under which a model moves as wanted.
@@ -143,6 +146,8 @@ def invert(
         Further signals that effects of the model depend on.
     sample_rate : float, optional
         Of the wanted motion [Hz], where that is known: another one than the model's is refused.
+    like : Inverse, optional
+        Of nearly the same motion, to begin with where plays widen with speed.
 
     Returns
     -------
@@ -166,7 +171,7 @@ def invert(
     >>> drive.error < 0.01, bool(0 <= drive.v.min() and drive.v.max() <= 10)
     (True, True)
     """
-    y = _checked(wanted)
+    y = checked_motion(wanted)
     if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
         raise DataError(
             f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
@@ -187,7 +192,9 @@ def invert(
     # the voltage moves before and after the motion
     lead, tail = Q.ahead, Q.behind
     x = np.pad(s.x(y), (lead, tail), mode='edge')
-    more = _padded(channels or {}, y.size, (lead, tail))
+    more = padded(channels or {}, y.size, (lead, tail))
+    if like is not None and isinstance(H, RateInverse):
+        H.begin_at(np.pad(s.u(like.v), (lead - like.lead, tail), mode='edge'))
     t = (np.arange(x.size) - lead) / model.sample_rate
     span = float(np.ptp(x))
     span = span if span > STANDS else 1.0
@@ -244,7 +251,13 @@ def invert(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
-    warnings += _extrapolated(model, v, y) + _creeping(model, float(v[0]))
+    warnings += _extrapolated(model, v, y)
+    # the same of nearly the same motion
+    warnings += (
+        _creeping(model, float(v[0]))
+        if like is None
+        else [told for told in like.warnings if told.startswith(CREEPS)]
+    )
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     lead -= used.start
     return Inverse(
@@ -259,60 +272,6 @@ def invert(
         expected=expected_error(model),
         warnings=tuple(warnings),
     )
-
-
-def _checked(wanted: ArrayLike) -> Array:
-    y = _vector(wanted)
-    if y.size < 2 or not np.all(np.isfinite(y)):
-        raise DataError(
-            'invert: the wanted motion must be a vector of finite numbers, in metres, two at least'
-        )
-    return y
-
-
-def _vector(values: ArrayLike) -> Array:
-    """Return numbers as a vector, an empty one where they are none; NaN where masked."""
-    try:
-        given: Any = np.ma.asarray(values)
-        if given.ndim == 1 and np.isrealobj(given):
-            return np.asarray(given.astype(np.float64).filled(np.nan))
-    except (TypeError, ValueError):
-        pass
-    return np.empty(0)
-
-
-def checked_limits(
-    model: StageModel, limits: tuple[float, float] | None, slew: float
-) -> tuple[float, float, float]:
-    """
-    Return lowest and highest voltage and its speed as numbers; the identified range for None.
-
-    Raises
-    ------
-    DataError
-    """
-    given = model.scaling.range if limits is None else limits
-    try:
-        (low, high), speed = map(float, given), float(slew)
-    except (TypeError, ValueError):
-        low = high = speed = np.nan
-    if not (-np.inf < low < high < np.inf and speed > 0.0):
-        raise DataError('limits must be (lowest, highest) voltage, finite, and a slew above zero')
-    return low, high, speed
-
-
-def _padded(
-    channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]
-) -> dict[str, Array]:
-    """Return the further signals as long as the voltage is."""
-    found = {name: _vector(z) for name, z in channels.items()}
-    for name, z in found.items():
-        if z.shape != (n,) or not np.all(np.isfinite(z)):
-            raise DataError(
-                f'invert: the channel {name!r} must be a vector of {n} finite numbers, one for '
-                'each of the wanted motion'
-            )
-    return {name: np.pad(z, around, mode='edge') for name, z in found.items()}
 
 
 def _of_hysteresis(
@@ -383,7 +342,7 @@ def _creeping(model: StageModel, v0: float) -> list[str]:
     left = only.stream().reset(v0) - only.simulate(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
     if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
         return []
-    told = f'the stage creeps: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
+    told = f'{CREEPS}: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
     return [f'{told} left to where the motion begins; wait longer, or begin it under {low:g} V']
 
 

@@ -203,5 +203,6 @@ class Learning:
         else:
             self._step *= 0.5
         self._reference = self._best_reference + self._step * self._correction
-        self.drive = self._invert(self._reference)
+        # no other voltage of the same motion: another one errs elsewhere
+        self.drive = self._invert(self._reference, like=self.best.drive)
         return error

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
-from piezo_ident.control.inverse import checked_limits, SHORT
+from piezo_ident.control.inputs import checked_limits
+from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
     least_preview,

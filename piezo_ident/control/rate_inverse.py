@@ -8,6 +8,10 @@ With known thresholds each sample is the root of one unknown, as for H alone.  T
 follow from the speed of the voltage that is sought: it is that of the voltage found before,
 smoothed.  To solve for both at once would be exact and of no use: a faster voltage widens the
 plays by more than it moves them, so the root jumps from sample to sample.
+
+Where plays widen much, that does not settle: the voltage has to begin before a turn to make up for
+it, as before a zero outside the unit circle.  There the whole voltage is corrected at once by
+Gauss and Newton, in steps that are small, smooth and of least squares.
 """
 
 from __future__ import annotations
@@ -19,9 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import smoothed
+from piezo_ident.control.rate_tangent import tangent
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
+from scipy.sparse.linalg import LinearOperator, lsmr
 
 __all__ = ['RateInverse']
 
@@ -31,6 +37,17 @@ Array = NDArray[np.float64]
 PASSES, SMOOTH = 4, 0.5
 #: share of the square of what a pass misses that it must leave at most for another one
 WORTH = 0.7
+#: what the passes may leave without a correction of the whole [of the span of the motion, rms]
+SETTLED = 1e-4
+#: such corrections, of a motion, and of nearly the same again
+STEPS, AGAIN = 12, 3
+#: corner of the correction in cutoffs of the effect, the weight of its size, and what it is
+#: solved to: share of the error, and products with the tangent
+STEP_CORNER, STEP_SIZE, STEP_ERROR, PRODUCTS = 3.0, 1.0, 1e-3, 30
+
+
+#: what is left of the wanted motion, squared; the voltage; and H
+_Found = tuple[float, Array, Array]
 
 
 class RateInverse:
@@ -75,6 +92,7 @@ class RateInverse:
         growth = [self._effect.number(name) for name in names]
         self._inverse = HysteresisInverse(hysteresis, limits, step, growth=growth)
         self._smoothing = SMOOTH * self._effect.number('cutoff'), sample_rate
+        self._step = float(step)
         self._u0, self._before = 0.0, np.empty(0)
 
     @property
@@ -87,9 +105,13 @@ class RateInverse:
         self._u0 = u0
         return self._inverse.reset(u0)
 
+    def begin_at(self, u: Array) -> None:
+        """Take a voltage of nearly the same motion to begin with, shape (n,)."""
+        self._before = u
+
     def process(self, w: Array) -> tuple[Array, Array]:
         """
-        Return the voltages of a motion from rest, and what H is under them.
+        Return the voltages of a motion from rest, and what H is under them, nearly.
 
         Parameters
         ----------
@@ -101,9 +123,21 @@ class RateInverse:
         u, w : ndarray, shape (n,)
             H comes as near as the limits allow.
         """
+        best = self._passed(w)
+        if best[0] > SETTLED**2 * w.size * float(np.ptp(w)) ** 2:
+            u, steps = best[1], STEPS
+            if self._before.size == w.size:
+                steps = AGAIN
+                if self._left(self._before, w) < best[0]:
+                    u = self._before
+            best = self._corrected(w, u, steps, best)
+        self._before = best[1]
+        return best[1:]
+
+    def _passed(self, w: Array) -> _Found:
+        """Return the best of passes, each with the speed of the one before."""
         u, reached = self._inverse.process(w)
-        best = self._left(u, w), u, reached
-        passes = PASSES
+        best, passes = (self._left(u, w), u, reached), PASSES
         if self._before.size == w.size:
             # of nearly the same motion
             u, passes = self._before, 1
@@ -116,11 +150,44 @@ class RateInverse:
                 best = left, u, reached
             if not left < WORTH * before:
                 break
-        self._before = best[1]
-        return best[1:]
+        return best
+
+    def _corrected(self, w: Array, u: Array, steps: int, best: _Found) -> _Found:
+        """Return the best of what was found and of what corrections make of a voltage."""
+        n = w.size
+        for _ in range(steps):
+            J = tangent(self._effect, u, self._u0)
+            smooth = LinearOperator((n, n), self._smooth, self._smooth, dtype=np.float64)
+            change = lsmr(
+                J @ smooth,
+                w - self._under(u),
+                damp=STEP_SIZE,
+                atol=STEP_ERROR,
+                btol=STEP_ERROR,
+                maxiter=PRODUCTS,
+            )[0]
+            # one that led away may lead to a better place, so the next one goes on from it
+            u = np.clip(u + self._smooth(change), *self.limits)
+            best = min(best, self._found(u, w), key=lambda x: x[0])
+        return best
+
+    def _found(self, u: Array, w: Array) -> _Found:
+        """Return a voltage with what it misses, endlessly much where it is too steep."""
+        if np.abs(np.diff(u, prepend=self._u0)).max() > self._step:
+            return np.inf, u, w
+        at_limit = (u <= self.limits[0]) | (u >= self.limits[1])
+        return self._left(u, w), u, np.where(at_limit, self._under(u), w)
+
+    def _smooth(self, x: Array) -> Array:
+        corner, rate = STEP_CORNER * self._effect.number('cutoff'), self._effect.sample_rate
+        return smoothed(x.ravel(), corner, rate)
+
+    def _under(self, u: Array) -> Array:
+        """Return H with its own speed."""
+        self._effect.reset(self._u0, self._u0)
+        return self._effect.process(Block(t=np.zeros(u.size), v=u, x=u)).x
 
     def _left(self, u: Array, w: Array) -> float:
         """Return by how much H with its own speed misses what is wanted, squared."""
-        self._effect.reset(self._u0, self._u0)
-        e = self._effect.process(Block(t=np.zeros(u.size), v=u, x=u)).x - w
+        e = self._under(u) - w
         return float(e @ e)

@@ -16,6 +16,9 @@ from piezo_ident.operators.kernels import curve, held
 
 __all__ = ['RateDependentHysteresis']
 
+#: speed below which the slope of its power is taken at it [spans/s]
+SLOW = 1e-3
+
 
 @kernel
 def _widened(
@@ -119,8 +122,8 @@ class RateDependentHysteresis(Effect):
     )
 
     def prepare(self) -> None:
-        """Compute the pole of the low-pass."""
-        self._pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
+        """Compute the pole of the low-pass of the speed."""
+        self.pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
@@ -192,7 +195,7 @@ class RateDependentHysteresis(Effect):
         names = ('gain', 'stretch', 'lead', 'lead_stretch', 'levelling', 'exponent')
         numbers: Numbers = {name: self.number(name) for name in names}
         r, q, *_, low, c = h.for_kernel
-        numbers |= {'m': m, 'r': r[:m], 'q': q[:m], 'low': low, 'pole': self._pole}
+        numbers |= {'m': m, 'r': r[:m], 'q': q[:m], 'low': low, 'pole': self.pole}
         numbers |= {'per_second': self.sample_rate}
         weight, bent = 'q[i]', ''
         if c.size:
@@ -243,8 +246,24 @@ class RateDependentHysteresis(Effect):
         """Return ``|s|^eps`` under an input from rest at v0, both shapes (n,)."""
         return self._power(np.ascontiguousarray(v), np.array([v0, 0.0]))
 
+    def power_and_slope(
+        self, v: NDArray[np.float64], v0: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what `power` returns, and its slope with the speed s."""
+        speed = _low_pass(
+            np.ascontiguousarray(v), self.pole, self.sample_rate, np.array([v0, 0.0])
+        )
+        exponent, levelled = (
+            self.number('exponent'),
+            1.0 + self.number('levelling') * np.abs(speed),
+        )
+        # of a small power the slope at rest has no end
+        near = np.maximum(np.abs(speed) / levelled, SLOW) ** (exponent - 1.0)
+        slope = exponent * near * np.sign(speed) / levelled**2
+        return (np.abs(speed) / levelled) ** exponent, slope
+
     def _power(self, v: NDArray[np.float64], state: NDArray[np.float64]) -> NDArray[np.float64]:
-        power = np.abs(_low_pass(v, self._pole, self.sample_rate, state))
+        power = np.abs(_low_pass(v, self.pole, self.sample_rate, state))
         if self.number('levelling') > 0.0:
             power /= 1.0 + self.number('levelling') * power
         if self.number('exponent') != 1.0:

@@ -26,7 +26,8 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, TOLERANCE, TRIALS
-from piezo_ident.control.inverse import checked_limits, SHORT
+from piezo_ident.control.inputs import checked_limits
+from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
     EPSILON,

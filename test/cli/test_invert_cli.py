@@ -3,6 +3,7 @@
 
 """``invert``: a file with the motion that is wanted, to a file with the voltage."""
 
+from dataclasses import replace
 import json
 
 from command_line import run
@@ -52,6 +53,17 @@ def test_what_is_out_of_reach_is_refused_or_clipped(capsys, made, scan):
     assert data['steepest'] == pytest.approx(40.0)
     code, _, error = run(capsys, *argv[:5], '--slew', '-1')
     assert code == 2 and "'-1' is no speed" in error
+
+
+def test_a_model_without_dynamics_takes_any_rate(capsys, tmp_path, made, scan):
+    model = pi.load(made / 'model.yaml')
+    static = replace(model.without_dynamics(), sample_rate=4 * RATE)
+    static.save(tmp_path / 'static.yaml')
+    out = tmp_path / 'drive.csv'
+    argv = ['invert', tmp_path / 'static.yaml', scan, '--columns', 'y=y_um', '--out', out]
+    data = json.loads(run(capsys, *argv, '--json')[1])
+    v = pi.read(out, voltage_alone=True).pieces[0].v
+    assert data['steepest'] == pytest.approx(RATE * np.abs(np.diff(v)).max(), rel=1e-6)
 
 
 @pytest.mark.parametrize(

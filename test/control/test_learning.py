@@ -162,3 +162,28 @@ def test_a_step_that_harms_is_halved():
     errors = repeated(stage, learning, most=16)
     assert errors[1] > errors[0]
     assert learning.best.error < 0.1 * errors[0]
+
+
+@pytest.mark.parametrize(('frequency', 'left'), [(10, 0.06), (50, 0.2)])
+def test_plays_that_widen_much_and_otherwise_than_the_model_says(frequency, left):
+    law = {'exponent': 1.0, 'levelling': 0.02, 'cutoff': 500.0, 'stretch': 0.02}
+    truth = {**law, 'cutoff': 420.0, 'stretch': 0.0215, 'levelling': 0.021}
+    model, stage = (
+        replace(PAPER, effects=(EffectSetting('rate_dependent_hysteresis', x),))
+        for x in (law, truth)
+    )
+    soft = np.minimum(1.0, T / 0.05)
+    learning = pi.Learning(model, 35e-6 - 25e-6 * soft * np.cos(2 * np.pi * frequency * T))
+    for _ in range(4):
+        learning.take(stage.simulate(learning.drive.v))
+    # passes of the inverse alone end at 0.11 and 0.35
+    assert learning.best.error < left
+
+
+def test_a_warning_of_creep_holds_for_repetitions(monkeypatch):
+    creep = EffectSetting('creep', {'gain': [0.05], 'time_constant': [5.0]})
+    learning = pi.Learning(replace(PAPER, effects=(creep,)), RASTER)
+    (told,) = learning.drive.warnings
+    assert told.startswith('the stage creeps')
+    learning.take(learning.drive.predicted + 1e-9)
+    assert learning.drive.warnings == (told,)

@@ -56,6 +56,32 @@ def gain_of(rng):
     return left / before
 
 
+@pytest.mark.parametrize(('frequency', 'left'), [(10.0, 2e-4), (50.0, 2e-3), (90.0, 2.5e-3)])
+def test_plays_that_widen_much_are_inverted(frequency, left):
+    # passes alone leave 1.2e-3, 5.5e-3 and 8.1e-3
+    h = Hysteresis(
+        [0.04, 0.1, 0.15, 0.2, 0.3, 0.5], [0.12, 0.16, 0.12, 0.1, 0.1, 0.07], -0.11, 0.5
+    )
+    law = {'exponent': 1.07, 'levelling': 0.023, 'cutoff': 540.0, 'stretch': 0.0167}
+    t = np.arange(4000) / FS
+    wave = np.minimum(1.0, t / 0.02) * (0.5 - 0.5 * np.cos(2 * np.pi * frequency * t))
+    inverse = RateInverse(h, law, FS, (0.0, 1.0))
+    high, low = inverse.reset(0.95), inverse.reset(0.05)
+    wanted = low + (high - low) * wave
+    u, _ = inverse.process(wanted)
+    assert np.std(under(h, law, t, u) - wanted) < left * np.ptp(wanted)
+
+
+def test_a_voltage_to_begin_with_is_kept_where_it_is_right():
+    h, law = PAPER.hysteresis, {**LAW, 'stretch': 0.05}
+    t = np.arange(3000) / FS
+    u = 0.4 - 0.3 * np.cos(2 * np.pi * 60 * t)
+    inverse = RateInverse(h, law, FS, (0.0, 1.0))
+    inverse.reset(u[0])
+    inverse.begin_at(u)
+    assert np.abs(inverse.process(under(h, law, t, u))[0] - u).max() < 1e-3
+
+
 def under(h, law, t, u):
     """Return H with widened plays under a voltage."""
     operator = RateDependentHysteresis(FS, law, h)

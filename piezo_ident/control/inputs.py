@@ -1,0 +1,83 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What an inverse is asked for, checked: motion, limits, and further channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
+from piezo_ident.model.stage_model import StageModel
+
+__all__ = ['checked_limits', 'checked_motion', 'padded']
+
+Array = NDArray[np.float64]
+
+
+def checked_motion(wanted: ArrayLike) -> Array:
+    """
+    Return a wanted motion as a vector.
+
+    Raises
+    ------
+    DataError
+    """
+    y = _vector(wanted)
+    if y.size < 2 or not np.all(np.isfinite(y)):
+        raise DataError(
+            'invert: the wanted motion must be a vector of finite numbers, in metres, two at least'
+        )
+    return y
+
+
+def _vector(values: ArrayLike) -> Array:
+    """Return numbers as a vector, an empty one where they are none; NaN where masked."""
+    try:
+        given: Any = np.ma.asarray(values)
+        if given.ndim == 1 and np.isrealobj(given):
+            return np.asarray(given.astype(np.float64).filled(np.nan))
+    except (TypeError, ValueError):
+        pass
+    return np.empty(0)
+
+
+def checked_limits(
+    model: StageModel, limits: tuple[float, float] | None, slew: float
+) -> tuple[float, float, float]:
+    """
+    Return lowest and highest voltage and its speed as numbers; the identified range for None.
+
+    Raises
+    ------
+    DataError
+    """
+    given = model.scaling.range if limits is None else limits
+    try:
+        (low, high), speed = map(float, given), float(slew)
+    except (TypeError, ValueError):
+        low = high = speed = np.nan
+    if not (-np.inf < low < high < np.inf and speed > 0.0):
+        raise DataError('limits must be (lowest, highest) voltage, finite, and a slew above zero')
+    return low, high, speed
+
+
+def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -> dict[str, Array]:
+    """
+    Return the further signals as long as the voltage is.
+
+    Raises
+    ------
+    DataError
+    """
+    found = {name: _vector(z) for name, z in channels.items()}
+    for name, z in found.items():
+        if z.shape != (n,) or not np.all(np.isfinite(z)):
+            raise DataError(
+                f'invert: the channel {name!r} must be a vector of {n} finite numbers, one for '
+                'each of the wanted motion'
+            )
+    return {name: np.pad(z, around, mode='edge') for name, z in found.items()}

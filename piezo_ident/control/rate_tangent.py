@@ -1,0 +1,154 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What a small change of the voltage makes of H with plays that widen with speed, and its transpose.
+
+A play at an edge of its band goes with the voltage and with the speed, which is that of a
+low-pass; one within its band keeps what was left to it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.kernel import kernel, ordered_kernel
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from scipy.sparse.linalg import LinearOperator
+
+__all__ = ['tangent']
+
+Array = NDArray[np.float64]
+
+
+def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOperator:
+    """
+    Return the changes of H with small changes of a voltage from rest at u0, as an operator.
+
+    Parameters
+    ----------
+    effect : RateDependentHysteresis
+    u : ndarray, shape (n,)
+        The voltage at which they are.
+    u0 : float
+    """
+    h = effect.hysteresis
+    r, q, p1, p2, p0, low, c = h.for_kernel
+    power, slope = effect.power_and_slope(np.ascontiguousarray(u), u0)
+    names = 'gain', 'stretch', 'lead', 'lead_stretch'
+    growth = np.array([effect.number(name) for name in names])
+    rest = h.initial_memory(u0)
+    memory = np.append(rest, np.zeros(r.size - rest.size))
+    edge = np.empty((u.size, r.size), dtype=np.int8)
+    weight = np.tile(q, (u.size if c.size else 1, 1))
+    line = (3.0 * p1 * u + 2.0 * p0) * u + p2
+    _edges(u, power, r, growth, low, c, memory, edge, weight, line)
+    lower, upper = r * growth[1] + growth[0], r * growth[3] + growth[2]
+    gain = (1.0 - effect.pole) * effect.sample_rate
+    parts = edge, weight, lower, upper, line, slope, effect.pole, gain
+
+    def forward(x: Array) -> Array:
+        out = np.empty(u.size)
+        _forward(np.ascontiguousarray(x.ravel()), *parts, out)
+        return out
+
+    def transposed(x: Array) -> Array:
+        out = np.zeros(u.size)
+        _transposed(np.ascontiguousarray(x.ravel()), *parts, out)
+        return out
+
+    return LinearOperator((u.size, u.size), forward, transposed, dtype=np.float64)
+
+
+@kernel
+def _edges(
+    u: Array,
+    power: Array,
+    r: Array,
+    growth: Array,
+    low: float,
+    c: Array,
+    memory: Array,
+    edge: NDArray[np.int8],
+    weight: Array,
+    line: Array,
+) -> None:
+    """Write the edge at which each play is: -1, 1, or 0 for none; add what curves make."""
+    for k in range(u.size):
+        x, s = u[k], power[k]
+        for i in range(r.size):
+            width = max(r[i] * (1.0 + growth[1] * s) + growth[0] * s, 0.0)
+            ahead = max(r[i] * (growth[3] * s) + growth[2] * s, -width)
+            edge[k, i] = 0
+            if memory[i] > x + ahead:
+                memory[i], edge[k, i] = x + ahead, 1
+            if memory[i] < x - width:
+                memory[i], edge[k, i] = x - width, -1
+            if c.shape[0]:
+                t = memory[i] - low
+                line[k] += c[3, i] * t
+                weight[k, i] += c[3, i] * (x - low)
+                if 0.0 < t < c[4, i]:
+                    weight[k, i] += t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
+
+
+@ordered_kernel
+def _forward(
+    x: Array,
+    edge: NDArray[np.int8],
+    weight: Array,
+    lower: Array,
+    upper: Array,
+    line: Array,
+    slope: Array,
+    pole: float,
+    gain: float,
+    out: Array,
+) -> None:
+    plays, speed, last = np.zeros(lower.size), 0.0, 0.0
+    for k in range(x.size):
+        speed = pole * speed + gain * (x[k] - last)
+        last = x[k]
+        power, w = slope[k] * speed, line[k] * x[k]
+        row = weight[k if weight.shape[0] > 1 else 0]
+        for i in range(lower.size):
+            if edge[k, i] > 0:
+                plays[i] = x[k] + upper[i] * power
+            elif edge[k, i] < 0:
+                plays[i] = x[k] - lower[i] * power
+            w += row[i] * plays[i]
+        out[k] = w
+
+
+@ordered_kernel
+def _transposed(
+    x: Array,
+    edge: NDArray[np.int8],
+    weight: Array,
+    lower: Array,
+    upper: Array,
+    line: Array,
+    slope: Array,
+    pole: float,
+    gain: float,
+    out: Array,
+) -> None:
+    plays, speed = np.zeros(lower.size), 0.0
+    for k in range(x.size - 1, -1, -1):
+        power, v = 0.0, line[k] * x[k]
+        row = weight[k if weight.shape[0] > 1 else 0]
+        for i in range(lower.size):
+            plays[i] += row[i] * x[k]
+            if edge[k, i] > 0:
+                v += plays[i]
+                power += upper[i] * plays[i]
+                plays[i] = 0.0
+            elif edge[k, i] < 0:
+                v += plays[i]
+                power -= lower[i] * plays[i]
+                plays[i] = 0.0
+        speed += slope[k] * power
+        out[k] += v + gain * speed
+        if k > 0:
+            out[k - 1] -= gain * speed
+        speed *= pole
