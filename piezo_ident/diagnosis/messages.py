@@ -107,11 +107,15 @@ def sentence(
     """
     before, refit, after = (e.overall for e in errors)
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
+    if is_given:
+        fall = (
+            f'other motion gains nothing, so the model stays as given ({before:.3g} % of stroke)'
+        )
     missed = 'what the model missed'
     if findings.effects and refit < 0.5 * before:
         # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
-        fall += f', with the refit alone to {refit:.3g} %'
+        fall += '' if is_given else f', with the refit alone to {refit:.3g} %'
     share = f'{100.0 * findings.share:.0f} % of {missed}'
     names = ' and '.join(name.replace('_', ' ') for name in findings.effects)
     tail = '' if is_given else f'; after a refit of the hysteresis {fall}'

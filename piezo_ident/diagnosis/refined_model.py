@@ -68,8 +68,8 @@ def refine(
         and (not _is_worth(rows, fitted, e) or _harms_the_whole(simulator, given, fitted.state))
     ):
         return Refined(model, given, metres, is_given=True)
-    if fitted.transfer.sum() > e @ e:
-        # of a kind of excitation that was not fitted the given model knows more
+    if fitted.transfer.sum() > (1.0 - criteria.WORTH_REFIT) ** 2 * (e @ e):
+        # of a kind of excitation that was not fitted the given model knows as much
         return Refined(model, given, metres, is_given=True)
     if shifts.any():
         offsets = fitted.state.offsets - shifts

@@ -66,6 +66,15 @@ def test_a_refit_that_is_not_kept_is_said():
     assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
 
 
+def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
+    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.4, 0.4))
+    found, rest = Findings('named', 0.95, ('creep',), None, 0.1), Unexplained(0.05, 0.1, 'rest')
+    said = sentence(found, errors, rest, 0.05, True)
+    assert said.endswith(
+        'other motion gains nothing, so the model stays as given (0.4 % of stroke).'
+    )
+
+
 # -- which candidates are separated -------------------------------------------------------------
 
 
