@@ -33,6 +33,7 @@ ROOMS = (
     'model',
     'residual',
     'identification',
+    'axes',
     'diagnosis',
     'control',
     'export',

@@ -1,0 +1,110 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The best linear approximation of a stage of several axes, line by line.
+
+Around each line the response is a polynomial of the frequency, fitted to all records at once by
+least squares: y(k + d) = sum_p G_p d^p u(k + d), G(k) = G_0.  As many records as inputs determine
+it without help of the neighbours; more of them, and the neighbours, average distortion and noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.common.errors import DataError
+
+__all__ = ['FrequencyResponse', 'excited_lines', 'frequency_response']
+
+#: a line whose voltage is smaller than this part of the largest is not excited
+EXCITED = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """
+    G at lines of a period.
+
+    Attributes
+    ----------
+    lines : ndarray of int, shape (k,)
+        Numbers of the lines, multiples of rate / samples.
+    samples : int
+        Samples a period.
+    g : ndarray of complex, shape (k, outputs, inputs)
+    """
+
+    lines: NDArray[np.intp]
+    samples: int
+    rate: float
+    g: NDArray[np.complex128]
+
+    @property
+    def z(self) -> NDArray[np.complex128]:
+        """The lines on the unit circle."""
+        return np.asarray(np.exp(2j * np.pi * self.lines / self.samples))
+
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """The lines in Hz."""
+        return np.asarray(self.lines * (self.rate / self.samples))
+
+
+def excited_lines(records: Sequence[PeriodicRecord]) -> NDArray[np.intp]:
+    """Return the lines, without the mean, that every input excites on average over the records."""
+    power = np.mean([np.abs(np.fft.rfft(r.mean_u, axis=0)) ** 2 for r in records], axis=0)
+    power[0] = 0
+    # what a few records excite alone is noise beside what all of them do
+    return np.flatnonzero((power > EXCITED**2 * power.max(axis=0)).all(axis=1))
+
+
+def frequency_response(
+    records: Sequence[PeriodicRecord],
+    *,
+    lines: NDArray[np.intp] | None = None,
+    half_width: int = 4,
+    degree: int = 2,
+) -> FrequencyResponse:
+    """
+    Fit the response at each excited line by a local polynomial over its neighbours.
+
+    Parameters
+    ----------
+    records : sequence of PeriodicRecord
+        Of one rate and one number of samples.
+    lines : ndarray of int, optional
+        The lines; otherwise those that are excited.
+    half_width : int
+        Neighbours on either side.
+    degree : int
+        Degree of the polynomial.
+    """
+    shapes = {(r.u.shape[1:], r.y.shape[1:], r.rate) for r in records}
+    if len(shapes) != 1:
+        raise DataError(f'the records differ in samples, channels or rate: {sorted(shapes)}')
+    lines = excited_lines(records) if lines is None else lines
+    u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
+    y = np.array([np.fft.rfft(r.mean_y, axis=0)[lines] for r in records])
+    inputs, outputs = u.shape[2], y.shape[2]
+    width = 2 * half_width + 1
+    unknown, known = inputs * (degree + 1), width * len(records)
+    if known < unknown or len(lines) < width:
+        raise DataError(
+            f'{len(records)} records of {len(lines)} lines do not determine the response from '
+            f'{inputs} inputs; take more records or a wider neighbourhood'
+        )
+    g = np.zeros((len(lines), outputs, inputs), complex)
+    for i in range(len(lines)):
+        low = max(0, min(i - half_width, len(lines) - width))
+        near = slice(low, low + width)
+        powers = np.vander((lines[near] - lines[i]) / half_width, degree + 1, increasing=True)
+        columns = (u[:, near, None, :] * powers[None, :, :, None]).reshape(-1, unknown)
+        solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
+        g[i] = solution[:inputs].T
+    (shape,) = shapes
+    return FrequencyResponse(lines, shape[0][0], shape[2], g)

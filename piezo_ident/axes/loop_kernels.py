@@ -1,0 +1,263 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The compiled loops of a stage with softening and plays inside its loop, and its sensitivities.
+
+    z(k) = F x(k) + G u(k)
+    p_j(k) = z_j(k) (clip(s(k)) - 1)                   j < levels: softening
+    p_j(k) = sum_i mu_ji F_ri[z_j](k)                  the others: plays (eqs. 1-2)
+    s(k)^2 = l(k),  l(k+1) = kappa l(k) + (1 - kappa) mean_{j < levels} z_j(k)^2
+    x(k+1) = A x(k) + B u(k) + E p(k),    y(k) = C x(k) + D u(k) + H p(k)
+
+with F_r the play of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
+
+Sensitivities run beside the trajectory, in single precision, some parameters at once so that they
+stay in the cache: of a play the derivative is that of z where z drives it and stands where it
+rests.  Both loops share one file because a compiled loop is kept on disk until its own file
+changes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.kernel import alive, kernel
+
+__all__ = ['CHUNK', 'KINDS', 'sensitivities', 'trajectory']
+
+Array = NDArray[np.float64]
+
+#: what a parameter is, by number: two numbers a block of A, then entries of matrices
+KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')
+#: parameters that run through the loop together
+CHUNK = 64
+
+
+@kernel
+def trajectory(
+    u: Array,
+    blocks: Array,
+    b: Array,
+    e: Array,
+    f: Array,
+    g: Array,
+    c: Array,
+    d: Array,
+    h: Array,
+    mu: Array,
+    r: Array,
+    levels: int,
+    low: float,
+    high: float,
+    kappa: float,
+    x: Array,
+    memory: Array,
+    level: Array,
+    xs: Array,
+    zs: Array,
+    ps: Array,
+    plays: Array,
+    gates: NDArray[np.uint8],
+    ls: Array,
+    ys: Array,
+) -> int:
+    """
+    Run the loop over u; carry x, memory and level on, write what passes into xs ... ys.
+
+    Returns the samples that were run: fewer than u where the stage runs away.
+    """
+    samples, inputs = u.shape
+    order, signals = e.shape
+    thresholds = len(r)
+    p = np.zeros(signals)
+    new = np.zeros(order)
+    for t in range(samples):
+        ls[t] = level[0]
+        softening = min(max(np.sqrt(level[0]), low), high) - 1.0
+        squares = 0.0
+        for i in range(order):
+            xs[t, i] = x[i]
+        for j in range(signals):
+            z = 0.0
+            for i in range(order):
+                z += f[j, i] * x[i]
+            for i in range(inputs):
+                z += g[j, i] * u[t, i]
+            zs[t, j] = z
+            if j < levels:
+                squares += z * z
+                p[j] = z * softening
+            else:
+                total = 0.0
+                for k in range(thresholds):
+                    v = memory[j, k]
+                    gates[t, j, k] = 0
+                    if z - v > r[k]:
+                        v = z - r[k]
+                        gates[t, j, k] = 1
+                    elif z - v < -r[k]:
+                        v = z + r[k]
+                        gates[t, j, k] = 1
+                    memory[j, k] = v
+                    plays[t, j, k] = v
+                    total += mu[j, k] * v
+                p[j] = total
+            ps[t, j] = p[j]
+        for o in range(len(c)):
+            y = 0.0
+            for i in range(order):
+                y += c[o, i] * x[i]
+            for i in range(inputs):
+                y += d[o, i] * u[t, i]
+            for j in range(signals):
+                y += h[o, j] * p[j]
+            ys[t, o] = y
+        if levels > 0:
+            level[0] = alive(kappa * level[0] + (1.0 - kappa) * squares / levels)
+        for i in range(0, order, 2):
+            block = i // 2
+            new[i] = blocks[block, 0, 0] * x[i] + blocks[block, 0, 1] * x[i + 1]
+            new[i + 1] = blocks[block, 1, 0] * x[i] + blocks[block, 1, 1] * x[i + 1]
+        for i in range(order):
+            value = new[i]
+            for j in range(inputs):
+                value += b[i, j] * u[t, j]
+            for j in range(signals):
+                value += e[i, j] * p[j]
+            x[i] = alive(value)
+            if not abs(value) < 1e12:
+                return t
+    return int(samples)
+
+
+@kernel
+def sensitivities(
+    kinds: NDArray[np.intp],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    u: Array,
+    blocks: Array,
+    e: Array,
+    f: Array,
+    mu: Array,
+    c: Array,
+    h: Array,
+    levels: int,
+    low: float,
+    high: float,
+    kappa: float,
+    xs: Array,
+    zs: Array,
+    ps: Array,
+    plays: Array,
+    gates: NDArray[np.uint8],
+    ls: Array,
+    skip: int,
+    out: NDArray[np.float32],
+) -> None:
+    """
+    Write dy/dtheta after `skip` samples into `out`, shape (samples, outputs, parameters).
+
+    A parameter is `kinds`, a number of `KINDS`, at `rows` and `columns` of its array.
+    """
+    single = np.float32
+    samples = len(u)
+    order, signals = e.shape
+    thresholds = mu.shape[1]
+    outputs = len(c)
+    many = len(kinds)
+    e4, f4, c4, h4 = e.astype(single), f.astype(single), c.astype(single), h.astype(single)
+    blocks4, mu4 = blocks.astype(single), mu.astype(single)
+    s = np.zeros((order, many), single)
+    new = np.zeros((order, many), single)
+    d_play = np.zeros((signals, thresholds, many), single)
+    dz = np.zeros((signals, many), single)
+    dp = np.zeros((signals, many), single)
+    dl = np.zeros(many, single)
+    dy = np.zeros(many, single)
+    for t in range(samples):
+        root = np.sqrt(ls[t])
+        softening = single(min(max(root, low), high) - 1.0)
+        slope = 0.5 / root if low < root < high else 0.0
+        for j in range(signals):
+            row = dz[j]
+            row[:] = 0
+            for i in range(order):
+                weight, state = f4[j, i], s[i]
+                for q in range(many):
+                    row[q] += weight * state[q]
+        for q in range(many):
+            if kinds[q] == 3:
+                dz[rows[q], q] += single(xs[t, columns[q]])
+            elif kinds[q] == 4:
+                dz[rows[q], q] += single(u[t, columns[q]])
+        for j in range(signals):
+            row, push = dz[j], dp[j]
+            if j < levels:
+                by_level = single(zs[t, j] * slope)
+                for q in range(many):
+                    push[q] = softening * row[q] + by_level * dl[q]
+            else:
+                push[:] = 0
+                for k in range(thresholds):
+                    moved, weight = d_play[j, k], mu4[j, k]
+                    if gates[t, j, k]:
+                        for q in range(many):
+                            moved[q] = row[q]
+                    for q in range(many):
+                        push[q] += weight * moved[q]
+        for q in range(many):
+            if kinds[q] == 5:
+                dp[rows[q], q] += single(plays[t, rows[q], columns[q]])
+        if levels > 0:
+            keep = single(kappa)
+            for q in range(many):
+                dl[q] *= keep
+            for j in range(levels):
+                weight, row = single((1.0 - kappa) * 2.0 * zs[t, j] / levels), dz[j]
+                for q in range(many):
+                    dl[q] += weight * row[q]
+        if t >= skip:
+            for o in range(outputs):
+                dy[:] = 0
+                for i in range(order):
+                    weight, state = c4[o, i], s[i]
+                    for q in range(many):
+                        dy[q] += weight * state[q]
+                for j in range(signals):
+                    weight, push = h4[o, j], dp[j]
+                    for q in range(many):
+                        dy[q] += weight * push[q]
+                out[t - skip, o, :] = dy
+        for i in range(0, order, 2):
+            block = i // 2
+            a00, a01 = blocks4[block, 0, 0], blocks4[block, 0, 1]
+            a10, a11 = blocks4[block, 1, 0], blocks4[block, 1, 1]
+            s0, s1, n0, n1 = s[i], s[i + 1], new[i], new[i + 1]
+            for q in range(many):
+                n0[q] = a00 * s0[q] + a01 * s1[q]
+                n1[q] = a10 * s0[q] + a11 * s1[q]
+        for i in range(order):
+            row = new[i]
+            for j in range(signals):
+                weight, push = e4[i, j], dp[j]
+                for q in range(many):
+                    row[q] += weight * push[q]
+        for q in range(many):
+            i, j = rows[q], columns[q]
+            if kinds[q] == 0:
+                if blocks[i, 0, 1] != 0.0:
+                    if j == 0:
+                        new[2 * i, q] += single(xs[t, 2 * i])
+                        new[2 * i + 1, q] += single(xs[t, 2 * i + 1])
+                    else:
+                        new[2 * i, q] += single(xs[t, 2 * i + 1])
+                        new[2 * i + 1, q] -= single(xs[t, 2 * i])
+                else:
+                    new[2 * i + j, q] += single(xs[t, 2 * i + j])
+            elif kinds[q] == 1:
+                new[i, q] += single(u[t, j])
+            elif kinds[q] == 2:
+                new[i, q] += single(ps[t, j])
+        s, new = new, s

@@ -1,0 +1,154 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A linear stage of several axes in modal coordinates.
+
+    x(k+1) = A x(k) + B u(k),    y(k) = C x(k) + D u(k)
+
+A is block diagonal, [[a, b], [-b, a]] for a mode of the poles a +- ib, diag(a, b) for two real
+poles, so a stage of 44 states takes 88 products a sample for A, and a pole moves without the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
+
+__all__ = ['Modal', 'Modes', 'balanced', 'modes', 'to_modal']
+
+
+@dataclass(frozen=True, eq=False)
+class Modal:
+    """
+    A linear model in modal coordinates.
+
+    Attributes
+    ----------
+    blocks : ndarray, shape (n / 2, 2, 2)
+        Of A.
+    b, c, d : ndarray, shapes (n, inputs), (outputs, n), (outputs, inputs)
+    """
+
+    blocks: NDArray[np.float64]
+    b: NDArray[np.float64]
+    c: NDArray[np.float64]
+    d: NDArray[np.float64]
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.b)
+
+    @property
+    def oscillates(self) -> NDArray[np.bool_]:
+        """Which blocks hold a pair of complex poles."""
+        return np.asarray(self.blocks[:, 0, 1] != 0)
+
+    @property
+    def a(self) -> NDArray[np.float64]:
+        """A as one matrix."""
+        a = np.zeros((self.order, self.order))
+        for i, block in enumerate(self.blocks):
+            a[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+        return a
+
+    @property
+    def radius(self) -> float:
+        """Distance of the outermost pole from the origin; a stable model has less than 1."""
+        return float(np.abs(np.linalg.eigvals(self.blocks)).max())
+
+    def resolvent(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return (z - A)^-1 block by block, shape (k, n / 2, 2, 2)."""
+        a, b = self.blocks[:, 0, 0], self.blocks[:, 0, 1]
+        c, d = self.blocks[:, 1, 0], self.blocks[:, 1, 1]
+        zz = z[:, None]
+        adjugate = np.empty((len(z), len(a), 2, 2), complex)
+        adjugate[:, :, 0, 0] = zz - d
+        adjugate[:, :, 0, 1] = b
+        adjugate[:, :, 1, 0] = c
+        adjugate[:, :, 1, 1] = zz - a
+        return np.asarray(adjugate / ((zz - a) * (zz - d) - b * c)[:, :, None, None])
+
+    def states(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return (z - A)^-1 B, shape (k, n, inputs)."""
+        b = self.b.reshape(-1, 2, self.b.shape[1])
+        return np.asarray(
+            np.einsum('kbij,bjm->kbim', self.resolvent(z), b).reshape(len(z), self.order, -1)
+        )
+
+    def reach(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return C (z - A)^-1, shape (k, outputs, n)."""
+        c = self.c.reshape(len(self.c), -1, 2)
+        return np.asarray(
+            np.einsum('pbi,kbij->kpbj', c, self.resolvent(z)).reshape(len(z), -1, self.order)
+        )
+
+    def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return C (z - A)^-1 B + D, shape (k, outputs, inputs)."""
+        return np.asarray(self.c @ self.states(z) + self.d)
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Frequencies in Hz and damping ratios of the modes, slowest first."""
+
+    frequency: NDArray[np.float64]
+    damping: NDArray[np.float64]
+
+
+def modes(a: NDArray[np.float64], rate: float) -> Modes:
+    """Return the modes of a matrix A: its complex poles as frequency and damping ratio."""
+    poles = np.linalg.eigvals(a)
+    s = np.log(poles[poles.imag > 1e-9]) * rate
+    s = s[np.argsort(np.abs(s))]
+    return Modes(np.abs(s) / (2 * np.pi), -s.real / np.abs(s))
+
+
+def to_modal(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    c: NDArray[np.float64],
+    d: NDArray[np.float64],
+    *,
+    radius: float = 0.9999,
+) -> Modal:
+    """
+    Bring a model into modal coordinates; poles beyond `radius` are mirrored to within.
+
+    Raises
+    ------
+    ModelError
+        Where A has no basis of eigenvectors, or an odd number of real poles.
+    """
+    poles, vectors = np.linalg.eig(a)
+    complexes = [i for i in np.argsort(np.angle(poles)) if poles[i].imag > 1e-12]
+    reals = [i for i in np.argsort(-poles.real) if abs(poles[i].imag) <= 1e-12]
+    if len(reals) % 2:
+        raise ModelError(f'an order of {len(a)} is odd; take an even one')
+    basis, blocks = [], []
+    for i in complexes:
+        basis += [vectors[:, i].real, vectors[:, i].imag]
+        pole = complex(poles[i])
+        if abs(pole) > radius:
+            pole *= (radius / abs(pole)) ** 2
+        blocks.append([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    values = np.clip([poles[i].real for i in reals], -radius, radius)
+    basis += [vectors[:, i].real for i in reals]
+    blocks += [[[v, 0.0], [0.0, w]] for v, w in zip(values[::2], values[1::2], strict=True)]
+    t = np.array(basis).T
+    try:
+        return Modal(np.array(blocks, dtype=float), np.linalg.solve(t, b), c @ t, np.array(d))
+    except np.linalg.LinAlgError as error:
+        raise ModelError(f'the modes of an order of {len(a)} coincide; take another') from error
+
+
+def balanced(model: Modal) -> Modal:
+    """Scale the two states of each block so that B and C are of equal size there."""
+    b = np.linalg.norm(model.b.reshape(-1, 2 * model.b.shape[1]), axis=1)
+    c = np.sqrt((model.c**2).sum(axis=0).reshape(-1, 2).sum(axis=1))
+    scale = np.repeat(np.sqrt(np.where((b > 0) & (c > 0), c, 1) / np.where(b > 0, b, 1)), 2)
+    return Modal(model.blocks, model.b * scale[:, None], model.c / scale, model.d)

@@ -1,0 +1,109 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+import axes_stage as stage
+import numpy as np
+from piezo_ident.axes.frequency_response import excited_lines, frequency_response
+from piezo_ident.axes.linear_fit import choose_order, linear_error, linear_fit, refined
+from piezo_ident.axes.modal import modes, to_modal
+from piezo_ident.axes.periodic import periodicity, PeriodicRecord
+from piezo_ident.axes.subspace import subspace
+from piezo_ident.common.errors import DataError, IdentificationError, ModelError
+import pytest
+
+
+@pytest.fixture(scope='module')
+def noisy():
+    return stage.records(
+        stage.linear_stage(), np.random.default_rng(1), (1.0,), count=6, noise=0.01
+    )
+
+
+def test_a_record_states_what_is_wrong_with_it():
+    u, y = np.ones((2, 8, 1)), np.ones((2, 9, 1))
+    with pytest.raises(DataError, match='equal periods and samples'):
+        PeriodicRecord('a', 'b', 1.0, u, y)
+    with pytest.raises(DataError, match='rests throughout'):
+        PeriodicRecord('a', 'b', 1.0, u, y[:, :8])
+    with pytest.raises(DataError, match='not finite'):
+        PeriodicRecord('a', 'b', 1.0, u * np.nan, y[:, :8])
+
+
+def test_periodicity_finds_the_record_that_changed_between_periods(noisy):
+    rng = np.random.default_rng(2)
+    changed = noisy[2]
+    lines = np.zeros((stage.SAMPLES // 2 + 1, 2), complex)
+    at = slice(600, 700)  # 586 to 684 Hz
+    lines[at] = np.exp(2j * np.pi * rng.random((100, 2)))
+    other = np.fft.irfft(lines, stage.SAMPLES, axis=0)
+    y = changed.y.copy()
+    y[1] += 0.1 * y.std() * other / other.std()
+    tested = periodicity(
+        [*noisy[:2], PeriodicRecord('changed', '1', stage.RATE, changed.u, y), *noisy[3:]]
+    )
+    assert [t.suspicious for t in tested] == [False, False, True, False, False, False]
+    found = tested[2]
+    assert found.band[0] <= 600 * stage.RATE / stage.SAMPLES
+    assert 684 <= found.band[1] < 760
+    assert found.difference == pytest.approx(10, rel=0.1)
+    assert found.weight == pytest.approx(0.14, rel=0.15) and tested[0].weight == 1
+    assert tested[0].noise == pytest.approx(1.0, rel=0.1)
+    assert 'changed' in str(found) and 'counts 0.14' in str(found)
+
+
+def test_response_agrees_with_the_truth_within_the_noise(noisy):
+    truth = stage.linear_stage()
+    found = frequency_response(noisy)
+    assert found.lines[0] == 1 and found.frequency[-1] == pytest.approx(800, rel=0.01)
+    error = found.g - truth.response(found.z)
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(found.g)
+    with pytest.raises(DataError, match='do not determine'):
+        frequency_response(noisy[:1], half_width=1, degree=2)
+
+
+def test_subspace_is_exact_without_noise():
+    truth = stage.linear_stage()
+    records = stage.records(truth, np.random.default_rng(3), (1.0,), count=3)
+    response = frequency_response(records, half_width=1, degree=0)
+    exact = type(response)(
+        response.lines, response.samples, response.rate, truth.response(response.z)
+    )
+    found = subspace(exact, 4)
+    assert np.abs(found.response(exact.z) - exact.g).max() < 1e-6
+    assert modes(found.a, stage.RATE).frequency == pytest.approx([190, 310], rel=1e-6)
+    assert modes(found.a, stage.RATE).damping == pytest.approx([0.03, 0.02], rel=1e-4)
+    with pytest.raises(IdentificationError, match='odd'):
+        subspace(exact, 3)
+
+
+def test_refinement_recovers_the_stage_to_the_noise(noisy):
+    start = subspace(frequency_response(noisy[:4]), 4)
+    found = refined(start, frequency_response(noisy[:4]))
+    for record in noisy[4:]:
+        assert linear_error(found, record) == pytest.approx(1.0, rel=0.15)
+    assert found.radius < 1
+    assert modes(found.a, stage.RATE).frequency == pytest.approx([190, 310], rel=1e-3)
+
+
+def test_order_is_chosen_by_held_out_error(noisy):
+    model, errors = choose_order(noisy[:4], noisy[4:], orders=(2, 4, 8))
+    assert model.order == 4
+    assert errors[2] > 10 and errors[4] == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_model_of_too_high_an_order_stays_stable(noisy):
+    assert linear_fit(frequency_response(noisy), 12, iterations=3).radius < 1
+
+
+def test_poles_beyond_the_circle_are_mirrored_and_odd_orders_refused():
+    a = np.diag([1.1, 0.5])
+    assert to_modal(a, np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1))).radius < 1
+    with pytest.raises(ModelError, match='odd'):
+        to_modal(np.eye(1) / 2, np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1)))
+
+
+def test_lines_that_one_record_alone_excites_are_left_out(noisy):
+    rng = np.random.default_rng(4)
+    odd = noisy[0].u + 1e-3 * rng.standard_normal(noisy[0].u.shape)
+    dirty = PeriodicRecord('dirty', '1', stage.RATE, odd, noisy[0].y)
+    assert (excited_lines([dirty, *noisy[1:]]) == excited_lines(noisy)).all()

@@ -1,0 +1,131 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+from dataclasses import replace
+from itertools import pairwise
+
+import axes_stage as stage
+import numpy as np
+from piezo_ident.axes.loop_fit import loop_fit, output_sensitivities, Parameters
+from piezo_ident.axes.loop_kernels import KINDS
+from piezo_ident.axes.loop_model import load_loop_model, LoopModel
+from piezo_ident.axes.modal import modes
+from piezo_ident.common.errors import DataError, ModelError
+import pytest
+
+
+def percent(model, records):
+    errors = [np.linalg.norm(model.error(r)) / np.linalg.norm(r.y[-1]) for r in records]
+    return 100 * float(np.sqrt(np.mean(np.square(errors))))
+
+
+def test_sensitivities_agree_with_finite_differences():
+    model = stage.loop_stage()
+    u = stage.multisine(np.random.default_rng(1), 1.2)[:400]
+    parameters = Parameters.of(model)
+    inner = output_sensitivities(model, parameters, u, model.run(u))
+    outer = 2 * (model.linear.order + 2 + model.signals)
+    step = 1e-6
+    for kind in KINDS:
+        for k in np.flatnonzero(parameters.kinds == KINDS.index(kind))[::3]:
+            move = np.zeros(len(parameters) + outer)
+            move[k] = step
+            ahead, back = (parameters.moved(model, s * move) for s in (1, -1))
+            slope = (ahead.stream().simulate(u) - back.stream().simulate(u)) / (2 * step)
+            assert inner[:, :, k] == pytest.approx(slope, abs=2e-4 * np.abs(slope).max()), kind
+
+
+def test_sensitivities_of_real_poles():
+    linear = stage.linear_stage()
+    blocks = linear.blocks.copy()
+    blocks[0] = [[0.9, 0.0], [0.0, 0.3]]
+    model = LoopModel.of(replace(linear, blocks=blocks))
+    u = stage.multisine(np.random.default_rng(1), 1.0)[:200]
+    parameters = Parameters.of(model, hold=('b', 'e', 'f', 'g', 'mu'))
+    inner = output_sensitivities(model, parameters, u, model.run(u))
+    for k in range(4):
+        move = np.zeros(4 + 2 * 6)
+        move[k] = 1e-6
+        ahead, back = (parameters.moved(model, s * move).stream() for s in (1, -1))
+        slope = (ahead.simulate(u) - back.simulate(u)) / 2e-6
+        assert inner[:, :, k] == pytest.approx(slope, abs=2e-4 * np.abs(slope).max())
+
+
+def test_a_stream_gives_the_bits_of_the_whole_wherever_it_is_cut():
+    model = stage.loop_stage()
+    u = stage.multisine(np.random.default_rng(2), 1.5)
+    whole = model.stream().simulate(u)
+    stream = model.stream()
+    cuts = [0, 1, 2, 60, 700, len(u)]
+    parts = [stream.simulate(u[a:b]) for a, b in pairwise(cuts)]
+    assert (np.concatenate(parts) == whole).all()
+    with pytest.raises(DataError, match='do not fit 2 inputs'):
+        stream.simulate(u[:, :1])
+
+
+def test_modes_fall_and_loops_open_with_the_amplitude():
+    model = stage.loop_stage()
+    low, high = (model.modes_at(s, stage.RATE).frequency for s in (0.5, 1.5))
+    assert (low > high).all()
+    assert modes(model.a_at(9.0), stage.RATE).frequency == pytest.approx(
+        modes(model.a_at(model.range[1]), stage.RATE).frequency
+    )
+    rng = np.random.default_rng(3)
+    plain = LoopModel.of(stage.linear_stage())
+    assert percent(plain, [stage.record(model, rng, 1.0)]) > 3
+
+
+def test_a_model_without_signals_is_its_linear_part():
+    rng = np.random.default_rng(4)
+    record = stage.record(stage.linear_stage(), rng, 1.0)
+    assert percent(LoopModel.of(stage.linear_stage()), [record]) < 1e-6
+
+
+def test_the_fit_recovers_a_stage_to_the_noise():
+    rng = np.random.default_rng(5)
+    truth = stage.loop_stage()
+    taught = stage.records(truth, rng, count=2, noise=0.002)
+    held_out = stage.records(truth, rng, count=1)
+    start = replace(
+        truth,
+        linear=replace(truth.linear, b=1.02 * truth.linear.b),
+        e=0.5 * truth.e,
+        h=0 * truth.h,
+        mu=truth.mu * [[0.5, 1.5]],
+    )
+    before = percent(start, held_out)
+    fit = loop_fit(start, taught, iterations=15, warm_up=512)
+    assert before > 3
+    # of a noise of 0.2 % in each of 6 records little is left in 100 parameters
+    assert percent(fit.model, held_out) < 0.1
+    assert fit.errors[-1] == pytest.approx(0.2 / np.sqrt(2), rel=0.15)
+    assert list(fit.errors) == sorted(fit.errors, reverse=True)
+    assert fit.model.radius < 1
+
+
+def test_what_is_held_stays():
+    rng = np.random.default_rng(6)
+    truth = stage.loop_stage()
+    start = replace(truth, e=0.8 * truth.e)
+    fit = loop_fit(start, stage.records(truth, rng, (1.0,), count=1), hold=('mu',), still=(2, 3))
+    assert (fit.model.mu == start.mu).all()
+    assert (fit.model.f[2:] == start.f[2:]).all() and (fit.model.g[2:] == start.g[2:]).all()
+    assert (fit.model.f[:2] != start.f[:2]).any()
+
+
+def test_a_model_that_runs_away_says_so():
+    truth = stage.loop_stage()
+    wild = replace(truth, e=-60 * truth.e)
+    with pytest.raises(ModelError, match='runs away'):
+        wild.simulate(stage.multisine(np.random.default_rng(7), 1.5))
+
+
+def test_a_model_comes_back_from_its_file(tmp_path):
+    model = stage.loop_stage()
+    model.save(tmp_path / 'stage.npz')
+    again = load_loop_model(tmp_path / 'stage.npz')
+    u = stage.multisine(np.random.default_rng(8), 1.0)
+    assert (again.simulate(u) == model.simulate(u)).all()
+    (tmp_path / 'none.npz').write_text('nothing')
+    with pytest.raises(ModelError, match='holds no model'):
+        load_loop_model(tmp_path / 'none.npz')

@@ -1,0 +1,77 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A simulated stage of two axes that pull at one another, softening and hysteretic or not."""
+
+import numpy as np
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.modal import balanced, to_modal
+from piezo_ident.axes.periodic import PeriodicRecord
+from scipy.linalg import expm
+
+RATE, SAMPLES = 2000.0, 2048
+
+
+def linear_stage():
+    """Return two modes that both axes drive and show, each of a gain of 1 at rest."""
+    shapes = np.array([[1.0, 0.5], [0.4, -0.8]])
+    a, b, c = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((2, 4))
+    for i, (frequency, damping) in enumerate(((190.0, 0.03), (310.0, 0.02))):
+        w = 2 * np.pi * frequency
+        part = expm(np.array([[0, 1, 0], [-w * w, -2 * damping * w, w * w], [0, 0, 0]]) / RATE)
+        at = slice(2 * i, 2 * i + 2)
+        a[at, at], b[at] = part[:2, :2], np.outer(part[:2, 2], shapes[:, i])
+        c[:, 2 * i] = shapes[:, i]
+    return balanced(to_modal(a, b, c, np.zeros((2, 2))))
+
+
+def loop_stage(*, softening=0.04, plays=0.08):
+    """Return a stage whose first two signals soften and whose others are hysteretic."""
+    linear = linear_stage()
+    # the extension of each actuator, near 1 under voltages of rms 1
+    gain = np.linalg.inv(linear.response(np.ones(1, complex))[0].real)
+    f, g = gain @ linear.c, gain @ linear.d
+    e, h = np.hstack([linear.b] * 2), np.hstack([linear.d] * 2)
+    pushes = np.array([softening] * 2 + [plays] * 2)
+    return LoopModel(
+        linear,
+        e * pushes,
+        h * pushes,
+        np.vstack([f, f]),
+        np.vstack([g, g]),
+        2,
+        np.array([[0.0, 0.0]] * 2 + [[0.4, 0.6]] * 2),
+        np.array([0.4, 1.2]),
+        memory=100.0,
+    )
+
+
+def multisine(rng, amplitude, count=2):
+    """Return voltages of rms `amplitude` up to 0.4 of the rate, shape (samples, count)."""
+    lines = np.zeros((SAMPLES // 2 + 1, count), complex)
+    last = int(0.4 * SAMPLES)
+    lines[1:last] = np.exp(2j * np.pi * rng.random((last - 1, count)))
+    u = np.fft.irfft(lines, SAMPLES, axis=0)
+    return amplitude * u / u.std(axis=0)
+
+
+def record(model, rng, amplitude, name='record', *, noise=0.0, periods=2):
+    u = multisine(rng, amplitude)
+    y = model.simulate(u) if isinstance(model, LoopModel) else answer(model, u)
+    y = np.array([y] * periods)
+    y += noise * y.std() * rng.standard_normal(y.shape)
+    return PeriodicRecord(name, f'{amplitude:g}', RATE, np.array([u] * periods), y)
+
+
+def answer(linear, u):
+    z = np.exp(2j * np.pi * np.arange(SAMPLES // 2 + 1) / SAMPLES)
+    lines = np.einsum('kpm,km->kp', linear.response(z), np.fft.rfft(u, axis=0))
+    return np.fft.irfft(lines, SAMPLES, axis=0)
+
+
+def records(model, rng, amplitudes=(0.5, 1.0, 1.5), count=4, noise=0.0):
+    return [
+        record(model, rng, amplitude, f'{amplitude:g}/{i}', noise=noise)
+        for amplitude in amplitudes
+        for i in range(count)
+    ]
