@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from piezo_ident.model.free_run import free_run, FreeRun
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
+    from piezo_ident.record.channels import Axes
     from piezo_ident.record.io import read, write
     from piezo_ident.record.record import Record
     from piezo_ident.report.folder import write_report
@@ -52,6 +53,7 @@ __version__ = '0.1.0'
 
 # public name: where it is defined, and its name there where that differs
 _HOMES = {
+    'Axes': 'record.channels',
     'Cancelled': 'common.errors',
     'ConfigError': 'common.errors',
     'DataError': 'common.errors',
@@ -87,6 +89,7 @@ _HOMES = {
 }
 
 __all__ = [
+    'Axes',
     'Cancelled',
     'ConfigError',
     'DataError',

@@ -14,6 +14,7 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection, sections_in_c, slope_of_mode
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
+from piezo_ident.record.channels import role_of
 
 __all__ = ['CrossCoupling']
 
@@ -79,7 +80,8 @@ class CrossCoupling(Effect):
         """Return every channel that moves, with three corners."""
         trials = []
         for name, (mean, std) in view.channels.items():
-            if not (np.isfinite(std) and std > 0):
+            # another axis's displacement is an answer too, and no cause of what both share
+            if role_of(name) == 'y' or not (np.isfinite(std) and std > 0):
                 continue
             for f in (10.0, 100.0, 1000.0):
                 if f >= 0.4 * view.sample_rate:

@@ -136,9 +136,8 @@ class Snapshot:
                 raise DataError(f'{name}: no {key} has been captured; {cure}')
         order = ('voltage', 'displacement', *sorted(self.streams))
         streams = {key: self.streams[key] for key in dict.fromkeys(order)}
-        if not streams.get(APPLIED, streams['voltage']).n:
-            del streams[APPLIED]
-        return record_of_streams(streams, name=name, faults=self.faults)
+        heard = {k: s for k, s in streams.items() if s.n or not k.startswith(APPLIED)}
+        return record_of_streams(heard, name=name, faults=self.faults)
 
     def sent(self) -> dict[str, float]:
         """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
@@ -183,7 +182,8 @@ class Capture:
         Parameters
         ----------
         key : str
-            ``voltage``, ``displacement``, ``applied_voltage`` or ``x_<name>``.
+            ``voltage``, ``displacement``, ``applied_voltage``, the same with ``_<name>`` behind it
+            for a further axis, or ``x_<name>``.
         samples : Samples
         arrival : int
             When it came [ns], by a clock that all topics share.

@@ -150,7 +150,8 @@ IDENTIFIER = (
     Declaration(
         'channels',
         ('',),
-        'topics of further channels (layout t,x_<name>); empty names are left out',
+        'topics of further axes (voltage_<name>, displacement_<name>) and channels (layout '
+        't,x_<name>); empty names are left out',
         read_only=True,
     ),
     Declaration(

@@ -21,6 +21,7 @@ from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import ArrivalClock
 from piezo_ident.nodes.wire import LATCHED, LATCHED_TOPICS, SAMPLE_TOPICS, STREAM
 from piezo_ident.record.bags.write import knows_type, SAMPLE_QOS
+from piezo_ident.record.channels import channel_of_quantity, role_of
 from piezo_ident.record.stream import LossCount
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
@@ -271,7 +272,7 @@ class RawSubscriptions:
             if topic.request is not None:
                 return topic.request
             base = topic.name.rpartition('/')[2]
-            if base in SAMPLE_TOPICS:
+            if base in SAMPLE_TOPICS or role_of(channel_of_quantity(base)):
                 return _Request('std_msgs/msg/Float64MultiArray', True, False)
             return _Request('std_msgs/msg/String', True, True) if base in LATCHED_TOPICS else None
         offers = [i.qos_profile for i in infos]

@@ -31,7 +31,7 @@ from piezo_ident.record.options import ReadOptions
 __all__ = ['read_hdf5', 'read_mat', 'read_npz', 'read_parquet', 'read_tdms']
 
 _LABELS = ('segment_name', 'segment_start')
-_USED = 't|v|y|x_.+|segment_name|segment_start'
+_USED = '[tvy]|[vyx]_.+|segment_name|segment_start'
 _HDF5 = b'\x89HDF\r\n\x1a\n'
 
 

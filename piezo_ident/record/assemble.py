@@ -18,6 +18,7 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
+from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.options import ReadOptions, UNITS
 from piezo_ident.record.ordering import at_times, in_order, OrderedRows
@@ -87,11 +88,11 @@ def assemble(
     segments : tuple of (names, starts), optional
         Label of each stretch and the row at which it begins; an empty label means none.
     channels : mapping of str to array_like, shape (n,), optional
-        Further signals.
+        Further signals; ``v_<name>`` and ``y_<name>`` are another axis.
     name : str
         What errors call the data, and the record's name.
     options : ReadOptions, optional
-        Unit of `y`, and limits of `v`.
+        Unit of `y`, and limits of `v`; they hold for further axes too.
     sample_rate : float, optional
         Rate that the file names [Hz]; the stamps must agree with it.
     faults : iterable of Fault
@@ -117,9 +118,10 @@ def assemble(
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
     unit = options.displacement_unit or 'm'
-    if y is not None and unit != 'm':
-        scaled = table.columns['y'] / UNITS['y'][unit]
-        table = replace(table, columns={**table.columns, 'y': scaled})
+    if unit != 'm':
+        moved = {k: x for k, x in table.columns.items() if k == 'y' or role_of(k) == 'y'}
+        scaled = {k: x / UNITS['y'][unit] for k, x in moved.items()}
+        table = replace(table, columns={**table.columns, **scaled})
     _check_limits(table, options.voltage_limits, name)
     _check_ranges(table, unit, name)
     pieces = _pieces(table, epochs, name, sample_rate, met)
@@ -135,6 +137,8 @@ def _table(
     name: str,
 ) -> OrderedRows:
     columns = {}
+    if taken := {'t', 'v', 'y'} & channels.keys():
+        raise DataError(f'{name}: a further channel is called {min(taken)}; give it another name')
     for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
         if values is None:
             continue
@@ -188,15 +192,26 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
 
 
 def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: str) -> None:
-    v = table.columns.get('v')
-    if v is None or limits is None or (limits[0] <= v.min() and v.max() <= limits[1]):
-        return
+    for key, v in table.columns.items():
+        if limits is not None and (key == 'v' or role_of(key) == 'v'):
+            _check_voltage(table, key, v, limits, name)
+
+
+def _check_voltage(
+    table: OrderedRows,
+    key: str,
+    v: NDArray[np.float64],
+    limits: tuple[float, float],
+    name: str,
+) -> None:
     low, high = limits
+    if low <= v.min() and v.max() <= high:
+        return
     outside = np.flatnonzero((v < low) | (v > high))
     worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (low + high)))]
     raise DataError(
         f'{name}: {outside.size} samples leave the voltage limits {low:g}..{high:g} V, worst '
-        f'{v[worst]:g} V at {table.t[worst]:.6g} s; check the limits or the unit of v'
+        f'{v[worst]:g} V at {table.t[worst]:.6g} s; check the limits or the unit of {key}'
     )
 
 

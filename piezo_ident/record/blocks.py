@@ -10,7 +10,8 @@ A block is an N x 2 matrix, row by row::
     dim[1] = {label 't,<quantity>',     size 2, stride 2}
 
 so that a block explains itself: when its samples were taken, what they are, to which segment
-they belong.  The quantity is ``voltage``, ``displacement``, or ``x_<name>`` for a further channel.
+they belong.  The quantity is ``voltage``, ``displacement``, ``voltage_<name>`` or
+``displacement_<name>`` for a further axis, or ``x_<name>`` for a further channel.
 """
 
 from __future__ import annotations

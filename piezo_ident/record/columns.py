@@ -4,9 +4,10 @@
 """
 Which column of a file is which.
 
-The names ``t``, ``v``, ``y``, ``segment`` and ``x_<name>`` mean what they say.  For other names
-the words and the unit of a header decide, and only where one column fits; what was decided is
-reported.  Where none or several fit, the option that decides is asked for.
+The names ``t``, ``v``, ``y``, ``segment``, ``x_<name>``, and ``v_<name>`` and ``y_<name>`` beside
+``v`` and ``y``, mean what they say.  For other names the words and the unit of a header decide,
+and only where one column fits; what was decided is reported.  Where none or several fit, the
+option that decides is asked for.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import shlex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
+from piezo_ident.record.channels import channel_of_column, role_of
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
@@ -53,13 +55,14 @@ class RecordTable:
     Attributes
     ----------
     columns : dict of str to array, shape (n,)
-        By quantity: ``v``, ``y``, ``x_<name>``, and ``t`` unless `rate` is known.
+        By quantity: ``v``, ``y``, ``v_<name>``, ``y_<name>``, ``x_<name>``, and ``t`` unless
+        `rate` is known.
     names, starts : list of str, array_like
         Label of each stretch and the row at which it begins.
     ignored : tuple of str
         Columns that are not read.
     units : mapping of str to str
-        Units of ``t``, ``v`` and ``y`` where the file or an option names them.
+        Units of ``t``, ``v``, ``y``, and of further axes where the file or an option names them.
     rate : float, optional
         Samples a second, of a file without time.
     faults : tuple of Fault
@@ -96,7 +99,7 @@ class ChosenColumns:
 
 def is_wanted(name: str) -> bool:
     """Return whether a column of this name is read without asking."""
-    return re.fullmatch('t|v|y|x_.+', name) is not None
+    return name in ('t', 'v', 'y') or bool(channel_of_column(name))
 
 
 def listed(names: Iterable[str]) -> str:
@@ -134,6 +137,9 @@ def choose(
         When a quantity is missing or ambiguous; the message shows the option to give.
     """
     given = {role: _place(role, name, names, path) for role, name in options.named.items()}
+    for role in given:
+        if role not in ('t', 'v', 'y', 'segment') and not channel_of_column(role):
+            raise DataError(f'{path}: --columns {role}: {role[2:]} is a unit; name it otherwise')
     places = dict(given)
     rate, origin = options.rate, '--rate'
     if rate is not None:
@@ -162,6 +168,10 @@ def choose(
             groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
             fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
         if len(fitting) > 1:
+            # v [V] beside v_b [V]
+            bare = [i for i in fitting if _parts(names[i])[0] == role]
+            fitting = bare if len(bare) == 1 else fitting
+        if len(fitting) > 1:
             raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
         if fitting:
             guessed[role] = fitting[0]
@@ -173,11 +183,12 @@ def choose(
     if missing:
         raise _missing(missing, names, free, path)
     places |= guessed
-    for i in [i for i in free if names[i].startswith('x_') and len(names[i]) > 2]:
-        if names[i] in places:
-            raise DataError(f'{path}: column {names[i]} stands there twice; keep one of them')
-        places[names[i]] = i
+    _add_channels(places, free, names, path)
     units = {role: _unit_of(role, places, names, options, path) for role in 'tvy'}
+    for role in filter(role_of, places):
+        # a unit that the first axis has holds for the others
+        own = _unit_of(role, places, names, options, path)
+        units[role] = own or units[role_of(role)]
     used = set(places.values())
     faults = []
     if guessed or given or (rate is not None and options.rate is None):
@@ -193,6 +204,24 @@ def choose(
         rate,
         tuple(faults),
     )
+
+
+def _add_channels(
+    places: dict[str, int], free: Iterable[int], names: Sequence[str], path: Path
+) -> None:
+    """Add the columns of further axes, and further channels, to those that are chosen."""
+    # of several runs in groups, that of the first axis
+    group = next((_group(names[places[role]]) for role in 'vy' if role in places), '')
+    for i in free:
+        base = _parts(names[i])[0]
+        is_axis = role_of(base) and _group(names[i]) == group
+        role = base if is_axis else names[i]
+        if not channel_of_column(role):
+            continue
+        channels = [channel_of_column(place) for place in places]
+        if channel_of_column(role) in channels:
+            raise DataError(f'{path}: column {role} stands there twice; keep one of them')
+        places[role] = i
 
 
 def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
@@ -283,10 +312,11 @@ def _rate_of(scalars: Mapping[str, float]) -> tuple[float | None, str]:
 def _unit_of(
     role: str, places: Mapping[str, int], names: Sequence[str], options: ReadOptions, path: Path
 ) -> str:
+    own, role = role, role_of(role) or role
     given = options.unit(role)
-    if given or role not in places or names[places[role]] == role:
+    if given or own not in places or names[places[own]] == own:
         return given or ''
-    name = names[places[role]]
+    name = names[places[own]]
     _, unit = _parts(name)
     if unit and unit not in UNITS[role]:
         quantity = _QUANTITIES[role]

@@ -19,6 +19,7 @@ from piezo_ident.record.arrays import read_hdf5, read_mat, read_npz, read_parque
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
+from piezo_ident.record.channels import channel_of_column, column_of, role_of
 from piezo_ident.record.columns import RecordTable
 from piezo_ident.record.options import ReadOptions, UNITS
 from piezo_ident.record.record import Fault, Record
@@ -110,9 +111,12 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         reason = error.strerror or str(error)
         raise DataError(f'{path}: cannot be read ({reason}); check the file') from None
     columns = dict(table.columns)
-    for role in ('t', 'v'):
-        factor = UNITS[role].get(table.units.get(role, ''), 1.0)
-        if role in columns and factor != 1.0:
+    for role in columns:
+        factor = _factor(table, role)
+        if role_of(role) == 'y':
+            # the unit of y is met with y itself, for all displacements
+            factor /= _factor(table, 'y')
+        if role != 'y' and factor != 1.0:
             columns[role] = columns[role] / factor
     v, y = (columns.pop(role, None) for role in 'vy')
     n = next(x.size for x in (v, y) if x is not None)
@@ -122,7 +126,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         v,
         y,
         (table.names, table.starts),
-        {name[2:]: x for name, x in columns.items()},
+        {channel_of_column(name): x for name, x in columns.items()},
         name=str(path),
         options=replace(options, displacement_unit=table.units.get('y')),
         faults=[
@@ -131,6 +135,12 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         ],
     ).renamed(path.name)
     return replace(record, faults=(*record.faults, *_doubts(record, table)))
+
+
+def _factor(table: RecordTable, role: str) -> float:
+    """Return how many of a column's unit make one of SI; 1 where no unit is named."""
+    units: Mapping[str, float] = UNITS.get(role_of(role) or role, {})
+    return units.get(table.units.get(role, ''), 1.0)
 
 
 def _doubts(record: Record, table: RecordTable) -> Iterator[Fault]:
@@ -234,6 +244,8 @@ def _check_labels(record: Record, path: Path) -> None:
             raise DataError(
                 f'{path}: channel name {name!r} cannot be written; use letters, digits and _'
             )
+        if channel_of_column(column_of(name)) != name:
+            raise DataError(f'{path}: channel name {name!r} cannot be read back')
 
 
 def _losses(record: Record) -> tuple[str, ...]:

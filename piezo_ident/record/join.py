@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.assemble import assemble
+from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.ordering import at_times
@@ -32,8 +33,6 @@ Vector = NDArray[np.float64]
 #: equal times of two streams: first row of the one, first row of the other, how many rows
 Matches = list[tuple[int, int, int]]
 
-#: key of what the amplifier got, which carries the quantity voltage
-APPLIED = 'applied_voltage'
 #: commanded and applied voltage may differ by this share of the range
 TOLERANCE = 1e-3
 #: most of a segment by time, or of a further channel, that may be missing before it is not used
@@ -58,9 +57,10 @@ def record_of_streams(
     Parameters
     ----------
     streams : mapping of str to BlockStream
-        Those of ``voltage``, ``displacement``, ``x_<name>``, and ``applied_voltage``.  Where
-        command and applied voltage differ, the amplifier's guard was at work: the stage did not
-        get the command, so these samples are cut out.  An ``x_<name>`` that lacks more than
+        Those of ``voltage``, ``displacement``, ``x_<name>``, ``voltage_<name>``,
+        ``displacement_<name>``, and of each voltage ``applied_voltage``.  Where command and
+        applied voltage differ, the amplifier's guard was at work: the stage did not get the
+        command, so these samples are cut out.  A further axis or channel that lacks more than
         `MAX_MISSING` of the samples is left out.
     name : str
         What errors call the data, and the record's name.
@@ -76,23 +76,26 @@ def record_of_streams(
     sparse = {
         key: Fault('sparse_channel', f'{key}, {s.n} samples beside {n}', n - s.n, 'left out')
         for key, s in streams.items()
-        if key.startswith('x_') and s.n < (1.0 - MAX_MISSING) * n
+        if channel_of_quantity(key) and s.n < (1.0 - MAX_MISSING) * n
     }
-    needed = {key: s for key, s in streams.items() if key != APPLIED and key not in sparse}
+    needed = {
+        key: s for key, s in streams.items() if key not in sparse and not key.startswith(APPLIED)
+    }
+    guarded = {key: applied_key(key) for key in needed if applied_key(key) in streams}
     try:
-        joined = join(needed, {APPLIED: streams[APPLIED]} if APPLIED in streams else None)
+        joined = join(needed, {key: streams[key] for key in guarded.values()})
     except DataError as error:
         raise DataError(f'{name}: {error}') from None
     met = [*faults, *sparse.values(), *joined.faults]
-    if APPLIED in joined.columns:
-        joined = _without_guarded(joined, name, met)
+    for key in guarded:
+        joined = _without_guarded(joined, key, name, met)
     columns = dict(joined.columns)
     return assemble(
         joined.t,
         columns.pop('voltage'),
         columns.pop('displacement'),
         joined.segments,
-        {key[2:]: x for key, x in columns.items()},
+        {channel_of_quantity(key): x for key, x in columns.items()},
         name=name,
         options=options,
         sample_rate=sample_rate,
@@ -110,10 +113,10 @@ class Joined:
     faults: tuple[Fault, ...]
 
 
-def _without_guarded(joined: Joined, name: str, met: list[Fault]) -> Joined:
+def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> Joined:
     """Cut out the samples at which another voltage was applied than commanded."""
     columns = dict(joined.columns)
-    v, applied, t = columns['voltage'], columns.pop(APPLIED), joined.t
+    v, applied, t = columns[key], columns.pop(applied_key(key)), joined.t
     if np.array_equal(v, applied):
         return replace(joined, columns=columns)
     unknown = np.isnan(applied)

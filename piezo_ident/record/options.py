@@ -44,8 +44,9 @@ class ReadOptions:
     displacement_alone : bool, optional
         Take a table without voltage, as of a motion that is wanted; the voltage is then NaN.
     columns : mapping of str to str, or str, optional
-        Name or number (from 1) of the columns ``t``, ``v``, ``y``, ``segment`` and ``x_<name>``;
-        those left out are taken by the header.  Also as text, ``'t=time_s,v=voltage'``.
+        Name or number (from 1) of the columns ``t``, ``v``, ``y``, ``segment``, ``v_<name>`` and
+        ``y_<name>`` of further axes, and ``x_<name>``; those left out are taken by the header.
+        Also as text, ``'t=time_s,v=voltage'``.
     rate : float, optional
         Samples a second [Hz]; the time of sample k is then k / rate, and no column is read.
     time_unit : {'s', 'ms', 'us', 'ns', 'min'}, optional
@@ -88,10 +89,10 @@ class ReadOptions:
         if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
             raise DataError(f'a rate of {self.rate:g} Hz; give the samples a second, as in 20e3')
         for role, name in self.named.items():
-            if not re.fullmatch(r't|v|y|segment|x_\w{1,60}', role, re.ASCII):
+            if not re.fullmatch(r't|v|y|segment|[vyx]_\w{1,60}', role, re.ASCII):
                 raise DataError(
-                    f'columns: {role!r} is no quantity; use t, v, y, segment or x_NAME, as in '
-                    '--columns t=time_s,v=voltage,y=position_um'
+                    f'columns: {role!r} is no quantity; use t, v, y, segment, v_NAME, y_NAME '
+                    'or x_NAME, as in --columns t=time_s,v=voltage,y=position_um'
                 )
             if not name.strip():
                 raise DataError(f'columns: {role} needs the name of a column, or its number')

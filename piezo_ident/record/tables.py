@@ -4,8 +4,8 @@
 """
 Records as columns by name, and the writers of NumPy's npz and MATLAB's mat.
 
-``x_<name>`` are further channels.  npz and mat carry ``segment_name`` and ``segment_start``, the
-sample (counted from 0) at which each segment begins.
+``v_<name>`` and ``y_<name>`` are further axes, ``x_<name>`` further channels.  npz and mat carry
+``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment begins.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import zipfile
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.record.channels import column_of
 from piezo_ident.record.record import Record
 
 __all__ = ['ROWS', 'Blocks', 'blocks_of', 'labels_of', 'write_mat', 'write_npz']
@@ -41,7 +42,7 @@ def blocks_of(record: Record, **further: Sequence[Vector]) -> Blocks:
             if further:
                 columns |= {name: parts[i] for name, parts in further.items()}
             else:
-                columns |= {f'x_{name}': x for name, x in piece.channels.items()}
+                columns |= {column_of(name): x for name, x in piece.channels.items()}
             for a in range(0, piece.n, ROWS):
                 cut = slice(a, min(a + ROWS, piece.n))
                 yield {'t': piece.time(cut.start, cut.stop)} | {

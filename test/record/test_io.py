@@ -34,7 +34,8 @@ def records(draw) -> Record:
     pieces = []
     rate = draw(st.sampled_from([1000.0, 20000.0, 2048.0, 1 / 3e-4]))
     tick = draw(st.integers(-1000, 10**6))
-    channels = draw(st.sets(st.sampled_from(['temperature', 'v2', 'T_1']), max_size=2))
+    names = st.sampled_from(['temperature', 'v2', 'T_1', 'v_b', 'y_b'])
+    channels = draw(st.sets(names, max_size=3))
     for i in range(draw(st.integers(1, 3))):
         n = draw(st.integers(10, 250))
         # equal pieces would be taken for repeated rows

@@ -15,7 +15,7 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.nodes.identifier.excitation_client import Streams
 from piezo_ident.nodes.subscriptions import BlockSubscriptions
 from piezo_ident.nodes.wire import from_message
-from piezo_ident.record.join import APPLIED
+from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
@@ -34,7 +34,7 @@ class Inputs:
     node : Node
     capture : Capture
     channels : sequence of str
-        Topics of further channels.
+        Topics of further axes and channels.
 
     Attributes
     ----------
@@ -51,6 +51,9 @@ class Inputs:
             self._subscriptions.add(key, key)
         for topic in channels:
             self._subscriptions.add(topic, '')
+            home, _, base = topic.rpartition('/')
+            if applied := applied_key(base):
+                self._subscriptions.add(f'{home}/{applied}' if home else applied, applied)
 
     def drain(self, *, hold: bool) -> None:
         """Capture what has come, or keep it for later."""
@@ -63,11 +66,12 @@ class Inputs:
     ) -> None:
         try:
             samples = from_message(message)
-            known = (*_CARRIED[key], key) if key else ()
+            known = (*_CARRIED.get(key, (key.removeprefix('applied_'),)), key) if key else ()
             quantity = samples.quantity
-            # a further channel names itself
-            if quantity not in known and (key or not quantity.startswith('x_')):
-                wanted = key or 'x_<name>'
+            # a further axis or channel names itself
+            if quantity not in known and (key or not channel_of_quantity(quantity)):
+                base = topic.rpartition('/')[2]
+                wanted = key or (base if channel_of_quantity(base) else 'x_<name>')
                 raise DataError(f"layout says 't,{quantity}', not 't,{wanted}'")
         except DataError as error:
             self._capture.unreadable(topic, str(error))
@@ -80,9 +84,10 @@ class Inputs:
         """Return what the client of the excitation follows."""
         c = self._capture
         answered = c.last_time('displacement')
-        if APPLIED in c.keys:
-            # the stage sends both, one after the other: a run ends with the later one
-            answered = min(answered, c.last_time(APPLIED))
+        for key in c.keys:
+            # the stage sends all of them, one after the other: a run ends with the last one
+            if key.startswith((APPLIED, 'displacement_')):
+                answered = min(answered, c.last_time(key))
         return Streams(
             self.passed['voltage'],
             c.last_time('voltage'),
@@ -94,4 +99,5 @@ class Inputs:
     def unpublished(self) -> str:
         """Topics without a publisher: before it is met, what it sends is lost."""
         topics = self._subscriptions.unpublished
-        return ', '.join(t for t in topics if t not in ('voltage', APPLIED))
+        driven = ('voltage', APPLIED)
+        return ', '.join(t for t in topics if not t.rpartition('/')[2].startswith(driven))

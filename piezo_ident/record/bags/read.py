@@ -29,6 +29,7 @@ from piezo_ident.record.bags.recover import (
     Stored,
 )
 from piezo_ident.record.blocks import decode, quantity_of, Samples
+from piezo_ident.record.channels import applied_key, channel_of_quantity
 from piezo_ident.record.join import APPLIED, record_of_streams
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
@@ -224,7 +225,10 @@ def _choose(
     if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
         chosen[APPLIED] = applied
     for topic, quantity in sorted(carried.items(), key=lambda item: item[::-1]):
-        if quantity.startswith('x_') and topic.startswith(home):
+        if channel_of_quantity(quantity) and topic.startswith(home):
+            if topic == f'{home}{applied_key(quantity)}':
+                chosen[applied_key(quantity)] = topic
+                continue
             if quantity in chosen:
                 raise DataError(
                     f'{path}: {chosen[quantity]} and {topic} both carry {quantity}; '

@@ -23,6 +23,7 @@ from piezo_ident.common.files import temporary_output, unwritable
 from piezo_ident.record.bags.jazzy import JazzyWriter
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
+from piezo_ident.record.channels import quantity_of_channel
 from piezo_ident.record.record import Record
 from rosbags.interfaces import (
     Connection,
@@ -343,12 +344,12 @@ def write_bag(
 
 def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
     quantities = ['voltage', 'displacement']
-    quantities += dict.fromkeys(f'x_{name}' for p in record for name in p.channels)
+    quantities += dict.fromkeys(quantity_of_channel(k) for p in record for k in p.channels)
     senders = {q: _sender(writer, q) for q in quantities}
     shift, latest = 0, 0.0
     for piece in record:
         columns = {'voltage': piece.v, 'displacement': piece.y}
-        columns |= {f'x_{name}': x for name, x in piece.channels.items()}
+        columns |= {quantity_of_channel(k): x for k, x in piece.channels.items()}
         first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
         # later by whole seconds, until nothing is before what was written already
         while first + shift < latest:

@@ -1,0 +1,210 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What a stage of several axes adds to a record, and under which name each format carries it.
+
+The first axis is ``v`` and ``y``, as of any stage.  The voltage and the displacement of another
+one are the channels ``v_<name>`` and ``y_<name>``; whatever looks at one axis takes them for
+further channels.
+
+| channel | column of a table | topic, and quantity of its blocks |
+|---|---|---|
+| ``v_<name>`` | ``v_<name>`` | ``voltage_<name>`` |
+| ``y_<name>`` | ``y_<name>`` | ``displacement_<name>`` |
+| any other | ``x_<channel>`` | ``x_<channel>`` |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.options import plain_unit, UNITS
+from piezo_ident.record.record import Piece, Record
+
+__all__ = [
+    'APPLIED',
+    'Axes',
+    'applied_key',
+    'channel_of_column',
+    'channel_of_quantity',
+    'column_of',
+    'quantity_of_channel',
+    'role_of',
+]
+
+#: what the amplifier of the first axis got; of another one with its name behind it
+APPLIED = 'applied_voltage'
+_QUANTITIES = {'v': 'voltage', 'y': 'displacement'}
+_AXIS = re.compile(r'([vy])_(\w{1,60})', re.ASCII)
+
+
+def role_of(channel: str) -> str:
+    """
+    Return what a channel is of another axis: ``v``, ``y``, or nothing.
+
+    A unit is no name of an axis.
+
+    >>> [role_of(x) for x in ('v_b', 'y_tilt', 'temperature', 'y_um', 'v')]
+    ['v', 'y', '', '', '']
+    """
+    found = _AXIS.fullmatch(channel)
+    if found is None:
+        return ''
+    unit = plain_unit(found[2])
+    is_unit = unit != 'min' and any(unit in units for units in UNITS.values())
+    return '' if is_unit else found[1]
+
+
+def column_of(channel: str) -> str:
+    """Return the name of a channel's column."""
+    return channel if role_of(channel) else f'x_{channel}'
+
+
+def channel_of_column(column: str) -> str:
+    """
+    Return the channel in a column, empty for a column that is none.
+
+    >>> [channel_of_column(x) for x in ('v_b', 'x_heat', 'v', 'offset')]
+    ['v_b', 'heat', '', '']
+    """
+    if role_of(column):
+        return column
+    return column[2:] if column.startswith('x_') else ''
+
+
+def quantity_of_channel(channel: str) -> str:
+    """
+    Return what the blocks of a channel are called, which is the name of their topic too.
+
+    >>> [quantity_of_channel(x) for x in ('v_b', 'y_b', 'heat')]
+    ['voltage_b', 'displacement_b', 'x_heat']
+    """
+    role = role_of(channel)
+    return f'{_QUANTITIES[role]}_{channel[2:]}' if role else f'x_{channel}'
+
+
+def channel_of_quantity(quantity: str) -> str:
+    """
+    Return the channel that blocks carry, empty where they carry none.
+
+    >>> [channel_of_quantity(x) for x in ('voltage_b', 'x_heat', 'voltage', 'prediction')]
+    ['v_b', 'heat', '', '']
+    """
+    for role, name in _QUANTITIES.items():
+        if quantity.startswith(f'{name}_'):
+            return channel_of_column(f'{role}{quantity[len(name) :]}')
+    return quantity[2:] if quantity.startswith('x_') else ''
+
+
+def applied_key(quantity: str) -> str:
+    """
+    Return the topic with what the amplifier made of a voltage, empty for what is no voltage.
+
+    >>> [applied_key(x) for x in ('voltage', 'voltage_b', 'displacement', 'x_heat')]
+    ['applied_voltage', 'applied_voltage_b', '', '']
+    """
+    is_voltage = quantity == 'voltage' or role_of(channel_of_quantity(quantity)) == 'v'
+    return f'applied_{quantity}' if is_voltage else ''
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """
+    A piece of a record as several inputs and outputs.
+
+    Attributes
+    ----------
+    inputs : ndarray, shape (n, m)
+        Command voltages [V].
+    outputs : ndarray, shape (n, p)
+        Displacements [m].
+    input_names, output_names : tuple of str
+        The columns that they are: the first axis before the others, these by their names.
+    sample_rate : float
+        [Hz]
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> x = np.random.default_rng(0).normal(size=(2, 100))
+    >>> record = pi.Record.from_arrays(
+    ...     x[0], 1e-6 * x[0], sample_rate=1000, channels={'v_b': x[1], 'y_b': 1e-6 * x[1]}
+    ... )
+    >>> axes = pi.Axes.of(record.pieces[0])
+    >>> axes.input_names, axes.output_names, axes.outputs.shape
+    (('v', 'v_b'), ('y', 'y_b'), (100, 2))
+    """
+
+    inputs: NDArray[np.float64]
+    outputs: NDArray[np.float64]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    sample_rate: float
+
+    @classmethod
+    def of(cls, piece: Piece) -> Axes:
+        """
+        Return the axes of a piece; a piece with one axis gives one column each.
+
+        Inputs and outputs may differ in number.
+
+        Raises
+        ------
+        DataError
+            Where a voltage or a displacement is not known.
+        """
+        columns = {'v': piece.v, 'y': piece.y, **piece.channels}
+        names = {
+            role: (role, *sorted(k for k in piece.channels if role_of(k) == role)) for role in 'vy'
+        }
+        for name in (*names['v'], *names['y']):
+            if not np.isfinite(columns[name]).all():
+                what = _QUANTITIES[name[0]]
+                raise DataError(f'{name}: the {what} is not known at every sample; record it too')
+        inputs, outputs = (
+            frozen_array(np.column_stack([columns[k] for k in names[role]])) for role in 'vy'
+        )
+        return cls(inputs, outputs, names['v'], names['y'], piece.sample_rate)
+
+    @classmethod
+    def of_records(cls, records: Iterable[Record]) -> list[Axes]:
+        """
+        Return the axes of every piece of some records of one stage.
+
+        Raises
+        ------
+        DataError
+            Where the pieces do not carry the same axes, or are not sampled alike.
+        """
+        found: list[Axes] = []
+        for record in records:
+            for piece in record:
+                try:
+                    axes = cls.of(piece)
+                except DataError as error:
+                    raise DataError(f'{record.name}: {error}') from None
+                found.append(axes)
+                first = found[0]
+                if axes._names != first._names:
+                    raise DataError(
+                        f'{record.name}: has {", ".join(axes._names)}, and another record or '
+                        f'piece {", ".join(first._names)}; give records of the same axes'
+                    )
+                if abs(axes.sample_rate / first.sample_rate - 1.0) > 1e-9:
+                    raise DataError(
+                        f'{record.name}: sampled at {axes.sample_rate:g} Hz, and another record '
+                        f'or piece at {first.sample_rate:g} Hz; give records of one rate'
+                    )
+        return found
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return (*self.input_names, *self.output_names)
