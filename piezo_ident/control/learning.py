@@ -9,7 +9,8 @@ Iterative learning: the same motion again, corrected by what was measured before
 F is a low-pass without phase: where the model is not known, above the lowest mode that rings, a
 correction may do harm.  What repeats from run to run falls by the share to which the model is
 right; noise does not, so the best run is kept and learning ends where the error falls no more.
-After a run that was worse, the step s from the best one is half as large.
+After a run that was worse, the step s from the best one is half as large.  Where the error falls
+slowly, what is left lies above the corner of F, which then grows until it harms.
 D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
 Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 """
@@ -39,6 +40,8 @@ WORTH = 0.95
 SMALLEST = 0.2
 #: corner of F, in parts of the lowest mode that rings, and of the sampling rate
 OF_MODE, OF_RATE = 0.7, 0.1
+#: share of the error that a run leaves where the corner holds it up, and by what it then grows
+SLOW, WIDER = 0.5, 2.0
 #: damping below which a mode rings
 RINGS = 0.2
 
@@ -81,7 +84,8 @@ class Learning:
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     corner : float, optional
-        Of F [Hz]; below the lowest mode of the model when absent.
+        Of F [Hz]; when absent, it begins below the lowest mode of the model and grows where the
+        error falls slowly.
 
     Attributes
     ----------
@@ -139,13 +143,14 @@ class Learning:
         self._model_span = abs(model.scaling.Y)
         self._span = float(np.ptp(self._wanted)) or self._model_span
         self.repetitions: list[Repetition] = []
-        self._step, self._correction = 1.0, np.zeros_like(self._wanted)
+        self._step, self._missed = 1.0, np.zeros_like(self._wanted)
         modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
         lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
         self.corner = min(lowest, OF_RATE * model.sample_rate) if corner is None else corner
         if not 0.0 < self.corner < math.inf:
             raise DataError(f'learning: a corner of {corner} Hz; give one above zero')
         self._rate = model.sample_rate
+        self._may_widen, self._is_wider = corner is None, False
 
     @property
     def best(self) -> Repetition:
@@ -197,12 +202,21 @@ class Learning:
         self.repetitions.append(Repetition(drive, y, error))
         if error <= self.best.error:
             # what is out of reach would grow from run to run
-            e = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
-            correction = smoothed(e, self.corner, self._rate)
-            self._best_reference, self._correction = self._reference, correction
+            self._missed = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
+            self._best_reference = self._reference
+            before = [r.error for r in self.repetitions[:-1]]
+            self._is_wider = self._may_widen and bool(before) and error > SLOW * min(before)
+            self._is_wider &= WIDER * self.corner <= OF_RATE * self._rate
+            if self._is_wider:
+                # what is left lies above the corner
+                self.corner *= WIDER
+        elif self._is_wider:
+            self.corner /= WIDER
+            self._may_widen = self._is_wider = False
         else:
             self._step *= 0.5
-        self._reference = self._best_reference + self._step * self._correction
+        correction = smoothed(self._missed, self.corner, self._rate)
+        self._reference = self._best_reference + self._step * correction
         # no other voltage of the same motion: another one errs elsewhere
         self.drive = self._invert(self._reference, like=self.best.drive)
         return error

@@ -95,6 +95,20 @@ def test_a_mode_that_is_somewhere_else_does_no_harm(off):
         assert errors[2] < left < 0.2 * errors[0]
 
 
+def test_the_corner_grows_where_it_holds_the_error_up():
+    w = 2 * np.pi * 50.0 / FS
+    poles = np.exp(w * np.array([-0.01 + 1j, -0.01 - 1j]))
+    model = replace(PAPER, dynamics=Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised())
+    bent = (EffectSetting('sensor_nonlinearity', {'square': 0.02}),)
+    stage = replace(model, effects=bent)
+    learning, kept = pi.Learning(model, RASTER), pi.Learning(model, RASTER, corner=35.0)
+    for _ in range(4):
+        learning.take(stage.simulate(learning.drive.v))
+        kept.take(stage.simulate(kept.drive.v))
+    assert kept.corner == 35.0 < learning.corner
+    assert learning.best.error < 0.6 * kept.best.error
+
+
 def test_what_drifts_ends_it_and_the_best_stays():
     stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning = pi.Learning(PAPER, RASTER)
