@@ -28,11 +28,12 @@ def linear_stage():
 def loop_stage(*, softening=0.04, plays=0.08):
     """Return a stage whose first two signals soften and whose others are hysteretic."""
     linear = linear_stage()
-    # the extension of each actuator, near 1 under voltages of rms 1
+    # the extension of each actuator, of rms 1 under voltages of rms 1
     gain = np.linalg.inv(linear.response(np.ones(1, complex))[0].real)
-    f, g = gain @ linear.c, gain @ linear.d
+    size = np.array([2.7, 3.9])
+    f, g = (gain @ x / size[:, None] for x in (linear.c, linear.d))
     e, h = np.hstack([linear.b] * 2), np.hstack([linear.d] * 2)
-    pushes = np.array([softening] * 2 + [plays] * 2)
+    pushes = np.concatenate([softening * size, plays * size])
     return LoopModel(
         linear,
         e * pushes,
@@ -41,7 +42,7 @@ def loop_stage(*, softening=0.04, plays=0.08):
         np.vstack([g, g]),
         2,
         np.array([[0.0, 0.0]] * 2 + [[0.4, 0.6]] * 2),
-        np.array([0.4, 1.2]),
+        np.array([0.4, 1.0]),
         memory=100.0,
     )
 

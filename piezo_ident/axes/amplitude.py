@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+How the modes of a stage change with the amplitude: frequency and damping, group by group.
+
+One modal model is refined on the response of each group, so a mode keeps its place and can be
+followed from amplitude to amplitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.axes.explain import groups
+from piezo_ident.axes.frequency_response import frequency_response
+from piezo_ident.axes.linear_fit import refined
+from piezo_ident.axes.modal import Modal
+from piezo_ident.axes.periodic import PeriodicRecord
+
+__all__ = ['AmplitudeDependence', 'amplitude_dependence']
+
+#: poles nearer than this part of their frequency are one mode to the eye: neither is followed
+APART = 0.012
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeDependence:
+    """
+    Modes by group.
+
+    Attributes
+    ----------
+    groups : tuple of str
+    voltage : ndarray, shape (groups,)
+        rms of the voltages.
+    frequency, damping : ndarray, shape (groups, modes)
+        In Hz, and as a ratio.
+    models : tuple of Modal
+        Of each group.
+    """
+
+    groups: tuple[str, ...]
+    voltage: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    models: tuple[Modal, ...]
+
+    def slope(self) -> NDArray[np.float64]:
+        """Return the change of each frequency per volt of rms, in Hz/V."""
+        if len(self.voltage) < 2:
+            return np.full(self.frequency.shape[1], np.nan)
+        return np.asarray(np.polyfit(self.voltage, self.frequency, 1)[0])
+
+
+def amplitude_dependence(
+    start: Modal,
+    records: Sequence[PeriodicRecord],
+    *,
+    count: int = 6,
+    iterations: int = 8,
+) -> AmplitudeDependence:
+    """
+    Follow the strongest modes of a model through the groups of records.
+
+    Parameters
+    ----------
+    start : Modal
+        A model of any of the groups.
+    count : int
+        Modes to follow: those whose response is largest and that stand alone.
+    """
+    parts = groups(records)
+    rate = records[0].rate
+    models = tuple(
+        refined(start, frequency_response(part), iterations=iterations) for part in parts.values()
+    )
+    places = _strongest(start, rate, count)
+    frequency, damping = [], []
+    for model in models:
+        s = _poles(model, rate)[places]
+        frequency.append(np.abs(s) / (2 * np.pi))
+        damping.append(-s.real / np.abs(s))
+    return AmplitudeDependence(
+        tuple(parts),
+        np.array([np.sqrt(np.mean([np.mean(r.u**2) for r in part])) for part in parts.values()]),
+        np.array(frequency),
+        np.array(damping),
+        models,
+    )
+
+
+def _poles(model: Modal, rate: float) -> NDArray[np.complex128]:
+    """Return s of each block, in 1/s."""
+    return np.asarray(np.log(model.blocks[:, 0, 0] + 1j * model.blocks[:, 0, 1]) * rate)
+
+
+def _strongest(model: Modal, rate: float, count: int) -> NDArray[np.intp]:
+    """Return the blocks of the modes with the largest peaks, by frequency."""
+    s = _poles(model, rate)
+    size = np.linalg.norm(model.b.reshape(len(s), -1), axis=1) * np.sqrt(
+        (model.c**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
+    )
+    peak = np.where(model.oscillates, size / np.abs(s.real), 0)
+    alone = [
+        np.min(np.abs(np.delete(s.imag, i) / s.imag[i] - 1), initial=1.0) > APART
+        for i in range(len(s))
+    ]
+    peak = np.where(alone, peak, 0)
+    chosen = np.argsort(-peak)[: min(count, int((peak > 0).sum()))]
+    return np.asarray(chosen[np.argsort(s.imag[chosen])])

@@ -1,0 +1,238 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Which effect a linear stage of several axes lacks, named by data that no fit has seen.
+
+Each candidate is one model for all amplitudes, fitted in free run to the records taught, and
+judged in free run on those held out:
+
+- ``linear``: nothing else;
+- ``input_hysteresis``: plays of the voltages in front of a second path;
+- ``loop_hysteresis``: plays of the actuators' extension inside the loop;
+- ``softening``: stiffness that follows the level of the extension, without plays;
+- ``hysteretic_stiffness``: softening, and plays of extension and voltage inside the loop.
+
+A rival that is none of them, ``changed_dynamics``, is a linear model for each amplitude: it knows
+the amplitude beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import time
+
+import numpy as np
+from piezo_ident.axes.frequency_response import frequency_response
+from piezo_ident.axes.linear_fit import refined
+from piezo_ident.axes.loop_fit import loop_fit
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.modal import Modal
+from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.axes.signals import with_input_plays, with_loop_plays, with_softening
+from piezo_ident.common.errors import DataError
+
+__all__ = ['Candidate', 'Explanation', 'Score', 'explain', 'groups', 'scores']
+
+#: a candidate is preferred to simpler ones where it takes at least this part of their error
+WORTH = 0.1
+#: simplest first
+SINGLE = ('linear', 'input_hysteresis', 'loop_hysteresis', 'softening', 'hysteretic_stiffness')
+
+
+@dataclass(frozen=True)
+class Score:
+    """
+    Free-run error over the last period, in steady state, counted in two ways.
+
+    Attributes
+    ----------
+    pooled : float
+        100 rms(y - yhat) / rms(y) over all outputs and records.
+    mean : float
+        Mean of 100 rms(y - yhat) / rms(y) of each output and record.
+    """
+
+    pooled: float
+    mean: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """
+    One explanation.
+
+    Attributes
+    ----------
+    models : dict
+        By group of records; the same model for all, but for ``changed_dynamics``.
+    scores : dict
+        On the records held out, by group.
+    """
+
+    name: str
+    models: dict[str, LoopModel]
+    scores: dict[str, Score]
+    seconds: float
+
+    @property
+    def error(self) -> float:
+        """Quadratic mean of the pooled errors of the groups in %."""
+        return float(np.sqrt(np.mean([s.pooled**2 for s in self.scores.values()])))
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The candidates, and which of them is named."""
+
+    candidates: tuple[Candidate, ...]
+
+    def __getitem__(self, name: str) -> Candidate:
+        return next(c for c in self.candidates if c.name == name)
+
+    @property
+    def name(self) -> str:
+        """Name of the simplest single model that no other beats by much."""
+        errors = {name: self[name].error for name in SINGLE}
+        limit = min(errors.values()) / (1 - WORTH)
+        return next(name for name in SINGLE if errors[name] <= limit)
+
+    @property
+    def model(self) -> LoopModel:
+        """The model of what is named."""
+        return next(iter(self[self.name].models.values()))
+
+
+def groups(records: Sequence[PeriodicRecord]) -> dict[str, list[PeriodicRecord]]:
+    """Return the records by group, in the order in which the groups appear."""
+    found: dict[str, list[PeriodicRecord]] = {}
+    for record in records:
+        found.setdefault(record.group, []).append(record)
+    return found
+
+
+def scores(models: dict[str, LoopModel], records: Sequence[PeriodicRecord]) -> dict[str, Score]:
+    """Judge the model of each group on its records."""
+    found = {}
+    for group, members in groups(records).items():
+        errors, powers = [], []
+        for record in members:
+            errors.append(np.mean(models[group].error(record) ** 2, axis=0))
+            powers.append(np.mean(record.y[-1] ** 2, axis=0))
+        found[group] = Score(
+            100 * float(np.sqrt(np.sum(errors) / np.sum(powers))),
+            100 * float(np.mean(np.sqrt(np.array(errors) / np.array(powers)))),
+        )
+    return found
+
+
+def explain(
+    linear: Modal,
+    taught: Sequence[PeriodicRecord],
+    held_out: Sequence[PeriodicRecord],
+    *,
+    weights: Sequence[float] | None = None,
+    few: int = 2,
+    iterations: int = 10,
+    warm_up: int = 1024,
+    memory: float = 300.0,
+    report: Callable[[str], None] = lambda text: None,
+) -> Explanation:
+    """
+    Fit every candidate, and judge all on the records held out.
+
+    Parameters
+    ----------
+    linear : Modal
+        Start: the stage at the middle amplitude.
+    weights : sequence of float, optional
+        Of the records taught, see `piezo_ident.axes.periodic.periodicity`.
+    few : int
+        Candidates grow on so many records a group, those of the largest weight; the last steps
+        of ``hysteretic_stiffness`` are fitted to all.
+    iterations : int
+        Steps a candidate, or a part of ``hysteretic_stiffness``.
+    memory : float
+        Time constant of the level of the softening in samples.
+    report : callable
+        Called with a line for each candidate.
+    """
+    weights = [1.0] * len(taught) if weights is None else list(weights)
+    if not set(groups(held_out)) <= set(groups(taught)):
+        raise DataError('records of a group were held out of which none was taught')
+    by_group: dict[str, list[tuple[float, PeriodicRecord]]] = {}
+    for record, weight in zip(taught, weights, strict=True):
+        by_group.setdefault(record.group, []).append((weight, record))
+    chosen = [
+        pair
+        for members in by_group.values()
+        for pair in sorted(members, key=lambda pair: -pair[0])[:few]
+    ]
+    small = [record for _, record in chosen]
+    small_weights = [weight for weight, _ in chosen]
+    found: list[Candidate] = []
+
+    def judged(name: str, models: dict[str, LoopModel], since: float) -> None:
+        candidate = Candidate(name, models, scores(models, held_out), time.monotonic() - since)
+        found.append(candidate)
+        pooled = ' / '.join(f'{s.pooled:.2f}' for s in candidate.scores.values())
+        report(f'{name}: {pooled} % ({candidate.seconds:.0f} s)')
+
+    def grown(model: LoopModel, steps: int, *, still: Sequence[int] = ()) -> LoopModel:
+        """Fit how new signals push first, then what they are."""
+        for hold, many in ((('f', 'g', 'mu'), 2), ((), steps)):
+            model = loop_fit(
+                model,
+                small,
+                weights=small_weights,
+                hold=hold,
+                still=still,
+                iterations=many,
+                warm_up=warm_up,
+            ).model
+        return model
+
+    def everywhere(model: LoopModel) -> dict[str, LoopModel]:
+        return dict.fromkeys(by_group, model)
+
+    plain = LoopModel.of(linear)
+    middle = _middle(small)
+
+    since = time.monotonic()
+    one = loop_fit(plain, small, weights=small_weights, iterations=iterations // 2).model
+    judged('linear', everywhere(one), since)
+
+    since = time.monotonic()
+    each = {}
+    for group, members in groups(taught).items():
+        good = [r for r in members if weights[taught.index(r)] == 1] or members
+        own = refined(linear, frequency_response(good), iterations=iterations)
+        each[group] = LoopModel.of(own)
+    judged('changed_dynamics', each, since)
+
+    since = time.monotonic()
+    signals = range(plain.linear.b.shape[1])
+    model = grown(with_input_plays(plain, middle), iterations // 2, still=signals)
+    judged('input_hysteresis', everywhere(model), since)
+
+    since = time.monotonic()
+    judged('loop_hysteresis', everywhere(grown(with_loop_plays(plain, middle), iterations)), since)
+
+    since = time.monotonic()
+    model = grown(with_softening(plain, small, memory=memory), iterations)
+    judged('softening', everywhere(model), since)
+
+    model = grown(with_loop_plays(model, middle), iterations)
+    model = grown(with_input_plays(model, middle), iterations)
+    model = loop_fit(
+        model, taught, weights=weights, iterations=max(1, iterations // 3), warm_up=warm_up
+    ).model
+    judged('hysteretic_stiffness', everywhere(model), since)
+    return Explanation(tuple(found))
+
+
+def _middle(records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:
+    """Return the records of the group of the middle voltage."""
+    parts = sorted(groups(records).values(), key=lambda part: float(np.mean(part[0].u ** 2)))
+    return parts[len(parts) // 2]

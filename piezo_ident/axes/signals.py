@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Signals inside the loop that a model may gain: softening, plays in the mechanics, plays of inputs.
+
+A signal begins as something that can be named, the extension of the actuators G(0)^-1 y or their
+voltages, of rms 1 over the records it is made for; a fit then mixes motion and voltage anew.  It
+begins without effect: E and H are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.common.errors import ModelError
+
+__all__ = ['THRESHOLDS', 'with_input_plays', 'with_loop_plays', 'with_softening']
+
+#: of the plays, in units of the rms of their signals
+THRESHOLDS = (0.05, 0.15, 0.4, 1.0, 2.0)
+#: how far the level may leave what was measured before its softening stays
+MARGIN = (0.6, 1.4)
+
+
+def with_softening(
+    model: LoopModel, records: Sequence[PeriodicRecord], *, memory: float = 300.0
+) -> LoopModel:
+    """
+    Let the extensions of the actuators soften the stage by their level.
+
+    Parameters
+    ----------
+    records : sequence of PeriodicRecord
+        The level s is 1 at the middle one of their amplitudes.
+    memory : float
+        Time constant of the level in samples.
+    """
+    if model.signals:
+        raise ModelError('softening comes before the plays')
+    loudness = np.array([np.sqrt(np.mean(r.u**2)) for r in records])
+    middle = loudness[np.abs(loudness - np.median(loudness)).argmin()]
+    at = [r for r, x in zip(records, loudness, strict=True) if abs(x - middle) < 0.05 * middle]
+    new = _with(model, *_extension(model), at, THRESHOLDS, plays=False)
+    low, high = MARGIN[0] * loudness.min() / middle, MARGIN[1] * loudness.max() / middle
+    return replace(new, levels=new.signals, memory=memory, range=(float(low), float(high)))
+
+
+def with_loop_plays(
+    model: LoopModel,
+    records: Sequence[PeriodicRecord],
+    thresholds: Sequence[float] = THRESHOLDS,
+) -> LoopModel:
+    """Add plays of the extensions of the actuators: hysteresis inside the mechanics."""
+    return _with(model, *_extension(model), records, thresholds)
+
+
+def with_input_plays(
+    model: LoopModel,
+    records: Sequence[PeriodicRecord],
+    thresholds: Sequence[float] = THRESHOLDS,
+) -> LoopModel:
+    """Add plays of the voltages."""
+    inputs = model.linear.b.shape[1]
+    f, g = np.zeros((inputs, model.linear.order)), np.eye(inputs)
+    return _with(model, f, g, records, thresholds)
+
+
+def _extension(model: LoopModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return F and G of G(0)^-1 y: what the outputs would take of the inputs at rest."""
+    gain = model.linear.response(np.ones(1, complex))[0].real
+    back = np.linalg.pinv(gain)
+    return back @ model.linear.c, back @ model.linear.d
+
+
+def _with(
+    model: LoopModel,
+    f: NDArray[np.float64],
+    g: NDArray[np.float64],
+    records: Sequence[PeriodicRecord],
+    thresholds: Sequence[float],
+    *,
+    plays: bool = True,
+) -> LoopModel:
+    squares = []
+    for record in records:
+        u = record.mean_u
+        z = model.run(np.concatenate([u, u])).x[len(u) :] @ f.T + u @ g.T
+        squares.append(z.var(axis=0))
+    size = np.sqrt(np.mean(squares, axis=0))[:, None]
+    r = np.asarray(thresholds, dtype=float)
+    if model.signals > model.levels and not np.array_equal(model.r, r):
+        raise ModelError(f'the plays share their thresholds, {model.r.tolist()}')
+    # each play as if the thresholds were spread evenly, as Rayleigh's law has it
+    weights = np.diff(r, prepend=0.0) if plays else np.zeros(len(r))
+    old = np.zeros((model.signals, len(r)))
+    if model.signals > model.levels:
+        old = model.mu
+    order, outputs = model.linear.order, len(model.linear.c)
+    many = len(f)
+    return replace(
+        model,
+        e=np.hstack([model.e, np.zeros((order, many))]),
+        h=np.hstack([model.h, np.zeros((outputs, many))]),
+        f=np.vstack([model.f, f / size]),
+        g=np.vstack([model.g, g / size]),
+        mu=np.vstack([old, np.tile(weights, (many, 1))]),
+        r=r,
+    )
