@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from piezo_ident.model.free_run import free_run, FreeRun
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
+    from piezo_ident.model.two_axis_stage import TwoAxisStage
     from piezo_ident.record.channels import Axes
     from piezo_ident.record.io import read, write
     from piezo_ident.record.record import Record
@@ -74,6 +75,7 @@ _HOMES = {
     'Settings': 'identification.results',
     'SimulatedStage': 'model.simulated_stage',
     'StageModel': 'model.stage_model',
+    'TwoAxisStage': 'model.two_axis_stage',
     'diagnose': 'diagnosis.diagnose',
     'effects': 'effects',
     'export_c': 'export.header',
@@ -110,6 +112,7 @@ __all__ = [
     'Settings',
     'SimulatedStage',
     'StageModel',
+    'TwoAxisStage',
     '__version__',
     'diagnose',
     'effects',

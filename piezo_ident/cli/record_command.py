@@ -14,8 +14,10 @@ from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_s
 from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
 
 __all__ = ['convert_command', 'simulate_command']
@@ -31,16 +33,21 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
         files[kind] = find_config(name, kind)
         if Path(name).suffix and not Path(name).is_file():
             console.note(f'{name} is not here; taking the shipped {files[kind]}')
-    stage, program = SimulatedStage.load(files['stage']), Program.load(files['program'])
-    rate = stage.model.sample_rate if args.sample_rate is None else args.sample_rate
-    if not stage.model.is_static and rate != stage.model.sample_rate:
+    stage, program = load_stage(files['stage']), Program.load(files['program'])
+    rate = stage.sample_rate if args.sample_rate is None else args.sample_rate
+    is_static = isinstance(stage, SimulatedStage) and stage.model.is_static
+    if not is_static and rate != stage.sample_rate:
         raise ConfigError(
-            f'{files["stage"]}: the stage holds for {stage.model.sample_rate:g} Hz, not for '
+            f'{files["stage"]}: the stage holds for {stage.sample_rate:g} Hz, not for '
             f'{rate:g} Hz; leave out --sample-rate'
         )
     seed = stage.seed if args.seed is None else args.seed
-    sequence = program.build(rate)
-    record = stage.play(sequence, np.random.default_rng(seed), name=out.name)
+    sequence, *others = build_axes(program, len(stage.names), rate)
+    rng = np.random.default_rng(seed)
+    if isinstance(stage, SimulatedStage):
+        record = stage.play(sequence, rng, name=out.name)
+    else:
+        record = stage.play((sequence, *others), rng, name=out.name)
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
     with deferred_interrupts():
@@ -54,7 +61,7 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, seed {seed}')
     console.say(sequence.describe())
     print_faults(record, losses, console)
-    warnings = stage.model.extrapolation(record)
+    warnings = stage.model.extrapolation(record) if isinstance(stage, SimulatedStage) else ()
     for warning in warnings:
         console.say(f'warning: {warning}')
     console.result(

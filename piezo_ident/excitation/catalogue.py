@@ -303,6 +303,7 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     period=_TIME,
     periods=_COUNT,
     realisations=replace(_COUNT, default=1),
+    lines=Option('', default='odd', choices=('odd', 'all')),
 )
 def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     period, count = o['period'], o['realisations']
@@ -317,7 +318,9 @@ def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     highest = math.floor(round(o['highest'] * period, 6))
     parts = []
     for number in range(1, count + 1):
-        lines = excitation.odd_lines(lowest, highest, s.rng)
+        lines = np.arange(lowest, highest + 1)
+        if o['lines'] == 'odd':
+            lines = excitation.odd_lines(lowest, highest, s.rng)
         v = excitation.multisine(
             o['bias'], o['amplitude'], lines, period, o['periods'], s.sample_rate, s.rng
         )

@@ -159,6 +159,16 @@ class SimulatedStage:
         return stage_from_dict(load_yaml(path), str(path))
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the axes: there is one, without a name."""
+        return ('',)
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples a second [Hz]."""
+        return self.model.sample_rate
+
+    @property
     def ideal(self) -> SimulatedStage:
         """The same stage without noise and converters: its record is the displacement itself."""
         return SimulatedStage(self.model)

@@ -1,0 +1,69 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One program for several axes: the same segments, and random signals of each axis's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.program import Program, Sequence
+from piezo_ident.record.record import Segment
+
+__all__ = ['build_axes']
+
+
+def build_axes(
+    program: Program,
+    count: int,
+    sample_rate: float | None = None,
+    limits: tuple[float, float] | None = None,
+) -> tuple[Sequence, ...]:
+    """
+    Return one sequence for each of several axes, with the same segments at the same samples.
+
+    Noise and multisines of each axis are drawn for it alone, so they tell which voltage moved
+    what.  Of one axis the sequence is that of `Program.build`.
+
+    Parameters
+    ----------
+    program : Program
+    count : int
+        Number of axes.
+    sample_rate, limits
+        As for `Program.build`.
+
+    Raises
+    ------
+    ConfigError
+        As for `Program.build`.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> first, second = build_axes(pi.Program.load('two_axes'), 2)
+    >>> first.segments == second.segments, bool((first.v == second.v).all())
+    (True, False)
+    """
+    seeds: list[int | list[int]] = [program.seed, *([program.seed, i] for i in range(1, count))]
+    built = [program.build(sample_rate, np.random.default_rng(seed), limits) for seed in seeds]
+    if len({tuple(s.label for s in sequence.segments) for sequence in built}) > 1:
+        raise ConfigError(
+            f'{program.name}: one axis needs a ramp where another needs none; move the bias'
+        )
+    # a ramp to where a random signal begins takes each axis its own time
+    lengths = [max(s.n for s in same) for same in zip(*(q.segments for q in built), strict=True)]
+    return tuple(_stretched(sequence, lengths) for sequence in built)
+
+
+def _stretched(sequence: Sequence, lengths: Iterable[int]) -> Sequence:
+    """Return a sequence whose segments end with their last voltage until they have a length."""
+    parts, segments, n = [], [], 0
+    for s, length in zip(sequence.segments, lengths, strict=True):
+        parts.append(np.pad(sequence.v[s.start : s.stop], (0, length - s.n), mode='edge'))
+        segments.append(Segment(s.label, n, n + length))
+        n += length
+    return replace(sequence, v=np.concatenate(parts), segments=tuple(segments))
