@@ -16,7 +16,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, ordered_kernel
-from scipy.signal import zpk2sos
 
 __all__ = ['rounding_of', 'run_sections', 'sections_at_rest', 'sections_of']
 
@@ -65,6 +64,9 @@ def sections_of(
     """
     if b[0] == 0.0 or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:
         return None
+    # few models need it, and it takes half a second to import
+    from scipy.signal import zpk2sos
+
     made = zpk2sos(np.roots(b), np.roots(np.concatenate([[1.0], a])), b[0])
     static = float(np.prod(made[:, :3].sum(axis=1) / made[:, 3:].sum(axis=1)))
     # roots beside each other may be too rough themselves
