@@ -99,10 +99,14 @@ def unseen_errors(result, record) -> tuple[float, float]:
 # -- the user's three cases --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('effect', ['creep', 'saturation'])
-def test_effect_of_the_catalogue_is_named_and_added(truths, effect):
+@pytest.mark.parametrize(
+    ('effect', 'candidates'),
+    # the whole catalogue, and those that come near
+    [('creep', ()), ('saturation', ('saturation', 'backlash', 'preload_loss', 'creep'))],
+)
+def test_effect_of_the_catalogue_is_named_and_added(truths, effect, candidates):
     model, record, unseen = measured(effect, 0.3, 1)
-    result = diagnose(model, record)
+    result = diagnose(model, record, DiagnosisSettings(effects=candidates))
     assert result.verdict in ('named', 'class'), result.sentence
     assert effect in {e.name for e in result.effects} | set(
         result.group.names if result.group else ()
