@@ -42,7 +42,7 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
             f'{rate:g} Hz; leave out --sample-rate'
         )
     seed = stage.seed if args.seed is None else args.seed
-    sequence, *others = build_axes(program, len(stage.names), rate)
+    sequence, *others = build_axes(program, len(stage.axes), rate)
     rng = np.random.default_rng(seed)
     if isinstance(stage, SimulatedStage):
         record = stage.play(sequence, rng, name=out.name)

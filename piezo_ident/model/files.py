@@ -149,6 +149,8 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     ModelError
         When the schema is later than this package knows, or a part is missing or wrong.
     """
+    if 'several_axes' in data:
+        raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
     version = data.get('schema_version', SCHEMA_VERSION)
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         raise ModelError(

@@ -159,8 +159,8 @@ class SimulatedStage:
         return stage_from_dict(load_yaml(path), str(path))
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the axes: there is one, without a name."""
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes: there is one, without a name."""
         return ('',)
 
     @property

@@ -56,8 +56,8 @@ class TwoAxisStage:
 
     Attributes
     ----------
-    names : tuple of str
-        Of the axes; the first has none.
+    axes : tuple of str
+        Their names; the first has none.
     sample_rate : float
         [Hz]
     gain : float
@@ -85,7 +85,7 @@ class TwoAxisStage:
     ('y', 'y_b')
     """
 
-    names: tuple[str, ...]
+    axes: tuple[str, ...]
     sample_rate: float
     gain: float
     frequency: NDArray[np.float64]
@@ -149,7 +149,7 @@ class TwoAxisStage:
         run = self.run(np.random.default_rng(self.seed) if rng is None else rng)
         v = np.column_stack([first.v, second.v])
         y = run.process(v)
-        label = self.names[1]
+        label = self.axes[1]
         channels = {f'v_{label}': v[:, 1], f'y_{label}': y[:, 1]}
         piece = Piece(v[:, 0], y[:, 0], self.sample_rate, 0.0, first.segments, channels)
         return Record((piece,), name)

@@ -12,6 +12,9 @@ schedule faster or slower; nobody is waited for, and each listener reports what 
 and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
 A ramp runs in real time.
 
+With `axes` several axes are driven at once, each with random signals of its own, on topics of
+their own: `voltage_b` for axis `b`.  All of them begin, end and stop together.
+
 Two programs at once would tear the stage to and fro, so a second publisher on `voltage` is
 refused at the start, and reported when it comes later.  An excitation that was killed is seen by
 the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
@@ -32,12 +35,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
 from piezo_ident.record.blocks import cut_blocks, Samples
+from piezo_ident.record.channels import role_of
 
 __all__ = ['ExcitationNode', 'main']
 
@@ -68,18 +73,23 @@ def _name(sequence: Sequence) -> str:
 
 @dataclass(eq=False)
 class Playing:
-    """One program on its way, as the threads see it."""
+    """One program on its way, as the threads see it; a sequence for each axis."""
 
-    sequence: Sequence
+    sequences: tuple[Sequence, ...]
     block_size: int
     factor: float
     stop: threading.Event = field(default_factory=threading.Event)
     hurry: bool = False
     tick: int = 0
-    voltage: float | None = None
+    voltages: list[float] = field(default_factory=list)
     clock: Schedule | None = None
     work: float = 0.0
     segment: str = ''
+
+    @property
+    def sequence(self) -> Sequence:
+        """That of the first axis; all have the same segments."""
+        return self.sequences[0]
 
 
 class _Stopped(Exception):
@@ -92,18 +102,23 @@ class ExcitationNode(LabNode):
     executable = 'excitation'
 
     def __init__(self, **kwargs: Any) -> None:
-        self._built: tuple[tuple[object, ...], Sequence] | None = None
+        self._built: tuple[tuple[object, ...], tuple[Sequence, ...]] | None = None
         self._playing: Playing | None = None
         self._thread: threading.Thread | None = None
         self._second = ''
         self._rate = Rate()
         super().__init__(**kwargs)
+        self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
         self._build(self.values['program'])
         # loads the kernel: the ramp of a stop, or of the end, must not wait for it
         Guard(self._guard_settings())
         self._quantity = self.values['quantity']
         self._unit, self._scale = UNITS[self._quantity]
-        self._output = ExclusivePublisher(self, self._quantity, stays=True)
+        # behind the quantity, what belongs to an axis
+        self._outputs = [
+            ExclusivePublisher(self, f'{self._quantity}{tail}', stays=True) for tail in self._tails
+        ]
+        self._output = self._outputs[0]
         self.offer('start', self._start)
         self.offer('stop', self._stop)
 
@@ -111,6 +126,9 @@ class ExcitationNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programs that cannot be played, and limits that are crossed."""
+        if name == 'axes':
+            bad = next((x for x in value if x and role_of(f'v_{x}') != 'v'), None)
+            return None if bad is None else f'axes: {bad!r} cannot be the name of an axis'
         if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
             return None
         # while parameters are declared, those that come later are not there yet
@@ -125,17 +143,18 @@ class ExcitationNode(LabNode):
             return str(error)
         return None
 
-    def _build(self, text: str, values: Mapping[str, Any] | None = None) -> Sequence:
+    def _build(self, text: str, values: Mapping[str, Any] | None = None) -> tuple[Sequence, ...]:
         values = values or self.values
         limits = (values['voltage_low'], values['voltage_high'])
         key = (text, limits)
         # a file may have changed since
         if self._built is None or self._built[0] != key or '\n' not in text:
             try:
-                sequence = read_program(text).build(values['sample_rate'], limits=limits)
+                count = 1 + sum(map(bool, values.get('axes', ())))
+                built = build_axes(read_program(text), count, values['sample_rate'], limits)
             except (OSError, MemoryError) as error:
                 raise ConfigError(f'program: {error}') from None
-            self._built = (key, sequence)
+            self._built = (key, built)
         return self._built[1]
 
     def _guard_settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
@@ -151,9 +170,14 @@ class ExcitationNode(LabNode):
     def _start(self) -> str:
         if self._is_playing():
             raise ConfigError('a program is being played already; call ~/stop first')
-        sequence = self._build(self.values['program'])
-        playing = Playing(sequence, self.values['block_size'], self.values['rate_factor'])
-        self._output.open()
+        playing = Playing(
+            self._build(self.values['program']),
+            self.values['block_size'],
+            self.values['rate_factor'],
+        )
+        sequence = playing.sequence
+        for output in self._outputs:
+            output.open()
         self._playing = playing
         self._rate = Rate()
         self.report_status('waiting', 0.0, 'waiting for subscribers')
@@ -190,8 +214,9 @@ class ExcitationNode(LabNode):
 
     def _await_graph(self, playing: Playing) -> None:
         needed, limit = self.values['subscribers'], self.values['wait_limit']
-        while not self._output.poll(needed, limit):
-            self._sleep(playing, time.monotonic() + 0.02)
+        for output in self._outputs:
+            while not output.poll(needed, limit):
+                self._sleep(playing, time.monotonic() + 0.02)
 
     def _sleep(self, playing: Playing, until: float) -> None:
         if playing.stop.wait(max(0.0, until - time.monotonic())):
@@ -206,7 +231,7 @@ class ExcitationNode(LabNode):
         playing.clock = clock
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
             self._sleep(playing, clock.due(start))
-            self._send(playing, sequence.v[start:stop], label)
+            self._send(playing, [axis.v[start:stop] for axis in playing.sequences], label)
             clock.note(start, stop - start, time.monotonic())
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
             percent = math.floor(100.0 * stop / sequence.n)
@@ -214,12 +239,13 @@ class ExcitationNode(LabNode):
             brief = f'{percent} %: {text}'
             self.report_status('running', percent, text, level, brief=brief, segment=label)
 
-    def _send(self, playing: Playing, v: NDArray[np.float64], label: str) -> None:
-        begin = time.perf_counter()
-        t = np.arange(playing.tick, playing.tick + v.size) / playing.sequence.sample_rate
-        playing.tick += v.size
-        playing.voltage, playing.segment = float(v[-1]), label
-        self._output.send(Samples(t, v * self._scale, label, self._quantity))
+    def _send(self, playing: Playing, voltages: Many[NDArray[np.float64]], label: str) -> None:
+        begin, n = time.perf_counter(), voltages[0].size
+        t = np.arange(playing.tick, playing.tick + n) / playing.sequence.sample_rate
+        playing.tick += n
+        playing.voltages, playing.segment = [float(v[-1]) for v in voltages], label
+        for tail, output, v in zip(self._tails, self._outputs, voltages, strict=True):
+            output.send(Samples(t, v * self._scale, label, f'{self._quantity}{tail}'))
         playing.work = time.perf_counter() - begin
 
     def _ramp(self, playing: Playing, state: str, message: str) -> None:
@@ -227,26 +253,27 @@ class ExcitationNode(LabNode):
         settings = self._guard_settings()
         level = WARN if state == 'failed' else OK
         progress = math.floor(100.0 * playing.tick / playing.sequence.n)
-        if playing.voltage is not None and playing.voltage != settings.rest:
+        if any(voltage != settings.rest for voltage in playing.voltages):
             self.report_status(
                 'stopping', progress, f'ramping to {settings.rest:g} {self._unit}', level
             )
-            self._send_ramp(playing, Guard(settings, playing.voltage))
+            self._send_ramp(playing, [Guard(settings, voltage) for voltage in playing.voltages])
         self.report_status(state, progress, message, level)
 
-    def _send_ramp(self, playing: Playing, guard: Guard) -> None:
-        settings = guard.settings
+    def _send_ramp(self, playing: Playing, guards: list[Guard]) -> None:
+        settings = guards[0].settings
         hurried, origin = False, playing.tick
         clock = playing.clock = Schedule(settings.sample_rate, time.monotonic())
         # short blocks even where those of the program are long: the end must not wait
         size = min(playing.block_size, max(1, round(0.005 * settings.sample_rate)))
-        while not guard.is_at_rest:
+        while not all(guard.is_at_rest for guard in guards):
             if playing.hurry and not hurried:
-                guard, hurried = Guard(settings, guard.applied), True
-            v = guard.idle(size, LAST_RAMP if hurried else math.inf)
+                guards, hurried = [Guard(settings, guard.applied) for guard in guards], True
+            longest = LAST_RAMP if hurried else math.inf
+            voltages = [guard.idle(size, longest) for guard in guards]
             time.sleep(max(0.0, clock.due(playing.tick - origin) - time.monotonic()))
             start = playing.tick
-            self._send(playing, v, 'ramp:stop')
+            self._send(playing, voltages, 'ramp:stop')
             clock.note(start - origin, size, time.monotonic())
 
     # diagnostics, end
@@ -255,9 +282,14 @@ class ExcitationNode(LabNode):
         """Return rate, blocks, delays and head-room; watch for a second publisher."""
         playing = self._playing
         if not self._is_playing():
-            self._output.stop_listening()
-        foreign = self._output.others()
-        self._second = f'second publisher {foreign[0]} on {self._quantity}' if foreign else ''
+            for output in self._outputs:
+                output.stop_listening()
+        foreign = [
+            f'{who} on {self._quantity}{tail}'
+            for tail, output in zip(self._tails, self._outputs, strict=True)
+            for who in output.others()
+        ]
+        self._second = f'second publisher {foreign[0]}' if foreign else ''
         values: dict[str, object] = {'publishers': self.count_publishers(self._output.topic)}
         if playing is None:
             return (WARN if foreign else OK), self._second or 'nothing played yet', values
@@ -290,7 +322,8 @@ class ExcitationNode(LabNode):
             playing.hurry = True
             playing.stop.set()
             self._thread.join(LAST_RAMP + 0.9)
-            self._output.close()
+            for output in self._outputs:
+                output.close()
 
 
 def main(argv: Many[str] | None = None) -> int:

@@ -69,6 +69,13 @@ EXCITATION = (
         choices=('voltage', 'reference'),
         read_only=True,
     ),
+    Declaration(
+        'axes',
+        ('',),
+        'names of further axes, each with signals of its own on voltage_<name>; empty names are '
+        'left out',
+        read_only=True,
+    ),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
         'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0

@@ -9,6 +9,11 @@ back as `displacement` with the same t and segment; `applied_voltage` is what th
 command, before the converter rounds it.  Where the two differ the guard had reason to: the
 displacement is published all the same, so that nothing is lost.
 
+A stage of two axes has topics of its own for the second, as `voltage_b`, `displacement_b` and
+`applied_voltage_b`, and a guard.  The stream of the first axis rules: a block of `voltage` waits
+up to `PATIENCE` for that of `voltage_b` with the same t.  What does not come in time leaves the
+last voltage of that axis in force; a second axis that nobody drives stays at rest.
+
 The stage itself never starts over: as a real one it keeps its memory from stream to stream, and
 its own clock (of drift and hum) goes on.
 
@@ -42,8 +47,9 @@ longer.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import functools
 import math
 import time
 from typing import Any
@@ -51,10 +57,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
+from piezo_ident.live.companions import Companion
+from piezo_ident.live.guard import Applied, Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
-from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
@@ -66,6 +73,8 @@ __all__ = ['StageNode', 'main']
 
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
+#: how long a block waits for that of a further axis [s]
+PATIENCE = 0.2
 #: longest gap through which a voltage is held [s]
 LONGEST_GAP = 10.0
 
@@ -85,12 +94,14 @@ class StageNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         try:
-            self._stage = SimulatedStage.load(self.values['stage'])
+            self._stage = load_stage(self.values['stage'])
         except OSError as error:
             raise DataError(f'stage: {error}') from None
         seed = self._stage.seed if self.values['seed'] < 0 else self.values['seed']
-        self.sample_rate = self._stage.model.sample_rate
-        self._guard = Guard(self._settings())
+        self.sample_rate = self._stage.sample_rate
+        # behind the names of what belongs to an axis
+        self._tails = [f'_{name}' if name else '' for name in self._stage.axes]
+        self._axis_guards = [Guard(self._settings()) for _ in self._tails]
         self._warm_up()
         self._run = self._stage.run(np.random.default_rng(seed))
         self._sample_clock = SampleClock(self.sample_rate, self._longest_gap())
@@ -103,8 +114,22 @@ class StageNode(LabNode):
         self._last = time.monotonic()
         self._pace = self._new_pace()
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
-        self._displacement = self.create_publisher(Float64MultiArray, 'displacement', STREAM)
-        self._applied = self.create_publisher(Float64MultiArray, 'applied_voltage', STREAM)
+        self._displacement, self._applied = (
+            [self.create_publisher(Float64MultiArray, f'{q}{x}', STREAM) for x in self._tails]
+            for q in ('displacement', 'applied_voltage')
+        )
+        # blocks of the first axis that wait for those of the others, and since when
+        self._waiting: deque[tuple[Samples, int | None, float]] = deque()
+        self._companions = {tail: Companion(self.sample_rate) for tail in self._tails[1:]}
+        self._further = {
+            tail: self.create_subscription(
+                Float64MultiArray,
+                f'voltage{tail}',
+                functools.partial(self._on_further, tail),
+                STREAM,
+            )
+            for tail in self._companions
+        }
         self._input = self.create_subscription(
             Float64MultiArray, 'voltage', self._on_voltage, STREAM
         )
@@ -113,10 +138,21 @@ class StageNode(LabNode):
 
     def _warm_up(self) -> None:
         """Compile what the first block would otherwise wait for."""
-        run, guard = self._stage.run(np.random.default_rng(0)), Guard(self._guard.settings)
+        run, guard = (
+            self._stage.run(np.random.default_rng(0)),
+            Guard(self._axis_guards[0].settings),
+        )
         rest = guard.applied
         for v in ([rest] * 2, [rest, math.nan]):
-            run.process(guard.process(v).voltage)
+            run.process(self._command([guard.process(v).voltage] * len(self._tails)))
+
+    def _command(self, voltages: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return what the stage takes: a vector for one axis, a matrix for several."""
+        return voltages[0] if len(voltages) == 1 else np.column_stack(voltages)
+
+    @property
+    def _is_at_rest(self) -> bool:
+        return all(guard.is_at_rest for guard in self._axis_guards)
 
     # parameters
 
@@ -135,10 +171,11 @@ class StageNode(LabNode):
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take new limits and times over at the next sample."""
-        self._guard.settings = self._settings()
+        for guard in self._axis_guards:
+            guard.settings = self._settings()
         self._sample_clock.longest_gap = self._longest_gap()
         self._watch.timer_period_ns = int(self._watch_period() * 1e9)
-        if self._sample_clock.head is None and not self._guard.is_at_rest:
+        if self._sample_clock.head is None and not self._is_at_rest:
             self._begin_ramp()
 
     def _longest_gap(self) -> float:
@@ -158,9 +195,30 @@ class StageNode(LabNode):
             self._sample_clock.skip(sequence)
             self._faults.note('malformed', f'a block is refused: {error}')
         else:
-            self._take(samples, sequence)
+            self._waiting.append((samples, sequence, time.monotonic()))
+            self._take_complete()
             self._busy += time.perf_counter() - begin
         self._report_state()
+
+    def _on_further(self, tail: str, message: Float64MultiArray) -> None:
+        try:
+            self._companions[tail].add(from_message(message, f'voltage{tail}'))
+        except DataError as error:
+            self._faults.note('malformed', f'a block is refused: {error}')
+        self._take_complete()
+
+    def _take_complete(self) -> None:
+        """Take the blocks whose further voltages are there, or do not come."""
+        while self._waiting:
+            samples, sequence, since = self._waiting[0]
+            lacking = any(
+                not companion.has(samples.t) and self._further[tail].get_publisher_count()
+                for tail, companion in self._companions.items()
+            )
+            if lacking and time.monotonic() < since + min(PATIENCE, self.values['silence'] / 2):
+                return
+            self._waiting.popleft()
+            self._take(samples, sequence)
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
         verdict = self._sample_clock.judge(
@@ -178,42 +236,72 @@ class StageNode(LabNode):
             self._ramp_timer.cancel()
             self._counts['streams'] += 1
         elif kind is Kind.GAP:
-            self._move(self._guard.hold(verdict.missing), 'hold:gap')
-        applied = self._guard.process(samples.values, restarted=kind is Kind.START)
-        for why, n in applied.altered.items():
-            self._faults.note(why, f'{n} {_WHY[why]}', n)
-        y = self._run.process(applied.voltage)
-        self._displacement.publish(
-            to_message(Samples(samples.t, y, samples.segment, 'displacement'))
-        )
-        self._applied.publish(to_message(replace(samples, values=applied.voltage)))
+            self._move([guard.hold(verdict.missing) for guard in self._axis_guards], 'hold:gap')
+        applied = [
+            self._guarded(tail, guard, samples, kind is Kind.START)
+            for tail, guard in zip(self._tails, self._axis_guards, strict=True)
+        ]
+        y = self._run.process(self._command(applied))
+        for k, column in enumerate(y.reshape(samples.t.size, -1).T):
+            moved = Samples(samples.t, column, samples.segment, f'displacement{self._tails[k]}')
+            self._displacement[k].publish(to_message(moved))
+        self._publish_applied(samples.t, applied, samples.segment)
         self._tick = verdict.tick + samples.t.size
         self._counts['blocks'] += 1
         self._counts['samples'] += samples.t.size
         self._state, self._segment = 'running', samples.segment
 
-    def _move(self, v: NDArray[np.float64], segment: str) -> None:
+    def _guarded(
+        self, tail: str, guard: Guard, samples: Samples, restarted: bool
+    ) -> NDArray[np.float64]:
+        """Return what is applied to an axis."""
+        command = samples.values
+        if tail:
+            command = self._companions[tail].take(samples.t)
+            missing = int(np.count_nonzero(np.isnan(command)))
+            if missing and (missing < command.size or not guard.is_at_rest):
+                about = f'{missing} samples of voltage{tail} are missing: the last stays in force'
+                self._faults.note('missing', about, missing)
+        applied: Applied = guard.process(command, restarted=restarted)
+        for why, n in applied.altered.items():
+            if not (tail and why == 'not_finite'):
+                self._faults.note(why, f'{n} {_WHY[why]}', n)
+        return applied.voltage
+
+    def _publish_applied(
+        self, t: NDArray[np.float64], voltages: Sequence[NDArray[np.float64]], segment: str
+    ) -> None:
+        for tail, publisher, v in zip(self._tails, self._applied, voltages, strict=True):
+            publisher.publish(to_message(Samples(t, v, segment, f'voltage{tail}')))
+
+    def _move(self, voltages: Sequence[NDArray[np.float64]], segment: str) -> None:
         """Apply what nobody commanded, and report it as applied."""
-        self._run.process(v)
-        for start in range(0, v.size, BLOCK_SIZE):
-            cut = v[start : start + BLOCK_SIZE]
-            t = np.arange(self._tick, self._tick + cut.size) / self.sample_rate
-            self._applied.publish(to_message(Samples(t, cut, segment)))
-            self._tick += cut.size
+        self._run.process(self._command(voltages))
+        for start in range(0, voltages[0].size, BLOCK_SIZE):
+            cut = [v[start : start + BLOCK_SIZE] for v in voltages]
+            t = np.arange(self._tick, self._tick + cut[0].size) / self.sample_rate
+            self._publish_applied(t, cut, segment)
+            self._tick += cut[0].size
 
     # silence
 
     def _on_watch(self) -> None:
+        self._take_complete()
         silent = time.monotonic() - self._last
         if self._sample_clock.head is not None and silent > self.values['silence']:
             self._sample_clock.pause()
-            if self._guard.is_at_rest:
-                self._sample_clock.end()
+            if self._is_at_rest:
+                self._end_stream()
                 self._state = 'idle'
             else:
                 self._faults.note('silence', f'no voltage for {silent:.2f} s: ramping to rest')
                 self._begin_ramp()
         self._report_state()
+
+    def _end_stream(self) -> None:
+        self._sample_clock.end()
+        for companion in self._companions.values():
+            companion.clear()
 
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', 'ramp:silence'
@@ -225,10 +313,10 @@ class StageNode(LabNode):
 
     def _on_ramp(self) -> None:
         if (due := self._pace.due()) > 0:
-            self._move(self._guard.idle(due), 'ramp:silence')
-        if self._guard.is_at_rest:
+            self._move([guard.idle(due) for guard in self._axis_guards], 'ramp:silence')
+        if self._is_at_rest:
             self._ramp_timer.cancel()
-            self._sample_clock.end()
+            self._end_stream()
             self._state = 'idle'
             self._faults.note('silence', 'no voltage: ramped to rest', 0)
         self._report_state()
@@ -262,8 +350,13 @@ class StageNode(LabNode):
             **{f'altered_{why}': self._counts[why] for why in altered},
             'clipped': self._run.clipped_input + self._run.clipped_output,
             'publishers': self._input.get_publisher_count(),
-            'applied': f'{self._guard.applied:.6f}',
+            **{
+                f'applied{tail}': f'{guard.applied:.6f}'
+                for tail, guard in zip(self._tails, self._axis_guards, strict=True)
+            },
         }
+        if self._companions:
+            values['missing'] = self._counts['missing']
         if rate:
             values['head_room'] = f'{max(0.0, 1.0 - worked * self.sample_rate / rate):.3f}'
         return (WARN if faults else OK), faults or self._state, values
@@ -272,13 +365,14 @@ class StageNode(LabNode):
         """Ramp to rest within a second."""
         size = max(1, round(RAMP_PERIOD * self.sample_rate))
         # a ramp that is under way at its own pace gives way to one that ends in time
-        guard = Guard(self._guard.settings, self._guard.applied)
+        guards = [Guard(guard.settings, guard.applied) for guard in self._axis_guards]
         begin, sent = time.monotonic(), 0
-        while not guard.is_at_rest:
-            self._move(guard.idle(size, LAST_RAMP), 'ramp:stop')
+        while not all(guard.is_at_rest for guard in guards):
+            self._move([guard.idle(size, LAST_RAMP) for guard in guards], 'ramp:stop')
             sent += size
             time.sleep(max(0.0, begin + sent / self.sample_rate - time.monotonic()))
-        self._applied.wait_for_all_acked(Duration(seconds=0.1))
+        for publisher in self._applied:
+            publisher.wait_for_all_acked(Duration(seconds=0.1))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

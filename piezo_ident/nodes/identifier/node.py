@@ -20,6 +20,7 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
 from piezo_ident.model.files import load
 from piezo_ident.nodes.given import home_problem
+from piezo_ident.nodes.identifier.axes_job import identify_axes_capture, save_axes
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs
@@ -66,6 +67,8 @@ class IdentifierNode(LabNode):
         self._state, self._task, self._reported_at = 'idle', '', 0.0
         self._steps = Steps()
         self._identified: Identification | None = None
+        # the last model of several axes, as text
+        self._axes = ''
         self._session = DiagnosisSession(self, self._capture)
         # what the running job uses of the capture, and the model last published
         self._using, self._published = dict[str, int](), ''
@@ -81,10 +84,12 @@ class IdentifierNode(LabNode):
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
-        self.offer('identify', functools.partial(self._identify, 'all'))
+        self.offer('identify', self._identify_all)
         for step in ('delay', 'dynamics', 'hysteresis'):
             self.offer(f'identify_{step}', functools.partial(self._identify, step))
-        for name in ('run', 'diagnose', 'cancel', 'clear', 'save'):
+        self.offer('run', functools.partial(self._run, self._identify_all))
+        self.offer('run_axes', functools.partial(self._run, self._identify_axes))
+        for name in ('identify_axes', 'diagnose', 'cancel', 'clear', 'save'):
             self.offer(name, getattr(self, f'_{name}'))
 
     def offer(self, name: str, handler: Callable[[], str]) -> None:
@@ -175,29 +180,44 @@ class IdentifierNode(LabNode):
 
     # services
 
-    def _run(self) -> str:
+    def _run(self, identify: Callable[[], str]) -> str:
         self._refuse_when_busy()
         settings_of(self.values)
         # older data may come from another stage, or another day
         about = 'program for the identification'
-        self.excite(self.values['program'], about, self._run_ended, self._forget)
+        ended = functools.partial(self._run_ended, identify)
+        self.excite(self.values['program'], about, ended, self._forget)
         return 'the program is requested; see ~/status'
 
-    def _run_ended(self, reason: str | None) -> None:
+    def _run_ended(self, identify: Callable[[], str], reason: str | None) -> None:
         if reason is not None:
             self.fail(reason)
             return
         try:
-            self._identify('all')
+            identify()
         except PiezoIdentError as error:
             self.fail(str(error))
 
-    def _identify(self, which: str) -> str:
-        self._refuse_when_busy()
+    def _refuse_when_empty(self) -> None:
         if not self._capture.n:
             raise DataError(
                 'nothing has been captured; start the excitation, call ~/run, or replay a bag'
             )
+
+    def _identify_axes(self) -> str:
+        self._refuse_when_busy()
+        self._refuse_when_empty()
+        self._task = 'identification of several axes'
+        self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
+        self._start(functools.partial(identify_axes_capture, self._capture.snapshot()))
+        return f'{self._task} has begun; see ~/status'
+
+    def _identify_all(self) -> str:
+        return self._identify('all')
+
+    def _identify(self, which: str) -> str:
+        self._refuse_when_busy()
+        self._refuse_when_empty()
         self._using = self._capture.mark()
         settings = settings_of(self.values)
         job = functools.partial(
@@ -214,14 +234,18 @@ class IdentifierNode(LabNode):
     def _save(self) -> str:
         self._refuse_when_busy()
         identified, folder = self._identified, Path(self.values['output']).expanduser().absolute()
-        if identified is None and self._session.diagnosis is None:
+        if identified is None and self._session.diagnosis is None and not self._axes:
             raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
         if not self.values['output']:
             raise PiezoIdentError("parameter 'output' is empty; set it to the folder to write to")
         check_folder(folder)
         self._task = 'saving'
         self._set_state('saving', 0.0, f'writing to {folder}')
-        self._start(functools.partial(save, identified, self._session.diagnosis, str(folder)))
+        if self._axes:
+            self._start(functools.partial(save_axes, self._axes, str(folder)))
+        else:
+            job = functools.partial(save, identified, self._session.diagnosis, str(folder))
+            self._start(job)
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
@@ -320,10 +344,12 @@ class IdentifierNode(LabNode):
         elif isinstance(result, IdentificationOutcome):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
+            if result.model:
+                self._axes = '' if result.identification else result.model
+                self._publish_model(result.model)
             if result.model and result.identification is not None:
                 self._identified = identified = result.identification
                 self._session.take(identified.model, self._using)
-                self._publish_model(result.model)
                 for warning in identified.warnings:
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK

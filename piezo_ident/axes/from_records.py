@@ -1,0 +1,218 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Whole periods out of records of several axes, and a model identified from them.
+
+A segment whose voltages repeat themselves holds periods; how long they are is found from the
+voltages alone.  Segments named alike but for a number, as the realisations of a multisine are, are
+of one group.  Models stand for the motion about the mean of the voltages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.axes.explain import explain, Explanation, groups, Score
+from piezo_ident.axes.linear_fit import choose_order
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
+from piezo_ident.common.errors import DataError
+from piezo_ident.record.channels import Axes
+from piezo_ident.record.record import Record
+
+__all__ = ['AxesIdentification', 'Periods', 'identify_axes', 'periods_of']
+
+#: most periods of one segment
+PERIODS = 64
+#: voltages that differ by less than this part of their range are equal: what a converter rounds
+EQUAL = 1e-6
+#: orders that are tried
+ORDERS = (4, 6, 8, 12, 16, 20, 28, 36)
+
+
+@dataclass(frozen=True, eq=False)
+class Periods:
+    """
+    The periods in some records, about the mean of the voltages.
+
+    Attributes
+    ----------
+    records : tuple of PeriodicRecord
+    v0 : ndarray, shape (inputs,)
+        That mean [V].
+    inputs, outputs : tuple of str
+        Their columns.
+    """
+
+    records: tuple[PeriodicRecord, ...]
+    v0: NDArray[np.float64]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def periods_of(records: Sequence[Record]) -> Periods:
+    """
+    Find the periodic segments of some records of one stage.
+
+    Of three periods or more the first is left out: the stage settles in it.
+
+    Raises
+    ------
+    DataError
+        When there is none, or they differ in length.
+    """
+    found = []
+    every = Axes.of_records(records)
+    pieces = [piece for record in records for piece in record]
+    for axes, piece in zip(every, pieces, strict=True):
+        for segment in piece.segments:
+            cut = slice(segment.start, segment.stop)
+            count = _periods(axes.inputs[cut])
+            if count < 2:
+                continue
+            first = 1 if count > 2 else 0
+            u, y = (
+                x[cut].reshape(count, -1, x.shape[1])[first:] for x in (axes.inputs, axes.outputs)
+            )
+            found.append((segment.label, u, y))
+    sizes = sorted({u.shape[1] for _, u, _ in found})
+    if len(sizes) != 1:
+        raise DataError(
+            f'the records hold periods of {sizes} samples; play one multisine again and again'
+            if sizes
+            else 'no segment of the records repeats itself; play multisines of two periods or more'
+        )
+    v0 = np.mean([u.mean(axis=(0, 1)) for _, u, _ in found], axis=0)
+    rate = every[0].sample_rate
+    return Periods(
+        tuple(
+            PeriodicRecord(label, re.sub(r'-\d+$', '', label), rate, u - v0, y)
+            for label, u, y in found
+        ),
+        v0,
+        every[0].input_names,
+        every[0].output_names,
+    )
+
+
+def _periods(u: NDArray[np.float64]) -> int:
+    """Return how many periods some voltages are; 1 where they do not repeat or an input rests."""
+    n, span = len(u), np.ptp(u, axis=0)
+    if not span.all():
+        return 1
+    for count in range(min(PERIODS, n // 16), 1, -1):
+        size = n // count
+        if n % count == 0 and (np.abs(u[size:] - u[:-size]).max(axis=0) < EQUAL * span).all():
+            return count
+    return 1
+
+
+@dataclass(frozen=True, eq=False)
+class AxesIdentification:
+    """
+    A stage of several axes, identified.
+
+    Attributes
+    ----------
+    model : LoopModel
+        Displacements about their mean from voltages about `v0`.
+    explanation : Explanation
+    errors : dict
+        In free run on the records held out, by group.
+    orders : dict
+        Error in % by order of the linear model.
+    periodicity : tuple of Periodicity
+        Of all records.
+    periods : Periods
+    """
+
+    model: LoopModel
+    explanation: Explanation
+    errors: dict[str, Score]
+    orders: dict[int, float]
+    periodicity: tuple[Periodicity, ...]
+    periods: Periods
+
+    @property
+    def error(self) -> float:
+        """100 rms(y - yhat) / rms(y) on what was held out, quadratic mean of the groups."""
+        return self.explanation[self.explanation.name].error
+
+    @property
+    def linear_error(self) -> float:
+        """The same of the linear model."""
+        return self.explanation['linear'].error
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Records that do not repeat."""
+        return tuple(str(p) for p in self.periodicity if p.suspicious)
+
+
+def identify_axes(
+    records: Sequence[Record],
+    *,
+    iterations: int = 6,
+    progress: Callable[[str, float], None] = lambda step, share: None,
+) -> AxesIdentification:
+    """
+    Identify a stage of several axes from multisines.
+
+    The last realisation of each group is held out; on it the order and the candidates are judged,
+    in free run.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With segments of at least two periods, each at least twice (realisations).
+    iterations : int
+        Steps a candidate.
+    progress : callable
+        Called with the step and its share done.
+
+    Raises
+    ------
+    DataError
+        When the records do not determine a model.
+    """
+    periods = periods_of(records)
+    parts = groups(periods.records)
+    alone = [group for group, members in parts.items() if len(members) < 2]
+    if alone:
+        raise DataError(
+            f'{", ".join(alone)}: one realisation only; play two or more, one of them is held out'
+        )
+    taught = [r for members in parts.values() for r in members[:-1]]
+    held_out = [members[-1] for members in parts.values()]
+    repeats = periodicity(periods.records)
+    weight = {id(r): p.weight for r, p in zip(periods.records, repeats, strict=True)}
+    progress('dynamics', 0.0)
+    # order and start at the middle of the amplitudes
+    middle = sorted(parts, key=lambda group: float(np.mean(parts[group][0].u ** 2)))[
+        len(parts) // 2
+    ]
+    linear, orders = choose_order(parts[middle][:-1], parts[middle][-1:], orders=ORDERS)
+    progress('candidates', 0.0)
+    told = 0
+
+    def told_of(_: str) -> None:
+        nonlocal told
+        told += 1
+        progress('candidates', min(1.0, told / 6))
+
+    found = explain(
+        linear,
+        taught,
+        held_out,
+        weights=[weight[id(r)] for r in taught],
+        iterations=iterations,
+        report=told_of,
+    )
+    return AxesIdentification(
+        found.model, found, found[found.name].scores, orders, repeats, periods
+    )

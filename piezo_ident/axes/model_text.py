@@ -1,0 +1,125 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A model of several axes as text: YAML that reads back to the same numbers, bit by bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.modal import Modal
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.files import parse_yaml
+import yaml
+
+__all__ = ['AxesModel', 'axes_model_from_text', 'axes_model_to_text']
+
+#: the key that tells such a text from a model of one axis
+KEY = 'several_axes'
+
+
+@dataclass(frozen=True, eq=False)
+class AxesModel:
+    """
+    A model with what it needs beside its equations.
+
+    Attributes
+    ----------
+    model : LoopModel
+    sample_rate : float
+        [Hz]
+    inputs, outputs : tuple of str
+        Their columns.
+    v0 : ndarray, shape (inputs,)
+        Voltages about which it holds [V].
+    effect : str
+        What it has beside linear dynamics.
+    error_percent : float
+        100 rms(y - yhat) / rms(y) in free run, on records that were held out.
+    """
+
+    model: LoopModel
+    sample_rate: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    v0: NDArray[np.float64]
+    effect: str
+    error_percent: float
+
+
+def axes_model_to_text(held: AxesModel) -> str:
+    """Return a model as YAML."""
+    model = held.model
+    arrays = {f.name: getattr(model, f.name) for f in fields(LoopModel) if f.name != 'linear'}
+    data = {
+        KEY: {
+            'sample_rate': held.sample_rate,
+            'inputs': [*held.inputs],
+            'outputs': [*held.outputs],
+            'v0': held.v0,
+            'effect': held.effect,
+            'error_percent': held.error_percent,
+        },
+        'linear': {f.name: getattr(model.linear, f.name) for f in fields(Modal)},
+        'loop': arrays,
+    }
+    return yaml.safe_dump(_plain(data), sort_keys=False, default_flow_style=None, width=99)
+
+
+def axes_model_from_text(text: str, name: str = 'model') -> AxesModel:
+    """
+    Read a model that `axes_model_to_text` wrote.
+
+    Raises
+    ------
+    ModelError
+        When it is none.
+    """
+    data = parse_yaml(text, name)
+    try:
+        head, loop = data[KEY], dict(data['loop'])
+        linear = Modal(*(np.array(data['linear'][f.name], dtype=float) for f in fields(Modal)))
+        order, (outputs, inputs) = linear.order, linear.d.shape
+        signals, levels = len(loop['f']), int(loop.pop('levels'))
+        memory, (low, high) = float(loop.pop('memory')), loop.pop('range')
+        r = np.array(loop['r'], dtype=float)
+        # a list without rows does not tell how many columns it has
+        shapes = {
+            'e': (order, signals),
+            'h': (outputs, signals),
+            'f': (signals, order),
+            'g': (signals, inputs),
+            'mu': (signals, r.size),
+            'r': r.shape,
+        }
+        arrays = {k: np.array(loop[k], dtype=float).reshape(s) for k, s in shapes.items()}
+        model = LoopModel(
+            linear, **arrays, levels=levels, memory=memory, range=(float(low), float(high))
+        )
+        return AxesModel(
+            model,
+            float(head['sample_rate']),
+            tuple(map(str, head['inputs'])),
+            tuple(map(str, head['outputs'])),
+            np.array(head['v0'], dtype=float),
+            str(head['effect']),
+            float(head['error_percent']),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ModelError(
+            f'{name}: no model of several axes ({error!r}); see docs/two_axes.md'
+        ) from None
+
+
+def _plain(x: Any) -> Any:
+    """Return arrays and tuples as lists, NumPy's numbers as Python's."""
+    if isinstance(x, Mapping):
+        return {key: _plain(value) for key, value in x.items()}
+    if isinstance(x, (np.ndarray, np.generic)):
+        return x.tolist()
+    return [*x] if isinstance(x, tuple) else x

@@ -1,0 +1,69 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The voltage of a further axis, kept until the block of the first axis of the same time comes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.record.blocks import Samples
+
+__all__ = ['Companion']
+
+#: samples that are kept at most
+MOST = 1_000_000
+
+
+class Companion:
+    """
+    Samples of one topic by their tick.
+
+    Parameters
+    ----------
+    sample_rate : float
+        [Hz]
+
+    Examples
+    --------
+    >>> voltage = Companion(10.0)
+    >>> voltage.add(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0])))
+    >>> voltage.has(np.array([0.1, 0.2])), voltage.take(np.array([0.1, 0.2])).tolist()
+    (False, [6.0, nan])
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        self._rate = sample_rate
+        self._kept: dict[int, float] = {}
+        self._newest = -1
+
+    def add(self, samples: Samples) -> None:
+        """Keep a block; one whose time jumps back begins a new stream."""
+        ticks = self._ticks(samples.t)
+        if not ticks:
+            return
+        if ticks[0] <= self._newest or len(self._kept) > MOST:
+            self._kept.clear()
+        self._kept.update(zip(ticks, samples.values.tolist(), strict=True))
+        self._newest = ticks[-1]
+
+    def clear(self) -> None:
+        """Forget all: the stream has ended."""
+        self._kept.clear()
+        self._newest = -1
+
+    def has(self, t: NDArray[np.float64]) -> bool:
+        """Return whether there is a sample at each of some times."""
+        return all(tick in self._kept for tick in self._ticks(t))
+
+    def take(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the samples at some times, NaN where there is none; they are not kept."""
+        return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
+
+    def _ticks(self, t: NDArray[np.float64]) -> list[int]:
+        # a time that is no number, or of no clock, belongs to nothing
+        usable = np.isfinite(t) & (np.abs(t) < 1e9)
+        ticks: list[int] = (
+            np.rint(np.where(usable, t, -1.0) * self._rate).astype(np.int64).tolist()
+        )
+        return ticks

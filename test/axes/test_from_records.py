@@ -1,0 +1,87 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Periods are found in records, a stage of two axes is identified from them, and its text kept."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.axes.from_records import identify_axes, periods_of
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.model_text import axes_model_from_text, axes_model_to_text, AxesModel
+from piezo_ident.common.errors import DataError, ModelError
+import pytest
+
+STAGE = pi.TwoAxisStage.load('two_axes')
+PROGRAM = pi.Program.load('two_axes')
+
+
+def program(*names, **options):
+    entries = (e for e in PROGRAM.entries if e.name in names)
+    return replace(
+        PROGRAM, entries=tuple(replace(e, options={**e.options, **options}) for e in entries)
+    )
+
+
+@pytest.fixture(scope='module')
+def record():
+    return STAGE.play(program('small', 'large', realisations=3, periods=3))
+
+
+def test_periods_are_found_and_the_first_is_left_to_settle(record):
+    found = periods_of([record])
+    assert [r.u.shape for r in found.records] == [(2, 2048, 2)] * 6
+    assert [r.group for r in found.records] == ['multisine:small'] * 3 + ['multisine:large'] * 3
+    assert (found.inputs, found.outputs) == (('v', 'v_b'), ('y', 'y_b'))
+    np.testing.assert_allclose(found.v0, 5.0, atol=1e-9)
+    two = STAGE.play(program('small', realisations=1, periods=2))
+    assert periods_of([two]).records[0].u.shape == (2, 2048, 2)
+
+
+def test_hysteresis_inside_the_loop_is_named_and_halves_the_error(record):
+    steps = []
+    found = identify_axes([record], progress=lambda step, _: steps.append(step))
+    assert found.explanation.name in ('loop_hysteresis', 'hysteretic_stiffness')
+    assert found.error < 0.35 * found.linear_error
+    # better than a linear model made for each amplitude alone
+    assert found.error < 0.7 * found.explanation['changed_dynamics'].error
+    assert found.model.radius < 1 and not found.warnings
+    assert set(steps) == {'dynamics', 'candidates'}
+
+
+def test_a_linear_stage_is_found_to_the_noise_and_nothing_is_blamed():
+    linear = replace(STAGE, hysteresis=(0.0, 0.4, 1.0), creep_gain=np.zeros(2))
+    record = linear.play(program('small', 'large', realisations=3, periods=3))
+    found = identify_axes([record], iterations=4)
+    assert found.explanation.name == 'linear'
+    # the noise is 2 nm
+    noise = 100 * 2e-9 / np.mean([r.y.std() for r in periods_of([record]).records])
+    assert found.error < 3 * noise
+
+
+def test_what_cannot_be_used_says_why(record):
+    with pytest.raises(DataError, match='no segment of the records repeats'):
+        periods_of([record.first(500)])
+    with pytest.raises(DataError, match='one realisation only'):
+        identify_axes([STAGE.play(program('small', realisations=1, periods=2))])
+    shorter = STAGE.play(program('small', realisations=1, periods=2, period=0.512))
+    with pytest.raises(DataError, match=r'periods of .1024, 2048. samples'):
+        periods_of([record, shorter])
+
+
+def test_the_text_of_a_model_reads_back_bit_by_bit(record):
+    linear = periods_of([record])
+    found = identify_axes([record], iterations=1)
+    for model in (found.model, LoopModel.of(found.model.linear)):
+        held = AxesModel(model, 2000.0, linear.inputs, linear.outputs, linear.v0, 'x', 1.5)
+        text = axes_model_to_text(held)
+        again = axes_model_from_text(text)
+        for f in fields(LoopModel):
+            if f.name != 'linear':
+                np.testing.assert_array_equal(getattr(again.model, f.name), getattr(model, f.name))
+        u = np.random.default_rng(0).normal(size=(300, 2))
+        np.testing.assert_array_equal(again.model.run(u).y, model.run(u).y)
+        assert (again.inputs, again.sample_rate, again.effect) == (('v', 'v_b'), 2000.0, 'x')
+    with pytest.raises(ModelError, match='no model of several axes'):
+        axes_model_from_text(text.replace('linear:', 'lin:'))
