@@ -12,6 +12,7 @@ from piezo_ident.axes.model_text import axes_model_from_text
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.model.files import model_from_dict
+from piezo_ident.record.blocks import Samples
 import pytest
 
 PROGRAM = """
@@ -102,7 +103,7 @@ def test_a_service_call_identifies_both_axes(lab, tmp_path):
     assert (tmp_path / 'out' / 'axes_model.yaml').read_text() == lab.texts('model')[-1]
 
 
-def test_an_axis_that_nobody_drives_rests_and_a_stop_ramps_both(lab):
+def test_a_stop_ramps_both_axes(lab):
     applied = [lab.collect(topic) for topic in ('applied_voltage', 'applied_voltage_b')]
     seen = len(lab.statuses('excitation'))
     assert lab.call('excitation/start')[0]
@@ -113,4 +114,39 @@ def test_an_axis_that_nobody_drives_rests_and_a_stop_ramps_both(lab):
     assert lab.call('excitation/stop')[0]
     lab.until('excitation', 'stopped', since=seen)
     for blocks in applied:
-        lab.wait(lambda blocks=blocks: blocks and blocks[-1].values[-1] == 0.0, 'rest')
+        assert max(block.values.max() for block in blocks) > 1.0
+        lab.wait(lambda blocks=blocks: blocks[-1].values[-1] == 0.0, 'rest')
+
+
+def test_an_axis_that_nobody_drives_rests(lab):
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
+    moved = [lab.collect(topic) for topic in ('displacement', 'displacement_b')]
+    applied = lab.collect('applied_voltage_b')
+    seen = len(moved[0]), len(applied)
+    t = np.arange(200) / RATE
+    lab.publish('voltage', Samples(t, 900 * t**2, 'alone', 'voltage'))
+    lab.wait(lambda: len(moved[0]) > seen[0], 'the first axis')
+    assert moved[0][-1].segment == 'alone' and np.ptp(moved[0][-1].values) > 1e-6
+    lab.wait(lambda: len(applied) > seen[1], 'the second axis')
+    assert not applied[seen[1]].values.any()
+    # the first one pulls at it all the same
+    lab.wait(lambda: moved[1][-1].segment == 'alone', 'the second axis')
+    assert np.ptp(moved[1][-1].values) > 1e-7
+    assert lab.diagnostics('stage')['missing'] == '0'
+
+    # the block of the second axis comes first, and then none
+    ahead, later = t + t.size / RATE, t + 2 * t.size / RATE
+    lab.publish('voltage_b', Samples(ahead, 1000 * t**2, 'both', 'voltage_b'))
+    for times in (ahead, later):
+        lab.publish('voltage', Samples(times, np.full(t.size, 8.9), 'both', 'voltage'))
+    lab.wait(lambda: moved[0][-1].t[-1] == later[-1], 'all blocks')
+    lab.wait(lambda: lab.diagnostics('stage')['missing'] == '200', 'what is missing')
+    held = [block for block in applied if block.segment == 'both']
+    assert held[0].values[-1] > 9.8 and (held[-1].values == held[0].values[-1]).all()
+
+
+def test_a_unit_is_no_name_of_an_axis():
+    with Graph() as g:
+        handle = g.start('excitation', {'axes': ['um']}, wait=False)
+        assert handle.process.wait(60) == 2
+        assert "axes: 'um' cannot be the name of an axis" in handle.log
