@@ -28,6 +28,8 @@ __all__ = ['Fit', 'Parameters', 'loop_fit', 'output_sensitivities']
 
 #: a real pole has died away to this part after the warm-up
 FADED = 0.01
+#: the softening follows the level but for this part of the time at either end
+RARE = 0.05
 #: the fit ends after so many steps in turn that gain less than this part of the error
 SLOW = 3e-3
 SLOW_STEPS = 3
@@ -210,9 +212,11 @@ def loop_fit(
     Returns
     -------
     Fit
-        Of a model whose modes are stable over its range of levels.
+        Of a model whose modes are stable over its range of levels, which is what the records
+        often reach.
     """
     weights = [1.0] * len(records) if weights is None else weights
+    model = _ranged(model, records)
     problem = _Problem(model, records, weights, hold, still, warm_up)
     damping, slow = 1e-3, 0
     with ThreadPoolExecutor(workers) as pool:
@@ -237,7 +241,25 @@ def loop_fit(
             slow = slow + 1 if before - cost < SLOW * before else 0
             if slow == SLOW_STEPS:
                 break
-    return Fit(model, tuple(errors))
+    return Fit(_ranged(model, records), tuple(errors))
+
+
+def _ranged(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
+    """Let the softening follow the level as far as the records often take it."""
+    if not model.levels:
+        return model
+    free = replace(model, range=(0.0, np.inf))
+    low, high = np.inf, 0.0
+    for record in records:
+        u = record.mean_u
+        try:
+            level = np.sqrt(free.run(np.concatenate([u, u])).level[len(u) :])
+        except ModelError:  # what keeps it from running away is its range
+            return model
+        reached = np.quantile(level, (RARE, 1 - RARE))
+        low, high = min(low, float(reached[0])), max(high, float(reached[1]))
+    ranged = replace(model, range=(low, high))
+    return ranged if ranged.radius < RADIUS else model
 
 
 class _Problem:

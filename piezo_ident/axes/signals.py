@@ -24,8 +24,6 @@ __all__ = ['THRESHOLDS', 'with_input_plays', 'with_loop_plays', 'with_softening'
 
 #: of the plays, in units of the rms of their signals
 THRESHOLDS = (0.05, 0.15, 0.4, 1.0, 2.0)
-#: how far the level may leave what was measured before its softening stays
-MARGIN = (0.6, 1.4)
 
 
 def with_softening(
@@ -47,8 +45,7 @@ def with_softening(
     middle = loudness[np.abs(loudness - np.median(loudness)).argmin()]
     at = [r for r, x in zip(records, loudness, strict=True) if abs(x - middle) < 0.05 * middle]
     new = _with(model, *_extension(model), at, THRESHOLDS, plays=False)
-    low, high = MARGIN[0] * loudness.min() / middle, MARGIN[1] * loudness.max() / middle
-    return replace(new, levels=new.signals, memory=memory, range=(float(low), float(high)))
+    return replace(new, levels=new.signals, memory=memory)
 
 
 def with_loop_plays(
