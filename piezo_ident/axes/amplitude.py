@@ -23,8 +23,10 @@ from piezo_ident.axes.periodic import PeriodicRecord
 
 __all__ = ['AmplitudeDependence', 'amplitude_dependence']
 
-#: poles nearer than this part of their frequency are one mode to the eye: neither is followed
-APART = 0.012
+#: modes nearer than this part of their frequency trade places from fit to fit: neither is followed
+APART = 0.02
+#: unless the peak of the other is below this part of its own
+FAINT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +107,9 @@ def _strongest(model: Modal, rate: float, count: int) -> NDArray[np.intp]:
         (model.c**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
     )
     peak = np.where(model.oscillates, size / np.abs(s.real), 0)
-    alone = [
-        np.min(np.abs(np.delete(s.imag, i) / s.imag[i] - 1), initial=1.0) > APART
-        for i in range(len(s))
-    ]
+    near = np.abs(s.imag[:, None] - s.imag) < APART * s.imag[:, None]
+    np.fill_diagonal(near, False)
+    alone = ~(near & (peak > FAINT * peak[:, None])).any(axis=1)
     peak = np.where(alone, peak, 0)
     chosen = np.argsort(-peak)[: min(count, int((peak > 0).sum()))]
     return np.asarray(chosen[np.argsort(s.imag[chosen])])
