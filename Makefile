@@ -12,7 +12,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 
 .PHONY: attack docs netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash limits study table-one clean distclean
+.PHONY: crash limits mirror study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -67,6 +67,11 @@ study-identification: .venv/.demo
 track: .venv/.demo
 	.venv/bin/python benchmarks/study_tracking.py docs/tracking.md \
 	    --picture docs/images/tracking.png
+
+# what a measured fast steering mirror has and a linear model lacks: under ten minutes; the records
+# are read from ../shared/data/fsm, or from fsm in PIEZO_IDENT_DATA
+mirror: .venv/.demo
+	.venv/bin/python benchmarks/study_mirror.py docs/mirror.md --pictures docs/images
 
 # how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
 # cores; goes on where it was stopped

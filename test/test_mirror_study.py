@@ -1,0 +1,49 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the study of the measured mirror rests on."""
+
+import importlib
+from pathlib import Path
+import sys
+
+import axes_stage as stage
+import numpy as np
+from piezo_ident.axes.explain import Candidate
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.periodic import periodicity
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / 'benchmarks'
+
+
+@pytest.fixture(scope='module')
+def study():
+    sys.path.insert(0, str(FOLDER))
+    yield importlib.import_module('study_mirror')
+    sys.path.remove(str(FOLDER))
+
+
+def test_the_records_that_do_not_repeat_are_found(study):
+    folder = study.data_folder()
+    if not folder.is_dir():
+        pytest.skip(f'{folder} is not there')
+    tested = periodicity(study.load(folder, 'train'))
+    assert [t.name for t in tested if t.suspicious] == [
+        '100 mV, realisation 1',
+        '100 mV, realisation 2',
+    ]
+    assert max(t.difference for t in tested if not t.suspicious) < 2
+
+
+def test_spectra_hold_the_whole_error(study):
+    rng = np.random.default_rng(1)
+    truth = stage.loop_stage()
+    records = stage.records(truth, rng, (1.0,), count=2, noise=0.01)
+    linear = LoopModel.of(stage.linear_stage())
+    found = study.spectra(records, Candidate('linear', {'1': linear}, {}, 0.0))
+    error = study.scores({'1': linear}, records)['1'].pooled
+    # lines between the ends stand for two
+    assert 100 * np.sqrt(found.sum()) == pytest.approx(error, rel=0.01)
+    edges = np.array([0.0, 400.0, 3200.0])
+    assert np.hypot(*study.in_bands(found, edges)) == pytest.approx(error, rel=0.01)
