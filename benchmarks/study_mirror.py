@@ -73,8 +73,10 @@ voltages at once, at 100, 200 and 300 mV rms: six realisations of 8192 samples a
 periods in steady state.
 
 **Held out**: realisations {held_out} (from zero) at each amplitude. No fit saw them, and the order
-was chosen by realisation 3 at 200 mV; which effect is named was decided by them. The test part of
-the benchmark is kept apart, and is not used here.
+was chosen by realisation 3 at 200 mV; which effect is named was decided by them. The form of
+the candidates - what softens, how many plays, the time constant - was found with their errors in
+view, so the test part of the benchmark, which is kept apart and not used here, is the one clean
+judge.
 
 ## What a linear model lacks
 
