@@ -21,6 +21,8 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from piezo_ident import effects, report
+    from piezo_ident.axes.from_records import identify_axes
+    from piezo_ident.axes.model_text import AxesModel
     from piezo_ident.common.errors import (
         Cancelled,
         ConfigError,
@@ -55,6 +57,7 @@ __version__ = '0.1.0'
 # public name: where it is defined, and its name there where that differs
 _HOMES = {
     'Axes': 'record.channels',
+    'AxesModel': 'axes.model_text',
     'Cancelled': 'common.errors',
     'ConfigError': 'common.errors',
     'DataError': 'common.errors',
@@ -82,6 +85,7 @@ _HOMES = {
     'export_fmu': 'export.fmu',
     'free_run': 'model.free_run',
     'identify': 'identification.identify',
+    'identify_axes': 'axes.from_records',
     'invert': 'control.inverse',
     'load': 'model.files',
     'read': 'record.io',
@@ -92,6 +96,7 @@ _HOMES = {
 
 __all__ = [
     'Axes',
+    'AxesModel',
     'Cancelled',
     'ConfigError',
     'DataError',
@@ -120,6 +125,7 @@ __all__ = [
     'export_fmu',
     'free_run',
     'identify',
+    'identify_axes',
     'invert',
     'load',
     'read',

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.explain import explain, Explanation, groups, Score
 from piezo_ident.axes.linear_fit import choose_order
-from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.model_text import AxesModel
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import Axes
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Record, records_of
 
 __all__ = ['AxesIdentification', 'Periods', 'identify_axes', 'periods_of']
 
@@ -119,8 +119,8 @@ class AxesIdentification:
 
     Attributes
     ----------
-    model : LoopModel
-        Displacements about their mean from voltages about `v0`.
+    model : AxesModel
+        With the effect that is named.
     explanation : Explanation
     errors : dict
         In free run on the records held out, by group.
@@ -131,7 +131,7 @@ class AxesIdentification:
     periods : Periods
     """
 
-    model: LoopModel
+    model: AxesModel
     explanation: Explanation
     errors: dict[str, Score]
     orders: dict[int, float]
@@ -141,7 +141,7 @@ class AxesIdentification:
     @property
     def error(self) -> float:
         """100 rms(y - yhat) / rms(y) on what was held out, quadratic mean of the groups."""
-        return self.explanation[self.explanation.name].error
+        return self.model.error_percent
 
     @property
     def linear_error(self) -> float:
@@ -155,7 +155,7 @@ class AxesIdentification:
 
 
 def identify_axes(
-    records: Sequence[Record],
+    records: Sequence[Record] | Record,
     *,
     iterations: int = 6,
     progress: Callable[[str, float], None] = lambda step, share: None,
@@ -168,7 +168,7 @@ def identify_axes(
 
     Parameters
     ----------
-    records : sequence of Record
+    records : Record, or sequence of Record
         With segments of at least two periods, each at least twice (realisations).
     iterations : int
         Steps a candidate.
@@ -179,7 +179,15 @@ def identify_axes(
     ------
     DataError
         When the records do not determine a model.
+
+    Examples
+    --------
+    >>> stage, program = pi.TwoAxisStage.load('two_axes'), pi.Program.load('two_axes')
+    >>> found = pi.identify_axes(stage.play(program), iterations=1)
+    >>> found.model.inputs, found.error < 0.5 * found.linear_error
+    (('v', 'v_b'), True)
     """
+    records = records_of(records, 'identify_axes: records')
     periods = periods_of(records)
     parts = groups(periods.records)
     alone = [group for group, members in parts.items() if len(members) < 2]
@@ -213,6 +221,13 @@ def identify_axes(
         iterations=iterations,
         report=told_of,
     )
-    return AxesIdentification(
-        found.model, found, found[found.name].scores, orders, repeats, periods
+    model = AxesModel(
+        found.model,
+        periods.records[0].rate,
+        periods.inputs,
+        periods.outputs,
+        periods.v0,
+        found.name,
+        found[found.name].error,
     )
+    return AxesIdentification(model, found, found[found.name].scores, orders, repeats, periods)

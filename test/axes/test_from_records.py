@@ -46,7 +46,7 @@ def test_hysteresis_inside_the_loop_is_named_and_halves_the_error(record):
     assert found.error < 0.35 * found.linear_error
     # better than a linear model made for each amplitude alone
     assert found.error < 0.7 * found.explanation['changed_dynamics'].error
-    assert found.model.radius < 1 and not found.warnings
+    assert found.model.model.radius < 1 and not found.warnings
     assert set(steps) == {'dynamics', 'candidates'}
 
 
@@ -73,7 +73,7 @@ def test_what_cannot_be_used_says_why(record):
 def test_the_text_of_a_model_reads_back_bit_by_bit(record):
     linear = periods_of([record])
     found = identify_axes([record], iterations=1)
-    for model in (found.model, LoopModel.of(found.model.linear)):
+    for model in (found.model.model, LoopModel.of(found.model.model.linear)):
         held = AxesModel(model, 2000.0, linear.inputs, linear.outputs, linear.v0, 'x', 1.5)
         text = axes_model_to_text(held)
         again = axes_model_from_text(text)

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 
 from piezo_ident.axes.from_records import AxesIdentification, identify_axes
-from piezo_ident.axes.model_text import axes_model_to_text, AxesModel
+from piezo_ident.axes.model_text import axes_model_to_text
 from piezo_ident.common.files import write_text
 from piezo_ident.common.process import Tick
 from piezo_ident.live.capture import Snapshot
@@ -35,15 +35,6 @@ def identify_axes_capture(snapshot: Snapshot, tick: Tick) -> IdentificationOutco
     found = identify_axes([record], progress=tick)
     tick('report', 0.98)
     periods, name = found.periods, found.explanation.name
-    held = AxesModel(
-        found.model,
-        periods.records[0].rate,
-        periods.inputs,
-        periods.outputs,
-        periods.v0,
-        name,
-        found.error,
-    )
     error, linear = f'{found.error:.3g}', f'{found.linear_error:.3g}'
     size = f'{len(periods.inputs)} inputs, {len(periods.outputs)} outputs'
     warnings = (*map(str, (f for f in record.faults if not f.is_note)), *found.warnings)
@@ -54,7 +45,7 @@ def identify_axes_capture(snapshot: Snapshot, tick: Tick) -> IdentificationOutco
         {'error_percent': error, 'linear_percent': linear, 'effect': name},
         json.dumps(_report(found, warnings)),
         len(warnings),
-        model=axes_model_to_text(held),
+        model=axes_model_to_text(found.model),
     )
 
 
@@ -64,7 +55,7 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
             'inputs': [*found.periods.inputs],
             'outputs': [*found.periods.outputs],
             'sample_rate': found.periods.records[0].rate,
-            'order': found.model.linear.order,
+            'order': found.model.model.linear.order,
             'effect': found.explanation.name,
             'error_formula': '100 rms(y - yhat) / rms(y), free run, realisations held out',
             'candidates': [
