@@ -182,6 +182,7 @@ def identify_axes(
 
     Examples
     --------
+    >>> import piezo_ident as pi
     >>> stage, program = pi.TwoAxisStage.load('two_axes'), pi.Program.load('two_axes')
     >>> found = pi.identify_axes(stage.play(program), iterations=1)
     >>> found.model.inputs, found.error < 0.5 * found.linear_error

@@ -45,6 +45,9 @@ class AxesModel:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> from piezo_ident.axes.loop_model import LoopModel
     >>> from piezo_ident.axes.modal import Modal
     >>> d = np.array([[1e-6, 2e-8]])  # m/V
     >>> stiff = Modal(np.zeros((1, 2, 2)), np.zeros((2, 2)), np.zeros((1, 2)), d)
