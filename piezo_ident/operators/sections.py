@@ -21,9 +21,9 @@ __all__ = ['rounding_of', 'run_sections', 'sections_at_rest', 'sections_of']
 
 #: share of the output that eq. (5) may lose by rounding
 LOST = 2e-14
-#: difference of the static gain of sections from that of G, as a share, beyond which their roots
-#: are not to be trusted
-NEAR = 1e-2
+#: difference of the static gain of sections from that of G, and of their products from B and A, as
+#: shares, beyond which their roots are not to be trusted
+NEAR, SAME = 1e-2, 1e-12
 
 
 def rounding_of(a: NDArray[np.float64]) -> float:
@@ -67,13 +67,25 @@ def sections_of(
     # few models need it, and it takes half a second to import
     from scipy.signal import zpk2sos
 
-    made = zpk2sos(np.roots(b), np.roots(np.concatenate([[1.0], a])), b[0])
+    whole = np.concatenate([[1.0], a])
+    made = zpk2sos(np.roots(b), np.roots(whole), b[0])
+    # of a B that begins with next to nothing one zero is far out, and the others are lost
+    if not (_is_product(made[:, :3], b) and _is_product(made[:, 3:], whole)):
+        return None
     static = float(np.prod(made[:, :3].sum(axis=1) / made[:, 3:].sum(axis=1)))
     # roots beside each other may be too rough themselves
     if not abs(gain - static) < NEAR * abs(static):
         return None
     made[0, :3] *= gain / static
     return np.ascontiguousarray(made[:, [0, 1, 2, 4, 5]])
+
+
+def _is_product(parts: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
+    product = np.ones(1)
+    for part in parts:
+        product = np.convolve(product, part)
+    product[: whole.size] -= whole
+    return bool(np.abs(product).max() <= SAME * np.abs(whole).max())
 
 
 def sections_at_rest(c: NDArray[np.float64], x: float) -> tuple[NDArray[np.float64], float]:

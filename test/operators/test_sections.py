@@ -46,6 +46,8 @@ def test_a_g_that_loses_nothing_is_left_as_it_is():
     # a delay is no section
     G = ringing(5)
     assert Dynamics(G.a, np.append(0.0, G.b)).sections is None
+    # one zero is far out, and those beside it are lost
+    assert Dynamics(G.a, np.array([2e-16, 1.0, 0.0, 0.0, 0.5])).sections is None
     # twelve zeros in one place are found elsewhere
     assert ringing(5, zeros=(0.9,) * 12).sections is None
 
