@@ -33,7 +33,7 @@ from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.signals import with_input_plays, with_loop_plays, with_softening
 from piezo_ident.common.errors import DataError
 
-__all__ = ['Candidate', 'Explanation', 'Score', 'explain', 'groups', 'scores']
+__all__ = ['Candidate', 'Explanation', 'Score', 'explain', 'groups', 'middle_group', 'scores']
 
 #: a candidate is preferred to simpler ones where it takes at least this part of their error
 WORTH = 0.1
@@ -197,7 +197,7 @@ def explain(
         return dict.fromkeys(by_group, model)
 
     plain = LoopModel.of(linear)
-    middle = _middle(small)
+    middle = middle_group(small)
 
     since = time.monotonic()
     one = loop_fit(plain, small, weights=small_weights, iterations=iterations // 2).model
@@ -232,7 +232,7 @@ def explain(
     return Explanation(tuple(found))
 
 
-def _middle(records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:
+def middle_group(records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:
     """Return the records of the group of the middle voltage."""
     parts = sorted(groups(records).values(), key=lambda part: float(np.mean(part[0].u ** 2)))
     return parts[len(parts) // 2]

@@ -17,7 +17,7 @@ import re
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.explain import explain, Explanation, groups, Score
+from piezo_ident.axes.explain import explain, Explanation, groups, middle_group, Score
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.model_text import AxesModel
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
@@ -202,10 +202,8 @@ def identify_axes(
     weight = {id(r): p.weight for r, p in zip(periods.records, repeats, strict=True)}
     progress('dynamics', 0.0)
     # order and start at the middle of the amplitudes
-    middle = sorted(parts, key=lambda group: float(np.mean(parts[group][0].u ** 2)))[
-        len(parts) // 2
-    ]
-    linear, orders = choose_order(parts[middle][:-1], parts[middle][-1:], orders=ORDERS)
+    middle = middle_group(periods.records)
+    linear, orders = choose_order(middle[:-1], middle[-1:], orders=ORDERS)
     progress('candidates', 0.0)
     told = 0
 
