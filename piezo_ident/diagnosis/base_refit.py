@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import refit_holds
+from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import (
     base_thresholds,
@@ -148,8 +148,8 @@ def with_refit(
 def _is_gain(simulator: Simulator, given: State, refit: Fitted) -> bool:
     """Return whether a plain gain takes most of what a refit takes: no other loop is one."""
     rows, x = simulator.rows, simulator.run(given)
-    e, h = centred(rows.x - x, rows.of_record), centred(x, rows.of_record)
-    taken, whole = float((h @ e) ** 2 / (h @ h)), float(e @ e)
+    e = centred(rows.x - x, rows.of_record)
+    taken, whole = taken_by_gain(rows, x, e), float(e @ e)
     return taken > criteria.ADDED * (whole - float(refit.errors.sum()))
 
 

@@ -31,6 +31,7 @@ __all__ = [
     'right_sides',
     'solve',
     'standard_errors',
+    'taken_by_gain',
     'with_columns',
 ]
 
@@ -177,6 +178,12 @@ def standard_errors(difference: Array) -> float:
         return 0.0
     deviation = float(np.sqrt(difference.size * difference.var(ddof=1)))
     return total / deviation if deviation > 0.0 else float(np.copysign(np.inf, total))
+
+
+def taken_by_gain(rows: Rows, x: Array, e: Array) -> float:
+    """Return the sum of squares that a gain of x takes off e, both without their means."""
+    h, e = centred(x, rows.of_record), centred(e, rows.of_record)
+    return float((h @ e) ** 2 / (h @ h))
 
 
 def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import refit_holds
+from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
@@ -104,8 +104,7 @@ def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     before, after = float(np.mean(e * e)), float(fitted.transfer.sum()) / rows.n
     if rows.percent(before - after) < criteria.REFIT_FINDING or after > 0.5 * before:
         return False
-    h = centred(x, rows.of_record)
-    by_gain = float((h @ e) ** 2 / (h @ h)) / rows.n
+    by_gain = taken_by_gain(rows, x, e) / rows.n
     return by_gain <= criteria.ADDED * (before - after) and refit_holds(rows, e, fitted.transfer)
 
 
