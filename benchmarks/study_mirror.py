@@ -372,7 +372,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('out', type=Path)
     parser.add_argument('--pictures', type=Path)
-    parser.add_argument('--model', type=Path, help='where the model named goes, as npz')
     args = parser.parse_args()
     folder = data_folder()
     if not folder.is_dir():
@@ -399,8 +398,6 @@ def main() -> None:
     report(f'{linear.order} states: {errors}')
     explanation = explain(linear, taught, held_out, weights=weights, report=report)
     model = explanation.model
-    if args.model is not None:
-        model.save(args.model)
     report(f'named: {explanation.name}')
 
     memories = memory_rows(explanation, taught, held_out, weights)

@@ -17,10 +17,7 @@ and gain change with the motion.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +25,8 @@ from piezo_ident.axes.loop_kernels import trajectory
 from piezo_ident.axes.modal import Modal, Modes, modes
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.common.files import temporary_output
 
-__all__ = ['LoopModel', 'LoopStream', 'Run', 'load_loop_model']
+__all__ = ['LoopModel', 'LoopStream', 'Run']
 
 #: poles of the stage, softened or not, stay within
 RADIUS = 0.9999
@@ -153,13 +149,6 @@ class LoopModel:
         """Return y - yhat over the last period of a record, in steady state and free run."""
         return np.asarray(record.y[-1] - self.simulate(record.u[-1]))
 
-    def save(self, path: str | Path) -> None:
-        """Write the model as arrays (NumPy's npz)."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        linear = {f.name: getattr(self.linear, f.name) for f in fields(Modal)}
-        with temporary_output(path, overwrite=True) as new, open(new, 'wb') as file:
-            np.savez(file, **arrays, **linear)
-
 
 class LoopStream:
     """A model that runs block by block, with the memory of what came before."""
@@ -223,20 +212,3 @@ class LoopStream:
     def simulate(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements under the next voltages."""
         return self.run(u).y
-
-
-_ARRAYS = ('e', 'h', 'f', 'g', 'levels', 'mu', 'r', 'memory', 'range')
-
-
-def load_loop_model(path: str | Path) -> LoopModel:
-    """Read a model that `LoopModel.save` wrote."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            held: Mapping[str, Any] = dict(file)
-        linear = Modal(*(held[f.name] for f in fields(Modal)))
-        parts = {name: held[name] for name in _ARRAYS}
-    except (OSError, ValueError, KeyError) as error:
-        raise ModelError(f'{path} holds no model of several axes: {error}') from error
-    low, high = parts.pop('range').tolist()
-    levels, memory = int(parts.pop('levels')), float(parts.pop('memory'))
-    return LoopModel(linear, levels=levels, memory=memory, range=(low, high), **parts)

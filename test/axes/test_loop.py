@@ -8,7 +8,7 @@ import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.loop_fit import loop_fit, output_sensitivities, Parameters
 from piezo_ident.axes.loop_kernels import KINDS
-from piezo_ident.axes.loop_model import load_loop_model, LoopModel
+from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.modal import modes
 from piezo_ident.common.errors import DataError, ModelError
 import pytest
@@ -118,14 +118,3 @@ def test_a_model_that_runs_away_says_so():
     wild = replace(truth, e=-60 * truth.e)
     with pytest.raises(ModelError, match='runs away'):
         wild.simulate(stage.multisine(np.random.default_rng(7), 1.5))
-
-
-def test_a_model_comes_back_from_its_file(tmp_path):
-    model = stage.loop_stage()
-    model.save(tmp_path / 'stage.npz')
-    again = load_loop_model(tmp_path / 'stage.npz')
-    u = stage.multisine(np.random.default_rng(8), 1.0)
-    assert (again.simulate(u) == model.simulate(u)).all()
-    (tmp_path / 'none.npz').write_text('nothing')
-    with pytest.raises(ModelError, match='holds no model'):
-        load_loop_model(tmp_path / 'none.npz')
