@@ -12,7 +12,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ['NODES', 'Declaration']
+__all__ = ['LATCHED_TOPICS', 'NODES', 'SAMPLE_TOPICS', 'Declaration']
+
+#: topics of blocks of samples, and of texts that a node that comes late must still hear
+SAMPLE_TOPICS = (
+    'voltage',
+    'displacement',
+    'applied_voltage',
+    'prediction',
+    'residual',
+    'reference',
+    'tracking_error',
+)
+LATCHED_TOPICS = ('model', 'report')
 
 
 @dataclass(frozen=True)
@@ -188,15 +200,8 @@ RECORDER = (
     Declaration(
         'topics',
         (
-            'voltage',
-            'displacement',
-            'applied_voltage',
-            'prediction',
-            'residual',
-            'reference',
-            'tracking_error',
-            'model',
-            'report',
+            *SAMPLE_TOPICS,
+            *LATCHED_TOPICS,
             'preview',
             'excitation/status',
             'stage/status',

@@ -19,7 +19,8 @@ from typing import Any
 
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import ArrivalClock
-from piezo_ident.nodes.wire import LATCHED, LATCHED_TOPICS, SAMPLE_TOPICS, STREAM
+from piezo_ident.nodes.parameters import LATCHED_TOPICS, SAMPLE_TOPICS
+from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.write import knows_type, SAMPLE_QOS
 from piezo_ident.record.channels import channel_of_quantity, role_of
 from piezo_ident.record.stream import LossCount

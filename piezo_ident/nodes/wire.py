@@ -16,9 +16,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 __all__ = [
     'LATCHED',
-    'LATCHED_TOPICS',
     'PREVIEW',
-    'SAMPLE_TOPICS',
     'SERVICE',
     'STREAM',
     'from_message',
@@ -28,17 +26,6 @@ __all__ = [
 
 #: most samples of a block, and characters of a label
 MOST, LONGEST = 100_000, 200
-#: topics of Float64MultiArray with the QoS of `STREAM`, and of String with that of `LATCHED`
-SAMPLE_TOPICS = (
-    'voltage',
-    'displacement',
-    'applied_voltage',
-    'prediction',
-    'residual',
-    'reference',
-    'tracking_error',
-)
-LATCHED_TOPICS = ('model', 'report')
 
 #: samples: reliable, the last hundred blocks
 STREAM = QoSProfile(
