@@ -7,7 +7,8 @@ How often a diagnosis is right on stages that are no sums of plays.
     python benchmarks/study_foreign.py --set tuning docs/diagnosis_study_foreign.md
 
 Every case: a stage from `foreign`, identified from one record, diagnosed on another and judged on
-a third that nothing saw.  One case in Python:
+a third that nothing saw.  The set `known` was the final one once, and may be looked at since;
+nothing may be tuned on the laws of `final`.  One case in Python:
 
     from study_foreign import case_records, judged
     records = case_records(draw('tuning', 7))
@@ -200,7 +201,7 @@ def case_records(case: Case, forms: bool = True) -> Records:
     forms : bool
         Also compare forms of the hysteresis, which takes some seconds.
     """
-    stage = make_stage(case.core, case.seed, case.effects, further=case.group == 'final')
+    stage = make_stage(case.core, case.seed, case.effects, further=case.group != 'tuning')
     low, high = stage.limits
     moved = motions(case, stage)
     volts = {name: low + (high - low) * m.u for name, m in moved.items()}

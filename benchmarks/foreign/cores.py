@@ -13,7 +13,7 @@ is one of
 - the law of Bouc and Wen (Wen, J. Eng. Mech. 102 (1976) 249),
 - Duhem's equation in the form of Coleman and Hodgdon (Int. J. Eng. Sci. 24 (1986) 897).
 
-Further laws are in `more_cores`.
+Further laws are in `more_cores` and `unseen_cores`.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ __all__ = [
     'everett_table',
     'play',
     'preisach',
+    'preisach_step',
     'uneven',
     'unlike_plays',
 ]
@@ -187,35 +188,50 @@ def _everett(a: float, b: float, table: Array, diagonal: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _preisach(u: Array, table: Array, diagonal: Array, out: Array) -> None:
+def preisach_step(
+    new: float,
+    x: float,
+    h: float,
+    n: int,
+    extreme: Array,
+    value: Array,
+    table: Array,
+    diagonal: Array,
+) -> tuple[int, float]:
+    """Return how many extremes are left and the output where the input goes from x to new."""
     # extremes: minimum, maximum, minimum, ...; value: the output when each was reached
+    if new == x:
+        return n, h
+    rising = new > x
+    if rising != (n % 2 == 1):
+        if n == DEPTH:
+            n -= 2
+        else:
+            extreme[n], value[n] = x, h
+            n += 1
+    if rising:
+        while n >= 3 and new >= extreme[n - 2]:
+            n -= 2
+    else:
+        while n >= 2 and new <= extreme[n - 2]:
+            n -= 2
+    if n == 0:
+        n = 1
+    last = extreme[n - 1]
+    if new > last:
+        return n, value[n - 1] + _everett(new, last, table, diagonal)
+    return n, value[n - 1] - _everett(last, new, table, diagonal)
+
+
+@njit(cache=True, nogil=True)
+def _preisach(u: Array, table: Array, diagonal: Array, out: Array) -> None:
     extreme, value = np.empty(DEPTH), np.empty(DEPTH)
     extreme[0], value[0] = 0.0, 0.0
     n, x, h = 1, 0.0, 0.0
     for k in range(u.size):
         new = min(max(u[k], 0.0), 1.0)
-        if new != x:
-            rising = new > x
-            if rising != (n % 2 == 1):
-                if n == DEPTH:
-                    n -= 2
-                else:
-                    extreme[n], value[n] = x, h
-                    n += 1
-            if rising:
-                while n >= 3 and new >= extreme[n - 2]:
-                    n -= 2
-            else:
-                while n >= 2 and new <= extreme[n - 2]:
-                    n -= 2
-            if n == 0:
-                n = 1
-            last = extreme[n - 1]
-            if new > last:
-                h = value[n - 1] + _everett(new, last, table, diagonal)
-            else:
-                h = value[n - 1] - _everett(last, new, table, diagonal)
-            x = new
+        n, h = preisach_step(new, x, h, n, extreme, value, table, diagonal)
+        x = new
         out[k] = h
 
 

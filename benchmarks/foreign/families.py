@@ -14,6 +14,13 @@ from .more_cores import (
     skewed_bouc_wen,
     turning_curves,
 )
+from .unseen_cores import (
+    frustrated_dipoles,
+    loaded_contacts,
+    moving_preisach,
+    rugged_walls,
+    turning_friction,
+)
 
 __all__ = ['LAWS', 'SETS']
 
@@ -27,12 +34,18 @@ LAWS = {
     'skewed-bouc-wen': skewed_bouc_wen,
     'dahl': dahl,
     'turning-curves': turning_curves,
+    'moving-preisach': moving_preisach,
+    'loaded-contacts': loaded_contacts,
+    'turning-friction': turning_friction,
+    'rugged-walls': rugged_walls,
+    'frustrated-dipoles': frustrated_dipoles,
 }
 
-#: how often each is dealt
+#: how often each is dealt; the laws of 'tuning' and 'known' may be looked at, those of 'final' are
+#: for judging alone
 SETS = {
     'tuning': ('preisach', 'preisach', 'bouc-wen', 'duhem'),
-    'final': (
+    'known': (
         'hills',
         'hills',
         'kp-kernels',
@@ -40,5 +53,12 @@ SETS = {
         'skewed-bouc-wen',
         'dahl',
         'turning-curves',
+    ),
+    'final': (
+        'moving-preisach',
+        'loaded-contacts',
+        'turning-friction',
+        'rugged-walls',
+        'frustrated-dipoles',
     ),
 }

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Further forms of the effects' laws, for the final set alone.  Parts of the span."""
+"""Further forms of the effects' laws, for all sets but that of the tuning.  Parts of the span."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Laws of the final set, which nothing was tuned on.
+Laws of the known set, which the diagnosis was judged on before it was tuned on them.
 
 - Preisach operators whose relays lie in Gaussian and Lorentzian hills,
 - a few Krasnosel'skii-Pokrovskii kernels (Systems with Hysteresis, Springer 1989),
