@@ -31,7 +31,7 @@ sys.path[:0] = [str(HERE.parent), str(HERE.parents[1])]
 
 from piezo_ident.common.errors import PiezoIdentError
 from rows import processors, shares, write_rows
-from running_graph import NODES, RATE, recorded_samples, RunningGraph, STREAMS
+from running_graph import BLOCK, NODES, RATE, recorded_samples, RunningGraph, STREAMS
 import yaml
 
 __all__ = ['Soak', 'Stream', 'clock_drift', 'slope', 'soak']
@@ -159,7 +159,7 @@ class Soak:
         yield f'recording: {self.parts} parts, {self.recorded}'
 
 
-def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
+def soak(seconds: float, factor: float, part: int, folder: Path, size: int = BLOCK) -> Soak:
     """
     Run the graph.
 
@@ -173,6 +173,8 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         Size of a part of the recording [bytes].
     folder : path
         For bags and logs.
+    size : int, optional
+        Samples in a block.
     """
     data = yaml.safe_load(MODEL.read_text())
     model = folder / 'model.yaml'
@@ -183,7 +185,7 @@ def soak(seconds: float, factor: float, part: int, folder: Path) -> Soak:
         'model': {'model': str(model)},
         'recorder': {'max_bag_size': part},
         # the recorder and the observer listen too
-        'excitation': {'subscribers': 5, 'rate_factor': factor},
+        'excitation': {'subscribers': 5, 'rate_factor': factor, 'block_size': size},
     }
     streams, samples, late, slipped = Streams(), 0, 0, 0.0
     times: list[float] = []
