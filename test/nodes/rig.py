@@ -3,8 +3,10 @@
 
 """A stage, an identifier and a model on a graph whose excitation is the test."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+import contextlib
 import re
+import signal
 import time
 
 from course import (
@@ -120,6 +122,23 @@ class Rig:
         # what was applied comes after the answer
         last = self.answers[-1].t[-1]
         self.g.wait(lambda: self.applied[-1].t[-1] == last, 'what was applied last')
+
+    @contextlib.contextmanager
+    def unanswered(self, blocks: list[Samples]) -> Iterator[None]:
+        """Have the identifier hear blocks that a stage that stands still answers afterwards."""
+        stage, count = self.g.handle('stage'), len(self.answers) + len(blocks)
+        # a message that was lost on its way cannot come again from one who stands still
+        self.settle()
+        stage.send(signal.SIGSTOP)
+        try:
+            for b in blocks:
+                self.g.publish('voltage', b)
+                self.sent.append(b)
+            self.settle()
+            yield
+        finally:
+            stage.send(signal.SIGCONT)
+        self.g.wait(lambda: len(self.answers) >= count, 'what waited for the stage')
 
     def to_capture(self) -> dict[str, float]:
         """Return the seconds of each topic that the observer has seen."""
