@@ -269,6 +269,9 @@ class ExcitationNode(LabNode):
         while not all(guard.is_at_rest for guard in guards):
             if playing.hurry and not hurried:
                 guards, hurried = [Guard(settings, guard.applied) for guard in guards], True
+                # all of it fits into the queues of the readers: what held it up is caught up with
+                size, origin = max(1, round(0.01 * settings.sample_rate)), playing.tick
+                clock = playing.clock = Schedule(clock.speed, time.monotonic(), math.inf)
             longest = LAST_RAMP if hurried else math.inf
             voltages = [guard.idle(size, longest) for guard in guards]
             time.sleep(max(0.0, clock.due(playing.tick - origin) - time.monotonic()))
@@ -321,7 +324,8 @@ class ExcitationNode(LabNode):
         if playing is not None and self._thread is not None:
             playing.hurry = True
             playing.stop.set()
-            self._thread.join(LAST_RAMP + 0.9)
+            # the node is ended with an error when that takes too long
+            self._thread.join()
             for output in self._outputs:
                 output.close()
 

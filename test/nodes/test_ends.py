@@ -7,6 +7,7 @@ SIGINT and SIGTERM end every node in two seconds whatever it does, with the driv
 On a machine that other programs make three times slower.
 """
 
+from collections.abc import Callable
 import itertools
 import signal
 import time
@@ -21,13 +22,16 @@ from piezo_ident.record.bags.write import write_bag
 
 #: how soon a node has to be gone [s]
 PROMISED = 2.0
+#: how long a machine that does other things may hold a ramp to rest up [s]
+HELD_UP = 1.0
 
 
-def end(g: Graph) -> None:
+def end(g: Graph, meanwhile: Callable[[], None] = lambda: None) -> None:
     """Send the two signals to nodes in turn, and see that each ends in time with exit code 0."""
     begin, took = time.monotonic(), {}
     for handle, number in zip(g.handles, itertools.cycle([signal.SIGINT, signal.SIGTERM])):
         handle.send(number)
+    meanwhile()
 
     def look() -> bool:
         for handle in g.handles:
@@ -37,6 +41,8 @@ def end(g: Graph) -> None:
 
     g.wait(look, 'the end of all nodes')
     for handle in g.handles:
+        if 'ended before' in handle.complaints:
+            raise Late(f'{handle.name} {handle.complaints}')
         assert handle.process.returncode == 0, (handle.name, handle.log)
         assert not handle.complaints, handle.name
         in_time(took[handle.name], PROMISED, f'the end of {handle.name}')
@@ -100,8 +106,16 @@ def in_the_middle(record, tmp_path):
         # last, for the signals to come while it ramps
         assert g.call('slow/excitation/stop')[0]
         g.wait(lambda: slow[-1].segment == 'ramp:stop', 'the slow ramp')
+
+        def held_up() -> None:
+            process = g.handle('excitation').process
+            g.wait(lambda: voltage[-1].segment == 'ramp:stop', 'the ramp')
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(HELD_UP)
+            process.send_signal(signal.SIGCONT)
+
         with crowd():
-            end(g)
+            end(g, held_up)
         try:
             for stream in (voltage, slow, applied, fed):
                 g.wait(lambda s=stream: s[-1].values[-1] == 0.0, 'rest', 10.0)
