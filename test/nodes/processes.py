@@ -113,8 +113,17 @@ def take_domain() -> tuple[int, IO[str]]:
         except OSError:
             lock.close()
             continue
+        _clear_ports(domain)
         return domain, lock
     raise RuntimeError('all ROS domains are in use')
+
+
+def _clear_ports(domain: int) -> None:
+    """Remove what a node that was killed left locked: the next one on its port would hang."""
+    first = 7400 + 250 * domain
+    for path in Path('/dev/shm').glob('*fastrtps_port*'):
+        if int(re.sub(r'\D', '', path.name)) in range(first, first + 250):
+            path.unlink(missing_ok=True)
 
 
 def _shared_memory(pid: int) -> list[Path]:
