@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.amplitude import amplitude_dependence, AmplitudeDependence
-from piezo_ident.axes.explain import Candidate, explain, Explanation, groups, Score, scores
+from piezo_ident.axes.explain import explain, Explanation, groups, Rival, Score, scores
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.loop_fit import loop_fit
 from piezo_ident.axes.loop_model import LoopModel
@@ -202,7 +202,7 @@ def table(explanation: Explanation) -> str:
     return '\n'.join(rows)
 
 
-def spectra(records: Sequence[PeriodicRecord], candidate: Candidate | None) -> NDArray[np.float64]:
+def spectra(records: Sequence[PeriodicRecord], candidate: Rival | None) -> NDArray[np.float64]:
     """Return the power of the errors, or of the motion, by line, as a share of that of y."""
     total, power = 0.0, 0.0
     for record in records:
@@ -354,7 +354,7 @@ def sentence(explanation: Explanation) -> str:
     """Say what was found."""
     best, linear = explanation[explanation.name], explanation['linear']
 
-    def pooled(candidate: Candidate) -> str:
+    def pooled(candidate: Rival) -> str:
         return ' / '.join(f'{s.pooled:.1f}' for s in candidate.scores.values())
 
     text = (

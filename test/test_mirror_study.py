@@ -9,7 +9,7 @@ import sys
 
 import axes_stage as stage
 import numpy as np
-from piezo_ident.axes.explain import Candidate
+from piezo_ident.axes.explain import Rival
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.periodic import periodicity
 import pytest
@@ -41,7 +41,7 @@ def test_spectra_hold_the_whole_error(study):
     truth = stage.loop_stage()
     records = stage.records(truth, rng, (1.0,), count=2, noise=0.01)
     linear = LoopModel.of(stage.linear_stage())
-    found = study.spectra(records, Candidate('linear', {'1': linear}, {}, 0.0))
+    found = study.spectra(records, Rival('linear', {'1': linear}, {}, 0.0))
     error = study.scores({'1': linear}, records)['1'].pooled
     # lines between the ends stand for two
     assert 100 * np.sqrt(found.sum()) == pytest.approx(error, rel=0.01)

@@ -33,7 +33,7 @@ from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.signals import with_input_plays, with_loop_plays, with_softening
 from piezo_ident.common.errors import DataError
 
-__all__ = ['Candidate', 'Explanation', 'Score', 'explain', 'groups', 'middle_group', 'scores']
+__all__ = ['Explanation', 'Rival', 'Score', 'explain', 'groups', 'middle_group', 'scores']
 
 #: a candidate is preferred to simpler ones where it takes at least this part of their error
 WORTH = 0.1
@@ -59,7 +59,7 @@ class Score:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class Rival:
     """
     One explanation.
 
@@ -86,9 +86,9 @@ class Candidate:
 class Explanation:
     """The candidates, and which of them is named."""
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Rival, ...]
 
-    def __getitem__(self, name: str) -> Candidate:
+    def __getitem__(self, name: str) -> Rival:
         return next(c for c in self.candidates if c.name == name)
 
     @property
@@ -171,10 +171,10 @@ def explain(
     ]
     small = [record for _, record in chosen]
     small_weights = [weight for weight, _ in chosen]
-    found: list[Candidate] = []
+    found: list[Rival] = []
 
     def judged(name: str, models: dict[str, LoopModel], since: float) -> None:
-        candidate = Candidate(name, models, scores(models, held_out), time.monotonic() - since)
+        candidate = Rival(name, models, scores(models, held_out), time.monotonic() - since)
         found.append(candidate)
         pooled = ' / '.join(f'{s.pooled:.2f}' for s in candidate.scores.values())
         report(f'{name}: {pooled} % ({candidate.seconds:.0f} s)')

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 
-__all__ = ['FrequencyResponse', 'excited_lines', 'frequency_response']
+__all__ = ['LineResponse', 'excited_lines', 'frequency_response']
 
 #: a line whose voltage is smaller than this part of the largest is not excited
 EXCITED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class FrequencyResponse:
+class LineResponse:
     """
     G at lines of a period.
 
@@ -69,7 +69,7 @@ def frequency_response(
     lines: NDArray[np.intp] | None = None,
     half_width: int = 4,
     degree: int = 2,
-) -> FrequencyResponse:
+) -> LineResponse:
     """
     Fit the response at each excited line by a local polynomial over its neighbours.
 
@@ -107,4 +107,4 @@ def frequency_response(
         solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
         g[i] = solution[:inputs].T
     (shape,) = shapes
-    return FrequencyResponse(lines, shape[0][0], shape[2], g)
+    return LineResponse(lines, shape[0][0], shape[2], g)

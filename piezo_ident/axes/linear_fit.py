@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.frequency_response import frequency_response, FrequencyResponse
+from piezo_ident.axes.frequency_response import frequency_response, LineResponse
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.subspace import subspace
@@ -33,12 +33,12 @@ THIN = 3
 RADIUS = 0.9999
 
 
-def linear_fit(response: FrequencyResponse, order: int, *, iterations: int = 20) -> Modal:
+def linear_fit(response: LineResponse, order: int, *, iterations: int = 20) -> Modal:
     """Identify a stable modal model of a frequency response."""
     return refined(subspace(response, order), response, iterations=iterations)
 
 
-def refined(model: Modal, response: FrequencyResponse, *, iterations: int = 20) -> Modal:
+def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:
     """Lower the error of a stable model's response, summed over lines, inputs and outputs."""
     z, scale = response.z, float(np.sqrt(np.mean(np.abs(response.g) ** 2)))
     error = (model.response(z) - response.g) / scale

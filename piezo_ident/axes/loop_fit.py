@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.linear_fit import moved_blocks
 from piezo_ident.axes.loop_kernels import CHUNK, KINDS, sensitivities
-from piezo_ident.axes.loop_model import LoopModel, RADIUS, Run
+from piezo_ident.axes.loop_model import LoopModel, Passage, RADIUS
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
@@ -139,7 +139,7 @@ def output_sensitivities(
     model: LoopModel,
     parameters: Parameters,
     u: NDArray[np.float64],
-    run: Run,
+    run: Passage,
     skip: int = 0,
 ) -> NDArray[np.float32]:
     """
@@ -305,7 +305,7 @@ class _Problem:
 
     def _error(
         self, model: LoopModel, target: tuple[NDArray[np.float64], NDArray[np.float64], float]
-    ) -> tuple[NDArray[np.float64], Run]:
+    ) -> tuple[NDArray[np.float64], Passage]:
         u, y, weight = target
         run = model.run(u)
         answer = run.y[self.warm_up :]

@@ -26,14 +26,14 @@ from piezo_ident.axes.modal import Modal, Modes, modes
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError, ModelError
 
-__all__ = ['LoopModel', 'LoopStream', 'Run']
+__all__ = ['LoopModel', 'LoopStream', 'Passage']
 
 #: poles of the stage, softened or not, stay within
 RADIUS = 0.9999
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Passage:
     """What passes in the loop: states, signals, pushes, plays, gates, squared level, outputs."""
 
     x: NDArray[np.float64]
@@ -137,7 +137,7 @@ class LoopModel:
         y = self.run(np.concatenate([u[len(u) - before :], u])).y[before:]
         return y - y.mean(axis=0) if periodic else y
 
-    def run(self, u: NDArray[np.float64]) -> Run:
+    def run(self, u: NDArray[np.float64]) -> Passage:
         """Return what passes in the loop under voltages u from rest."""
         return LoopStream(self).run(u)
 
@@ -159,7 +159,7 @@ class LoopStream:
         self._memory = np.zeros(model.mu.shape)
         self._level = np.ones(1)
 
-    def run(self, u: NDArray[np.float64]) -> Run:
+    def run(self, u: NDArray[np.float64]) -> Passage:
         """Return what passes in the loop under the next voltages."""
         model = self.model
         u = np.ascontiguousarray(u, dtype=float)
@@ -169,7 +169,7 @@ class LoopStream:
                 'give (samples, inputs)'
             )
         n, q, k = len(u), *model.mu.shape
-        run = Run(
+        run = Passage(
             np.zeros((n, model.linear.order)),
             np.zeros((n, q)),
             np.zeros((n, q)),

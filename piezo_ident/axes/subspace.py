@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.frequency_response import FrequencyResponse
+from piezo_ident.axes.frequency_response import LineResponse
 from piezo_ident.axes.modal import balanced, Modal, to_modal
 from piezo_ident.common.errors import IdentificationError
 
@@ -25,7 +25,7 @@ ROWS = 120
 TURNS = 3
 
 
-def subspace(response: FrequencyResponse, order: int) -> Modal:
+def subspace(response: LineResponse, order: int) -> Modal:
     """
     Identify a stable modal model of an even order.
 
@@ -50,7 +50,7 @@ def subspace(response: FrequencyResponse, order: int) -> Modal:
     return model
 
 
-def _observability(response: FrequencyResponse, rows: int) -> NDArray[np.float64]:
+def _observability(response: LineResponse, rows: int) -> NDArray[np.float64]:
     """Return an orthonormal basis of what G spans and the inputs do not, strongest first."""
     inputs = response.g.shape[2]
     powers = response.z[None, :] ** np.arange(rows)[:, None]
@@ -80,7 +80,7 @@ def _least_squares(
     )
 
 
-def _with_b(model: Modal, response: FrequencyResponse) -> Modal:
+def _with_b(model: Modal, response: LineResponse) -> Modal:
     reach = model.reach(response.z)
     outputs = len(model.c)
     direct = np.broadcast_to(np.eye(outputs), (len(reach), outputs, outputs))
@@ -90,7 +90,7 @@ def _with_b(model: Modal, response: FrequencyResponse) -> Modal:
     return balanced(Modal(model.blocks, found[:order], model.c, found[order:]))
 
 
-def _with_c(model: Modal, response: FrequencyResponse) -> Modal:
+def _with_c(model: Modal, response: LineResponse) -> Modal:
     states = model.states(response.z)
     inputs = model.b.shape[1]
     direct = np.broadcast_to(np.eye(inputs), (len(states), inputs, inputs))

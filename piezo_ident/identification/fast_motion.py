@@ -24,8 +24,8 @@ __all__ = [
     'EDGES',
     'FAINT',
     'HIGH_PASS',
+    'FastAndCalm',
     'FastMotion',
-    'Samples',
     'high_passed',
     'moving',
     'rms_above',
@@ -91,14 +91,14 @@ def _windows(u: Vector, rate: float) -> Mask:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class FastAndCalm:
     """Of each run, the samples whose motion is fast, and those that are slow enough for H."""
 
     fast: list[Mask]
     calm: list[Mask]
 
     @classmethod
-    def of(cls, excerpts: Sequence[Excerpt], rate: float, swing: float) -> Samples:
+    def of(cls, excerpts: Sequence[Excerpt], rate: float, swing: float) -> FastAndCalm:
         """Return them for the fitted parts of runs; `swing` is the range of the voltage."""
         jumps = [_windows(e.u, rate) & e.use for e in excerpts]
         rms = [rms_above(e.u, rate, HIGH_PASS) for e in excerpts]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.errors import key_of
-from piezo_ident.identification.fast_motion import FastMotion, moving, Samples
+from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
 from piezo_ident.identification.hold_out import fitted_parts, MOVES
 from piezo_ident.identification.linear_part import (
     find_linear_part,
@@ -125,7 +125,7 @@ def joint_fit(
     least = min(piece.n for piece in pieces) // 10
     step = delay_from_steps(pieces, min(100, least), min(60, least))
     progress('delay', 1.0)
-    motion = Samples.of(excerpts, rate, swing)
+    motion = FastAndCalm.of(excerpts, rate, swing)
     delays = [] if step.samples is None else [step.samples]
     delay, G = (
         Delay(settings.delay if settings.delay is not None else sum(delays)),

@@ -4,7 +4,7 @@
 """Delay and G from any fast motion, on modes in continuous time behind a held voltage."""
 
 import numpy as np
-from piezo_ident.identification.fast_motion import FastMotion, moving, Samples
+from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
 from piezo_ident.identification.linear_part import (
     fast_part,
     find_linear_part,
@@ -142,7 +142,7 @@ def test_fast_motion_under_a_slow_sweep_is_left_where_there_is_better():
     t = np.arange(40_000) / FS
     sweep = 0.45 * np.sin(2.0 * np.pi * 60.0 * t) + 0.02 * np.sin(2.0 * np.pi * 400.0 * t)
     u = np.concatenate([sweep, np.zeros(4000), chirp(1.0, 3000.0)])
-    samples = Samples.of([Excerpt(u, u, np.ones(u.size, dtype=bool))], FS, 0.9)
+    samples = FastAndCalm.of([Excerpt(u, u, np.ones(u.size, dtype=bool))], FS, 0.9)
     [fast] = samples.fast
     assert fast[44_000:].mean() > 0.5
     assert fast[:38_000].mean() < 0.01
