@@ -141,9 +141,8 @@ def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> float:
         excerpts = [run.excerpt(run.use) for run in runs]
         swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
         r = fine_thresholds(swing, swing / 10.0)
-        n = sum(int(e.use.sum()) for e in excerpts)
         R = factorise(excerpts, r, model.dynamics, model.delay)
-        model = replace(model, hysteresis=fit_hysteresis(R, r, n).hysteresis)
+        model = replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
     predictions = predictions_of(model, runs)
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
     errors = [

@@ -258,7 +258,7 @@ def without_harm(
         return list(runs), list(excerpts)
     r, delay = even_thresholds(swing, COUNT), Delay(found.samples, found.fraction)
     R = factorise(known, r, G, delay)
-    both, alone = (fit_hysteresis(S, r, 1) for S in (factorise(excerpts, r, G, delay), R))
+    both, alone = (fit_hysteresis(S, r) for S in (factorise(excerpts, r, G, delay), R))
     if both.left(R) < HARM**2 * alone.left(R):
         return list(runs), list(excerpts)
     return [replace(run, use=run.use & run.known) for run in runs], known

@@ -93,8 +93,7 @@ def _held_loss(
     dynamics: Dynamics,
     delay: Delay,
 ) -> tuple[float, NDArray[np.float64]]:
-    n = int(sum(e.use.sum() for e in fit))
-    result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds, n)
+    result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds)
     R = factorise(held, thresholds, dynamics, delay)
     return float(np.sqrt(result.left(R))), merged(result.hysteresis)
 
@@ -171,10 +170,9 @@ def with_small(
         As in `factorise`.
     """
     finer = np.concatenate([thresholds[0] / 2.0 ** np.arange(SMALL, 0, -1), thresholds])
-    n = int(sum(e.use.sum() for e in fit))
 
     def error(r: NDArray[np.float64]) -> float:
-        h = fit_hysteresis(factorise(fit, r, dynamics, delay), r, n).hysteresis
+        h = fit_hysteresis(factorise(fit, r, dynamics, delay), r).hysteresis
         # the rows below the offsets know nothing of them
         R = factorise(small, h.thresholds, dynamics, delay)[len(small) :, len(small) :]
         return float(np.linalg.norm(R[:, :-1] @ [*h.weights, h.p1, h.p2] - R[:, -1]))
@@ -244,7 +242,7 @@ def choose_law(
     whole = triangular_factor(parts, parts[0].shape[1])
 
     def fitted(R: NDArray[np.float64], law: HysteresisLaw) -> HysteresisFit:
-        return fit_hysteresis(_of(R, law, all_terms), law, 1)
+        return fit_hysteresis(_of(R, law, all_terms), law)
 
     # no law can do better than all their columns with any weights
     least = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=1e-10)[0]

@@ -253,7 +253,7 @@ class HysteresisFit:
 def fit_hysteresis(
     R: NDArray[np.float64],
     law: HysteresisLaw | NDArray[np.float64],
-    n: int,
+    n: int = 1,
     *,
     solver: Solver = 'least_squares',
     polish: bool = False,
@@ -269,8 +269,8 @@ def fit_hysteresis(
         From `factorise`.
     law : HysteresisLaw, or ndarray of shape (m,)
         As there.
-    n : int
-        Number of samples behind R.
+    n : int, optional
+        Number of samples behind R; only `rms` and `std` of the result go by it.
     solver : {'least_squares', 'swarm'}
         Whose weights are returned; both losses are kept.
     polish : bool, optional

@@ -262,13 +262,12 @@ def second_step(
     G = fast_part(first, rate, lean)
 
     excerpts = triangle_excerpts(runs)
-    n = int(sum(e.use.sum() for e in excerpts))
     swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
     excursion = float(np.ptp(run.u[start:stop]))
     r = fine_thresholds(swing, excursion)
 
     def undo(G: Dynamics) -> Hysteresis:
-        return fit_hysteresis(factorise(excerpts, r, G, delay), r, n).hysteresis
+        return fit_hysteresis(factorise(excerpts, r, G, delay), r).hysteresis
 
     H = undo(G)
     progress('dynamics', 0.45)

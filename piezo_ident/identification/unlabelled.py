@@ -127,10 +127,8 @@ def joint_fit(
     progress('delay', 1.0)
     motion = FastAndCalm.of(excerpts, rate, swing)
     delays = [] if step.samples is None else [step.samples]
-    delay, G = (
-        Delay(settings.delay if settings.delay is not None else sum(delays)),
-        Dynamics.unit(),
-    )
+    G = Dynamics.unit()
+    delay = Delay(settings.delay if settings.delay is not None else sum(delays))
     r = even_thresholds(swing, 40)
     linear: LinearPart | None = None
     for turn in range(TURNS):
@@ -140,8 +138,7 @@ def joint_fit(
         rules = fit_starts(slow, [True] * len(slow), lag_of(G, delay))
         excerpts = [replace(e, memory=rule) for e, rule in zip(excerpts, rules, strict=True)]
         parts = [replace(e, use=m) for e, m in zip(excerpts, masks, strict=True)]
-        n = sum(int(m.sum()) for m in masks)
-        result = fit_hysteresis(factorise(parts, r, G, delay), r, n)
+        result = fit_hysteresis(factorise(parts, r, G, delay), r)
         H = result.hysteresis
         if not any(m.any() for m in motion.fast) or (turn and linear is None):
             break
@@ -201,7 +198,7 @@ def joint_fit(
         excerpts=tuple(excerpts),
         hysteresis=H,
         gain=0.0 if linear is None else linear.gain,
-        not_identified=tuple(_missing(excerpts, found, linear, settings, band)),
+        not_identified=tuple(_missing(excerpts, found, linear, settings, band).items()),
     )
 
 
@@ -232,36 +229,29 @@ def _missing(
     linear: LinearPart | None,
     settings: Settings,
     band: float,
-) -> list[tuple[str, str]]:
+) -> dict[str, str]:
     """Return what stayed at its neutral value, and why."""
-    missing = []
+    missing = {}
     if delay.source == 'none':
-        missing.append(
-            (
-                'delay',
-                'nothing that the voltage does is fast enough to tell a delay from the lag of '
-                'the hysteresis; add steps or noise',
-            )
+        missing['delay'] = (
+            'nothing that the voltage does is fast enough to tell a delay from the lag of the '
+            'hysteresis; add steps or noise'
         )
-    if linear is None or linear.fit is None:
+    if linear is None:
+        missing['dynamics'] = (
+            f'the voltage has no jump and little power beyond slow motion (band {band:.3g} Hz), '
+            'so nobody knows how the stage follows faster motion; add steps or noise'
+        )
+    elif linear.fit is None:
         size = settings.max_order
-        missing.append(
-            (
-                'dynamics',
-                f'the voltage has no jump and little power beyond slow motion (band {band:.3g} '
-                'Hz), so nobody knows how the stage follows faster motion; add steps or noise'
-                if linear is None
-                else f'no order up to ({size}, {size}) errs clearly less on held-out motion than '
-                'the hysteresis and a pure delay; add steps or noise',
-            )
+        missing['dynamics'] = (
+            f'no order up to ({size}, {size}) errs clearly less on held-out motion than the '
+            'hysteresis and a pure delay; add steps or noise'
         )
     if all(_only_jumps(e.u) for e in excerpts):
-        missing.append(
-            (
-                'hysteresis',
-                'the voltage only jumps between levels, and what lies between them was never '
-                'seen; add a slow triangle',
-            )
+        missing['hysteresis'] = (
+            'the voltage only jumps between levels, and what lies between them was never seen; '
+            'add a slow triangle'
         )
     return missing
 
@@ -385,10 +375,9 @@ def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]
     if joint.G.a.size + joint.G.b.size == 1 and delay.total == 0.0:
         return joint
     r = joint.hysteresis.thresholds
-    n = sum(int(e.use.sum()) for e in early)
 
     def error(G: Dynamics, delay: Delay) -> float:
-        fit = fit_hysteresis(factorise(early, r, G, delay), r, n)
+        fit = fit_hysteresis(factorise(early, r, G, delay), r)
         return fit.left(factorise(late, r, G, delay))
 
     if not any(e.use.any() for e in late) or not all(e.use.any() for e in early):

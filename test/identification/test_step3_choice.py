@@ -115,7 +115,7 @@ def excerpt(core, u, noise=2e-5):
 
 def unseen(law, core, given):
     """Return the error of an H behind the true G on other motion, % of stroke."""
-    h = fit_hysteresis(factorise([given], law, G, D), law, given.u.size).hysteresis
+    h = fit_hysteresis(factorise([given], law, G, D), law).hysteresis
     u = np.concatenate([given.u, legs(given.u[-1], 0), UNSEEN])
     w = CORES[core](u)
     w /= np.ptp(w[: given.u.size])

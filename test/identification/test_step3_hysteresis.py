@@ -222,7 +222,7 @@ def split(h, noise=0.0):
 
 
 def error_of(r, fit, held):
-    h = fit_hysteresis(factorise([fit], r, UNIT, NONE), r, int(fit.use.sum())).hysteresis
+    h = fit_hysteresis(factorise([fit], r, UNIT, NONE), r).hysteresis
     e = (held.x - h(held.u))[held.use]
     return float(np.std(e))
 

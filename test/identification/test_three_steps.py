@@ -80,7 +80,7 @@ def test_dynamics_are_refined_where_they_do_not_suit_h():
     given, delay, r = runs(record()), Delay(3), PAPER.model.hysteresis.thresholds
     found, _ = second_step(given, delay, Settings(order=(10, 10)), silent)
     truth = PAPER.model.dynamics.normalised()
-    H = fit_hysteresis(factorise(triangle_excerpts(given), r, truth, delay), r, 1).hysteresis
+    H = fit_hysteresis(factorise(triangle_excerpts(given), r, truth, delay), r).hysteresis
     # a tenth of it answers through a slower pole
     slow = np.array([-np.exp(-2 * np.pi * 300 / 2e4)])
     b = 0.9 * np.convolve(truth.b, [1.0, *slow]) + 0.1 * (1 + slow[0]) * np.pad(truth.b, (0, 1))
