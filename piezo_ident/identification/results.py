@@ -19,7 +19,6 @@ from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
-from scipy.optimize import OptimizeResult
 
 __all__ = [
     'DelayResult',
@@ -367,11 +366,6 @@ class Identification(Showable):
     settings: Settings
     records: tuple[Record, ...] = ()
     memories: Mapping[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
-
-    @property
-    def swarm(self) -> OptimizeResult | None:
-        """What the swarm reported."""
-        return self.hysteresis.swarm
 
     def error(self, data: str) -> float:
         """

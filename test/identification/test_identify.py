@@ -114,9 +114,9 @@ def test_the_swarm_gives_what_it_found_and_polishing_is_stated():
     fit = found.hysteresis
     assert (fit.solver, fit.polished) == ('swarm', False)
     assert fit.loss == fit.swarm_loss > fit.optimum_loss == optimum.hysteresis.loss
-    assert found.swarm.nfev > 0
+    assert fit.swarm.nfev > 0
     h = found.model.hysteresis
-    assert_array_equal([*h.weights, h.p1, h.p2], found.swarm.x)
+    assert_array_equal([*h.weights, h.p1, h.p2], fit.swarm.x)
     assert found.model.identification['losses']['swarm'] == fit.swarm_loss
     assert polished.hysteresis.polished
     assert polished.hysteresis.swarm_loss == fit.swarm_loss
@@ -203,7 +203,7 @@ def test_delay_and_orders_may_be_given():
     assert result.delay.source == 'given'
     assert result.dynamics.order == (7, 6)
     assert result.model.dynamics.a.size == 7
-    assert result.swarm is None
+    assert result.hysteresis.swarm is None
 
 
 # -- stopping ----------------------------------------------------------------------------------
