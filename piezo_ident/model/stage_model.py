@@ -6,9 +6,6 @@ StageModel: the chain of operators with its scaling, and what it predicts.
 
     v --> [input] --> [ H ] --> [hidden] --> [ G ] --> [z^-d] --> [output] --> [acquisition] --> y
           [input], [hidden], [output] and [acquisition] hold effects; those of H wrap it
-
-A model is frozen.  `StageModel.stream` makes a `Stream`, which carries the state of one run;
-`StageModel.simulate` is a stream over a whole signal, so both give the same numbers.
 """
 
 from __future__ import annotations
@@ -175,8 +172,7 @@ class StageModel:
 
     def without_dynamics(self) -> StageModel:
         """Return the hysteresis alone, times the static gain of G; no delay, no effects."""
-        gain = self.dynamics.gain
-        static = Dynamics(a=np.empty(0), b=np.array([gain]))
+        static = replace(Dynamics.unit(), b=np.array([self.dynamics.gain]))
         return replace(self, dynamics=static, delay=Delay(0), effects=())
 
     def chain(self, memory: ArrayLike | None = None) -> Chain:
@@ -378,12 +374,11 @@ class StageModel:
         ------
         ModelError
         """
-        if self.takes(piece):
-            return
-        raise ModelError(
-            f'the record is sampled at {piece.sample_rate:g} Hz, the model at '
-            f'{self.sample_rate:g} Hz; identify a model from data of that rate'
-        )
+        if not self.takes(piece):
+            raise ModelError(
+                f'the record is sampled at {piece.sample_rate:g} Hz, the model at '
+                f'{self.sample_rate:g} Hz; identify a model from data of that rate'
+            )
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
         """Return a warning when the voltage differs from that of the identification."""
