@@ -182,7 +182,8 @@ def soak(seconds: float, factor: float, part: int, folder: Path, size: int = BLO
     parameters = {
         'stage': {'silence': 5.0},
         'identifier': {'capture_limit': min(60.0, max(1.0, seconds / 4))},
-        'model': {'model': str(model)},
+        # of the preview, too, a topic keeps so many messages and no more
+        'model': {'model': str(model), 'preview_rate': 50.0 * BLOCK / size},
         'recorder': {'max_bag_size': part},
         # the recorder and the observer listen too
         'excitation': {'subscribers': 5, 'rate_factor': factor, 'block_size': size},
