@@ -26,7 +26,8 @@ from piezo_ident.diagnosis.joint_fit import (
     offset_columns,
 )
 from piezo_ident.diagnosis.next_experiment import look_alikes
-from piezo_ident.diagnosis.rows import centred
+from piezo_ident.diagnosis.retuning import RETUNING
+from piezo_ident.diagnosis.rows import centred, Rows
 from piezo_ident.diagnosis.search import score_trials
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.verdict import Findings
@@ -72,10 +73,10 @@ def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:
 
 
 def effects_beside(
-    simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
+    simulator: Simulator, given: State, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
     """Return the effects found, fitted with the narrowest law that serves, and their base."""
-    base, selected = _selected(simulator, search, plays, wide)
+    base, selected = _selected(simulator, given, search, plays, wide)
     fitted = selected.fitted
     if simulator.holds_retuning(fitted.state):
         return base, selected
@@ -84,13 +85,18 @@ def effects_beside(
 
 
 def _selected(
-    simulator: Simulator, search: ForwardSelection, plays: Fitted, wide: Fitted
+    simulator: Simulator, given: State, search: ForwardSelection, plays: Fitted, wide: Fitted
 ) -> tuple[Fitted, Selected]:
     found = search.run(wide)
     beside, widest = plays, wide
     if found.taken:
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
-    both = search.beside(beside, widest, found)
+    as_given = fit_jointly(
+        simulator,
+        replace(given, effects=found.fitted.state.effects, retuning=(0.0,) * len(RETUNING)),
+        _offsets(simulator.rows),
+    )
+    both = search.beside(beside, widest, as_given, found)
     if both.imitated in both.taken:
         return plays, both
     fitted = both.fitted
@@ -177,15 +183,16 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     """Return the effects, best first, that do half of what a refit does."""
     rows = simulator.rows
     e = centred(rows.x - simulator.run(given), rows.of_record)
-    of = offset_columns(rows)
+    base = _offsets(rows)
+    count = base.columns.shape[1]
     start = replace(
         refit,
         state=given,
-        base=BaseColumns.of(rows, of),
+        base=base,
         e=e,
         moving=np.empty((rows.n, 0)),
-        free=np.ones(of.shape[1], bool),
-        prior=np.zeros(of.shape[1]),
+        free=np.ones(count, bool),
+        prior=np.zeros(count),
     )
     effects = [effect for effect in catalogue().values() if effect.rate_independent]
     left: dict[str, float] = {}
@@ -196,3 +203,8 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     whole, least = float(e @ e), float(refit.errors.sum())
     found = [name for name, x in left.items() if whole - x > 0.5 * (whole - least)]
     return sorted(found, key=lambda name: left[name])
+
+
+def _offsets(rows: Rows) -> BaseColumns:
+    """Return the columns of an H that stays as it is: offsets alone."""
+    return BaseColumns.of(rows, offset_columns(rows))

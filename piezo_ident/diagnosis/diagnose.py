@@ -223,7 +223,7 @@ def _diagnosed(
         missed=missed,
         given=left,
     )
-    base, selected = effects_beside(simulator, search, plays, wide)
+    base, selected = effects_beside(simulator, given, search, plays, wide)
     # 5. the verdict, and what holds
     progress('verdict', 0.0)
     findings = judge(rows, base, selected, noise)

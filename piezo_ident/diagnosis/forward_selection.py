@@ -185,13 +185,17 @@ class ForwardSelection:
         most = 0.5 * float(base.errors.sum() + retuned.errors.sum())
         return tuple(sorted((name for name in left if left[name] < most), key=left.__getitem__))
 
-    def beside(self, plays: Fitted, wide: Fitted, found: Selected) -> Selected:
+    def beside(
+        self, plays: Fitted, wide: Fitted, as_given: Fitted, found: Selected
+    ) -> Selected:
         """
         Select one effect that follows the path of the command alone, beside what was found.
 
         A wide H imitates it.  So it has to be nearly all that is left beside a sum of plays, and
-        to leave as little as the wide H does without it (`wide`).
+        to leave as little as the wide H does without it (`wide`).  What the H of the model does
+        not leave beside what was found and a retuned G (`as_given`) needs no effect.
         """
+        self._given = min(self._given, as_given.mean_square)
         self._allowed = [effect for effect in self._candidates if effect.rate_independent]
         # G was identified with the effect, and may be bent by it
         plays, wide = (self.retuned(fitted) for fitted in (plays, wide))
@@ -363,7 +367,8 @@ def takes(
     if not this.contenders:
         return False
     best = this.contenders[0]
-    gain, left = before - best.mean_square, max(before - noise, 1e-300)
+    # nothing is gained below the noise
+    gain, left = before - max(best.mean_square, noise), max(before - noise, 1e-300)
     if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
         return False
     # what follows time alone fits a shifted residual as well; its lines and trends have tests
