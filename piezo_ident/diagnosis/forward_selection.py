@@ -185,9 +185,7 @@ class ForwardSelection:
         most = 0.5 * float(base.errors.sum() + retuned.errors.sum())
         return tuple(sorted((name for name in left if left[name] < most), key=left.__getitem__))
 
-    def beside(
-        self, plays: Fitted, wide: Fitted, as_given: Fitted, found: Selected
-    ) -> Selected:
+    def beside(self, plays: Fitted, wide: Fitted, as_given: Fitted, found: Selected) -> Selected:
         """
         Select one effect that follows the path of the command alone, beside what was found.
 

@@ -39,12 +39,13 @@ from piezo_ident.identification.results import (
 )
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
-from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step
+from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step, WORTH
 from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
 from piezo_ident.identification.three_steps import (
     beside_law,
     first_step,
     model_of,
+    motion_excerpts,
     second_step,
     small_excerpts,
     triangle_excerpts,
@@ -60,6 +61,8 @@ import scipy
 
 __all__ = ['first_steps', 'identify']
 
+#: level of small motion from which loops drift, in parts of the rms that H leaves of the triangles
+ELSEWHERE = 2.0
 #: share by which a model may err more without a pair of G that H may stand for
 AS_WELL = 0.01
 _UNLABELLED = (
@@ -180,13 +183,21 @@ def _labelled(
         runs = with_starts(unstarted, lag_of(G, delay))
         fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
         small = small_excerpts(runs)
+        fitted_to: Sequence[Excerpt] = fit
         hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
+        model = model_of(rate, scaling, hysteresis, G, delay)
+        if hysteresis.law == 'plays' and settings.thresholds is None and _moves_on(model, runs):
+            motion = motion_excerpts(runs)
+            other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
+            left = _left(model_of(rate, scaling, other, G, delay), runs)
+            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * _left(model, runs):
+                hysteresis, fitted_to = other, motion
         if hysteresis.law != 'plays':
             # G was found beside plays
             refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
             if refined is not None:
                 dynamics, G = refined
-                hysteresis = fit_again(hysteresis, fit, G, delay)
+                hysteresis = fit_again(hysteresis, fitted_to, G, delay)
         model = model_of(rate, scaling, hysteresis, G, delay)
         return _Fitted(runs, fit, held, dynamics, hysteresis, model, _left(model, runs))
 
@@ -249,6 +260,27 @@ class _Fitted:
     hysteresis: HysteresisFit
     model: StageModel
     left: float
+
+
+def _moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
+    """
+    Return whether small motion goes to another level than the triangles tell.
+
+    Small loops of a stage that is no sum of plays do not close: steps and noise drift towards the
+    middle of the large loop, and a triangle does not show it.
+    """
+    for run in runs:
+        memory = run.start(model.hysteresis.thresholds)
+        e = run.piece.y - model.predict_piece(run.piece, memory)
+        sweeps, small = (
+            e[run.mask(*kinds) & run.known & ~run.held_out()]
+            for kinds in (('triangle',), ('step', 'settle', 'noise'))
+        )
+        if sweeps.size and small.size:
+            beside = float(small.mean() - sweeps.mean())
+            if abs(beside) > ELSEWHERE * float(sweeps.std()):
+                return True
+    return False
 
 
 def _left(model: StageModel, runs: Sequence[Run]) -> float:

@@ -34,6 +34,7 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 __all__ = [
     'PAPER_COUNT',
     'Choice',
+    'Means',
     'choose_law',
     'choose_thresholds',
     'merged',
@@ -181,11 +182,12 @@ def with_small(
 
 
 @dataclass(frozen=True, eq=False)
-class _Means(Excerpt):
+class Means(Excerpt):
     """Fast motion, of which only means over rows are compared: what G leaves is not of H."""
 
     @property
     def row(self) -> int:
+        """Samples that a row averages."""
         return max(1, min(int(self.use.sum()) // 1000, 50))
 
 
@@ -264,7 +266,7 @@ def choose_law(
         and fitted(whole, law_of[name]).hysteresis.lowest_slope() > 0
     ]
     for excerpt in others if better else ():
-        means = _Means(excerpt.u, excerpt.x, excerpt.use, excerpt.memory)
+        means = Means(excerpt.u, excerpt.x, excerpt.use, excerpt.memory)
         [rows] = filtered_rows([means], all_terms, dynamics, delay)
         R = triangular_factor([rows], rows.shape[1])
         left = {

@@ -46,6 +46,7 @@ from piezo_ident.identification.step2_dynamics import (
     scan_orders,
     stabilised,
 )
+from piezo_ident.identification.step3_choice import Means
 from piezo_ident.identification.step3_hysteresis import (
     factorise,
     fine_thresholds,
@@ -61,6 +62,7 @@ __all__ = [
     'beside_law',
     'first_step',
     'model_of',
+    'motion_excerpts',
     'second_step',
     'small_excerpts',
     'triangle_excerpts',
@@ -172,6 +174,11 @@ def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
         for run, use in zip(runs, uses, strict=True)
         if use.any()
     ]
+
+
+def motion_excerpts(runs: Sequence[Run]) -> list[Means]:
+    """Return all motion for fitting H, without the held-out blocks."""
+    return [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
 
 
 def _orders(
