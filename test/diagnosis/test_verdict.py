@@ -195,6 +195,37 @@ def test_an_effect_has_to_gain_against_the_model_as_it_was_given(rows):
     assert not takes(rows, a_round(best), given, 0.0, given, 0.05, first=True)
 
 
+def test_nothing_is_gained_below_the_noise(rows):
+    size = (0.05 * rows.stroke / 100.0) ** 2
+    noise = 0.3 * WHOLE
+    assert noise > 2.0 * size
+    best = contender('slew_limit', (noise - size) / WHOLE)
+    for beyond, is_taken in ((0.8, False), (1.2, True)):
+        before, left = noise + beyond * size, beyond * size
+        this = a_round(best, before=before)
+        assert takes(rows, this, before, noise, left, 0.05, first=True) == is_taken
+
+
+@pytest.mark.parametrize(('share', 'is_taken'), [(1.0, True), (0.03, False)])
+def test_what_the_h_of_the_model_does_not_leave_needs_no_effect(
+    rows, monkeypatch, share, is_taken
+):
+    search = object.__new__(forward_selection.ForwardSelection)
+    search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
+    search._noise, search._smallest, search._given, search._most = 0.0, 0.05, np.inf, 4
+    search._candidates, search.retuned = [], lambda fitted: fitted
+    best = contender('even_nonlinearity', 0.02)
+    plays, wide, as_given = (
+        SimpleNamespace(mean_square=part * WHOLE) for part in (1.0, 0.02, share)
+    )
+    search._round = lambda fitted: a_round(best)
+    monkeypatch.setattr(forward_selection, 'without_needless', lambda s, fitted, *_: (fitted, []))
+    none = forward_selection.Selected((), (), wide, None, frozenset())
+    found = search.beside(plays, wide, as_given, none)
+    assert bool(found.taken) == is_taken
+    assert found.fitted is (best if is_taken else wide)
+
+
 def test_an_effect_that_costs_a_kind_is_not(rows):
     worse = np.where(rows.group == 2, 1.0, 0.05)
     best = contender('slew_limit', 0.3, shape=worse)
