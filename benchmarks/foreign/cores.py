@@ -35,6 +35,7 @@ __all__ = [
     'coleman_hodgdon',
     'core_of',
     'everett_table',
+    'law_of',
     'play',
     'preisach',
     'preisach_step',
@@ -235,16 +236,21 @@ def _preisach(u: Array, table: Array, diagonal: Array, out: Array) -> None:
         out[k] = h
 
 
-def preisach(density: Callable[[Array, Array], Array]) -> Law:
-    """Return the Preisach operator of a density of relays, from all relays down."""
-    table, diagonal = everett_table(density)
+def law_of(kernel: Callable[..., None], *parameters: float | Array) -> Law:
+    """Return a law that a compiled loop computes, kernel(u, *parameters, out)."""
 
     def law(u: Array) -> Array:
         out = np.empty(u.size)
-        _preisach(np.ascontiguousarray(u), table, diagonal, out)
+        kernel(np.ascontiguousarray(u), *parameters, out)
         return out
 
     return law
+
+
+def preisach(density: Callable[[Array, Array], Array]) -> Law:
+    """Return the Preisach operator of a density of relays, from all relays down."""
+    table, diagonal = everett_table(density)
+    return law_of(_preisach, table, diagonal)
 
 
 def uneven(rng: Rng) -> Law:
@@ -291,14 +297,9 @@ def _slope(z: float, way: float, beta: float, gamma: float, power: float, skew: 
 
 def bouc_wen_of(rate: float, beta: float, gamma: float, power: float, skew: float = 0.0) -> Law:
     """Return the law of Bouc and Wen, with a term for each way."""
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _bouc_wen(np.ascontiguousarray(u), rate, beta, gamma, power, skew, out)
-        # what the restoring force takes away: a piezo's branches begin flat and grow steep
-        return -out
-
-    return law
+    force = law_of(_bouc_wen, rate, beta, gamma, power, skew)
+    # what the restoring force takes away: a piezo's branches begin flat and grow steep
+    return lambda u: -force(u)
 
 
 def bouc_wen(rng: Rng) -> Law:
@@ -332,10 +333,4 @@ def _coleman_hodgdon(u: Array, rate: float, bend: float, give: float, out: Array
 def coleman_hodgdon(rng: Rng) -> Law:
     """Draw Duhem's equation, dz = a |du| (f(u) - z) + g(u) du."""
     rate, bend, give = rng.uniform(1.5, 5.0), rng.uniform(-0.12, 0.12), rng.uniform(0.2, 0.8)
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _coleman_hodgdon(np.ascontiguousarray(u), rate, bend, give, out)
-        return out
-
-    return law
+    return law_of(_coleman_hodgdon, rate, bend, give)

@@ -22,7 +22,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-from .cores import bouc_wen_of, DEPTH, Law, preisach, STEP
+from .cores import bouc_wen_of, DEPTH, Law, law_of, preisach, STEP
 
 __all__ = [
     'dahl',
@@ -86,13 +86,7 @@ def krasnoselskii_pokrovskii(rng: Rng) -> Law:
     reach, lean = rng.uniform(0.15, 0.4), rng.uniform(-0.6, 0.6)
     weight = np.exp(-(up - down) / reach) * (1.0 + lean * (up + down - 1.0))
     weight *= rng.uniform(0.85, 1.15, up.size)
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _kernels(np.ascontiguousarray(u), up, down, ramp, weight, out)
-        return out
-
-    return law
+    return law_of(_kernels, up, down, ramp, weight)
 
 
 @njit(cache=True, nogil=True)
@@ -126,13 +120,7 @@ def jiles_atherton(rng: Rng) -> Law:
     """Draw the law of Jiles and Atherton, far from saturation."""
     a, pinning = rng.uniform(0.6, 1.5), rng.uniform(0.3, 0.9)
     coupling, give = rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.4)
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _jiles_atherton(np.ascontiguousarray(u), a, pinning, coupling, give, out)
-        return out
-
-    return law
+    return law_of(_jiles_atherton, a, pinning, coupling, give)
 
 
 def skewed_bouc_wen(rng: Rng) -> Law:
@@ -161,13 +149,7 @@ def _dahl(u: Array, rate: float, power: float, lean: float, out: Array) -> None:
 def dahl(rng: Rng) -> Law:
     """Draw Dahl's law, stiffer at one end."""
     rate, power, lean = rng.uniform(1.0, 5.0), rng.uniform(0.8, 2.2), rng.uniform(-0.4, 0.4)
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _dahl(np.ascontiguousarray(u), rate, power, lean, out)
-        return out
-
-    return law
+    return law_of(_dahl, rate, power, lean)
 
 
 @njit(cache=True, nogil=True)
@@ -207,10 +189,4 @@ def _turning(u: Array, bow: float, power: float, lean: float, out: Array) -> Non
 def turning_curves(rng: Rng) -> Law:
     """Draw curves from each turning point to the one before, the longer the more bent."""
     bow, power, lean = rng.uniform(0.5, 0.85), rng.uniform(0.6, 1.1), rng.uniform(-0.5, 0.5)
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _turning(np.ascontiguousarray(u), bow, power, lean, out)
-        return out
-
-    return law
+    return law_of(_turning, bow, power, lean)

@@ -26,7 +26,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-from .cores import DEPTH, everett_table, Law, preisach_step, STEP
+from .cores import DEPTH, everett_table, Law, law_of, preisach_step, STEP
 
 __all__ = [
     'contacts_of',
@@ -89,13 +89,7 @@ def _moving(u: Array, feedback: float, table: Array, diagonal: Array, out: Array
 
 def moving_of(feedback: float, table: Array, diagonal: Array) -> Law:
     """Return relays of an Everett function from 0 to 1, in a field that goes with their sum."""
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _moving(np.ascontiguousarray(u), feedback, table, diagonal, out)
-        return out
-
-    return law
+    return law_of(_moving, feedback, table, diagonal)
 
 
 def moving_preisach(rng: Rng) -> Law:
@@ -159,13 +153,7 @@ def contacts_of(
         Stiffness of the spring, least at the middle, and how it grows from there.
     """
     spring = np.array([soft, hardening, middle])
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _contacts(np.ascontiguousarray(u), stiff, limit, load, spring, out)
-        return out
-
-    return law
+    return law_of(_contacts, stiff, limit, load, spring)
 
 
 def loaded_contacts(rng: Rng) -> Law:
@@ -226,13 +214,7 @@ def _turning_friction(
 
 def turning_friction_of(bow: float, reach: Array, weight: Array, soft: float) -> Law:
     """Return cells with friction in a field along an arc that is so high."""
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _turning_friction(np.ascontiguousarray(u), bow, reach, weight, soft, out)
-        return out
-
-    return law
+    return law_of(_turning_friction, bow, reach, weight, soft)
 
 
 def turning_friction(rng: Rng) -> Law:
@@ -284,13 +266,7 @@ def _up(near: float, far: float, stiff: float) -> float:
 
 def walls_of(edges: Array, stiff: Array) -> Law:
     """Return the mean of walls in wells between edges (m, wells + 1), of stiffness (m, wells)."""
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _walls(np.ascontiguousarray(u), edges, stiff, out)
-        return out
-
-    return law
+    return law_of(_walls, edges, stiff)
 
 
 def rugged_walls(rng: Rng) -> Law:
@@ -369,13 +345,7 @@ def dipoles_of(field: Array, coercive: Array, bonds: Array, strides: Array) -> L
         How far a dipole that is up moves that which is so many strides on, and the reverse.
     strides : ndarray of int, shape (m,)
     """
-
-    def law(u: Array) -> Array:
-        out = np.empty(u.size)
-        _dipoles(np.ascontiguousarray(u), field, coercive, bonds, strides, out)
-        return out
-
-    return law
+    return law_of(_dipoles, field, coercive, bonds, strides)
 
 
 def frustrated_dipoles(rng: Rng) -> Law:
