@@ -26,6 +26,7 @@ import math
 from numba import njit
 import numpy as np
 from numpy.typing import NDArray
+from truths.cores import extremes_left
 
 __all__ = [
     'Core',
@@ -200,24 +201,9 @@ def preisach_step(
     diagonal: Array,
 ) -> tuple[int, float]:
     """Return how many extremes are left and the output where the input goes from x to new."""
-    # extremes: minimum, maximum, minimum, ...; value: the output when each was reached
     if new == x:
         return n, h
-    rising = new > x
-    if rising != (n % 2 == 1):
-        if n == DEPTH:
-            n -= 2
-        else:
-            extreme[n], value[n] = x, h
-            n += 1
-    if rising:
-        while n >= 3 and new >= extreme[n - 2]:
-            n -= 2
-    else:
-        while n >= 2 and new <= extreme[n - 2]:
-            n -= 2
-    if n == 0:
-        n = 1
+    n = extremes_left(new, x, h, n, extreme, value)
     last = extreme[n - 1]
     if new > last:
         return n, value[n - 1] + _everett(new, last, table, diagonal)

@@ -21,7 +21,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Density', 'Row', 'everett', 'plays']
+__all__ = ['Density', 'Row', 'everett', 'extremes_left', 'plays']
 
 Array = NDArray[np.float64]
 
@@ -104,31 +104,40 @@ class Row:
 
 
 @njit(cache=True, nogil=True)
+def extremes_left(new: float, x: float, h: float, n: int, extreme: Array, value: Array) -> int:
+    """
+    Return how many extremes a Preisach operator remembers where its input goes from x to new.
+
+    They are a minimum, a maximum, a minimum, ..., and `value` is the output when each was reached;
+    h is that at x.  Of more than there is room for, the smallest loops are forgotten.
+    """
+    rising = new > x
+    if rising != (n % 2 == 1):
+        if n == extreme.size:
+            n -= 2
+        else:
+            extreme[n], value[n] = x, h
+            n += 1
+    if rising:
+        while n >= 3 and new >= extreme[n - 2]:
+            n -= 2
+    else:
+        while n >= 2 and new <= extreme[n - 2]:
+            n -= 2
+    return max(n, 1)
+
+
+@njit(cache=True, nogil=True)
 def _everett(
     u: Array, amount: Array, order: Array, scale: Array, kappa: float, out: Array
 ) -> None:
-    # extremes: minimum, maximum, minimum, ...; value: the output when each was reached
     extreme, value = np.empty(DEPTH), np.empty(DEPTH)
     extreme[0], value[0] = 0.0, 0.0
     n, x, h = 1, 0.0, 0.0
     for k in range(u.size):
         new = max(u[k], 0.0)
         if new != x:
-            rising = new > x
-            if rising != (n % 2 == 1):
-                if n == DEPTH:
-                    n -= 2
-                else:
-                    extreme[n], value[n] = x, h
-                    n += 1
-            if rising:
-                while n >= 3 and new >= extreme[n - 2]:
-                    n -= 2
-            else:
-                while n >= 2 and new <= extreme[n - 2]:
-                    n -= 2
-            if n == 0:
-                n = 1
+            n = extremes_left(new, x, h, n, extreme, value)
             last = extreme[n - 1]
             g = _g(abs(new - last), amount, order, scale)
             g *= 1.0 + kappa * (new + last - 1.0)
