@@ -17,6 +17,7 @@ import platform
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
@@ -262,6 +263,12 @@ class _Fitted:
     left: float
 
 
+def _residual(model: StageModel, run: Run) -> NDArray[np.float64]:
+    """Return what a model leaves of a run [m]."""
+    memory = run.start(model.hysteresis.thresholds)
+    return run.piece.y - model.predict_piece(run.piece, memory)
+
+
 def _moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     """
     Return whether small motion goes to another level than the triangles tell.
@@ -270,8 +277,7 @@ def _moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     middle of the large loop, and a triangle does not show it.
     """
     for run in runs:
-        memory = run.start(model.hysteresis.thresholds)
-        e = run.piece.y - model.predict_piece(run.piece, memory)
+        e = _residual(model, run)
         sweeps, small = (
             e[run.mask(*kinds) & run.known & ~run.held_out()]
             for kinds in (('triangle',), ('step', 'settle', 'noise'))
@@ -289,8 +295,7 @@ def _left(model: StageModel, runs: Sequence[Run]) -> float:
     for run in runs:
         kept = run.held_out() & run.use
         if kept.any():
-            memory = run.start(model.hysteresis.thresholds)
-            e = (run.piece.y - model.predict_piece(run.piece, memory))[kept]
+            e = _residual(model, run)[kept]
             left += float(np.sum((e - e.mean()) ** 2))
     return left
 
