@@ -24,6 +24,8 @@ LOST = 2e-14
 #: difference of the static gain of sections from that of G, and of their products from B and A, as
 #: shares, beyond which their roots are not to be trusted
 NEAR, SAME = 1e-2, 1e-12
+#: samples after which a state that has died away is set to zero
+STRETCH = 1024
 
 
 def rounding_of(a: NDArray[np.float64]) -> float:
@@ -106,11 +108,15 @@ def run_sections(
     out: NDArray[np.float64],
 ) -> None:
     """Write what sections make of x to `out`, shape (n,), and carry z on, shape (n, 2)."""
-    for k in range(x.size):
-        u = x[k]
+    for start in range(0, x.size, STRETCH):
+        for k in range(start, min(start + STRETCH, x.size)):
+            u = x[k]
+            for i in range(c.shape[0]):
+                y = c[i, 0] * u + z[i, 0]
+                z[i, 0] = (c[i, 1] * u + z[i, 1]) - c[i, 3] * y
+                z[i, 1] = c[i, 2] * u - c[i, 4] * y
+                u = y
+            out[k] = u
+        # a test in every sample would delay the next one
         for i in range(c.shape[0]):
-            y = c[i, 0] * u + z[i, 0]
-            z[i, 0] = alive((c[i, 1] * u + z[i, 1]) - c[i, 3] * y)
-            z[i, 1] = alive(c[i, 2] * u - c[i, 4] * y)
-            u = y
-        out[k] = u
+            z[i, 0], z[i, 1] = alive(z[i, 0]), alive(z[i, 1])
