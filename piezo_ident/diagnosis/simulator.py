@@ -10,10 +10,13 @@ other effects.  What lies before the change in the chain is kept from the run be
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
+import os
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +51,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+T = TypeVar('T')
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,8 @@ class Simulator:
         self._kept: _Kept | None = None
         #: what G makes of the columns of the law that was asked for last
         self._of_law: tuple[Any, Array] | None = None
+        #: compiled loops leave the interpreter to others, so runs go side by side
+        self._pool = ThreadPoolExecutor(min(len(rows.runs), os.cpu_count() or 1))
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -167,17 +173,17 @@ class Simulator:
         key = (wide.name, wide.span, tuple(wide.thresholds))
         if self._of_law is None or self._of_law[0] != key:
             self._of_law = None
-            self._of_law = key, self._joined([*self._behind_G(wide)])
+            self._of_law = key, self._joined(self._of_runs(lambda i: self._behind_G(wide, i)))
         whole = self._of_law[1]
         return whole if law.name == wide.name else whole[law.within(wide)]
 
-    def _behind_G(self, law: HysteresisLaw) -> Iterator[Array]:
-        """Give all rows of the columns of a law in each run."""
+    def _behind_G(self, law: HysteresisLaw, i: int) -> Array:
+        """Return all rows of the columns of a law in a run."""
         links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
-        for source, memory in zip(self._sources, self.rows.memories, strict=True):
-            behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
-            raw = law.columns(source.x, memory(law.thresholds))
-            yield np.stack([behind.rows(x, float(x[0])) for x in raw])
+        source = self._sources[i]
+        behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
+        raw = law.columns(source.x, self.rows.memories[i](law.thresholds))
+        return np.stack([behind.rows(x, float(x[0])) for x in raw])
 
     def columns(self, state: State, law: HysteresisLaw, step: float) -> Array:
         """
@@ -185,8 +191,10 @@ class Simulator:
 
         Of a state that is remembered, divided by the step.
         """
-        parts = []
-        for i, chain in enumerate(self._known(state).chains):
+        chains = self._known(state).chains
+
+        def of_run(i: int) -> Array:
+            chain = chains[i]
             core = place_of_core(chain.operators)
             behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
             memory = self.rows.memories[i](law.thresholds)
@@ -201,8 +209,9 @@ class Simulator:
                 )
                 cores = (self._chain(s, i).operators[core] for s in moved)
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
-            parts.append(np.stack([behind.rows(x, float(x[0])) / step for x in changes]))
-        return self._joined(parts)
+            return np.stack([behind.rows(x, float(x[0])) / step for x in changes])
+
+        return self._joined(self._of_runs(of_run))
 
     def bare(self, state: State) -> Array:
         """Return the rows of H, G and the delay alone; shape (n,)."""
@@ -217,20 +226,20 @@ class Simulator:
         """Return the predicted rows; shape (n,)."""
         if self._kept is not None and self._kept.state is state:
             return self._kept.prediction
-        return self._predicted(state, [chain.output() for chain in self._chains(state)])
+        return self._predicted(state, self._of_runs(lambda i: self._chain(state, i).output()))
 
     def full(self, state: State) -> list[Array]:
         """Return the prediction of each run at the full rate, normalised."""
-        chains = zip(self._chains(state), self.rows.record, strict=True)
-        return [chain.output() + state.offsets[k] for chain, k in chains]
+        outputs = self._of_runs(lambda i: self._chain(state, i).output())
+        return [x + state.offsets[k] for x, k in zip(outputs, self.rows.record, strict=True)]
 
     def remember(self, state: State) -> Array:
         """Return the predicted rows, and keep what runs between the links."""
         if self._kept is None or self._kept.state is not state:
             # gives the room back first
             self._kept = None
-            chains = list(self._chains(state))
-            outputs = [chain.output(keep=True) for chain in chains]
+            chains = self._of_runs(lambda i: self._chain(state, i))
+            outputs = self._of_runs(lambda i: chains[i].output(keep=True))
             self._kept = _Kept(state, tuple(chains), self._predicted(state, outputs))
         return self._kept.prediction
 
@@ -245,11 +254,13 @@ class Simulator:
         The states differ in one place, an effect or (None) the factor of G; the chain is only run
         from there.
         """
-        changes = [
-            after.difference(before, place_of(effect, after.operators), self.rows.m)
-            for before, after in zip(self._known().chains, self._chains(state), strict=True)
-        ]
-        return self._joined(changes)
+        chains = self._known().chains
+
+        def of_run(i: int) -> Array:
+            after = self._chain(state, i)
+            return after.difference(chains[i], place_of(effect, after.operators), self.rows.m)
+
+        return self._joined(self._of_runs(of_run))
 
     def filtered(self, wanted: Sequence[tuple[int | None, str, int, float]]) -> dict[int, Array]:
         """
@@ -277,12 +288,17 @@ class Simulator:
             stacked = np.stack(list(sections.values()))
             # the numerators; a link that bends sees a small change
             stacked[:, :3] *= steps[:, None]
-            parts = [
-                chain.filtered(place_of(effect, chain.operators), stacked, self.rows.m)
-                for chain in kept.chains
-            ]
+            parts = self._of_runs(partial(self._filtered, effect, stacked))
             columns |= dict(zip(sections, self._joined(parts) / steps[:, None], strict=True))
         return columns
+
+    def _filtered(self, effect: type[Effect] | None, sections: Array, i: int) -> Array:
+        chain = self._known().chains[i]
+        return chain.filtered(place_of(effect, chain.operators), sections, self.rows.m)
+
+    def _of_runs(self, function: Callable[[int], T]) -> list[T]:
+        """Return what a function of the place of a run gives for each."""
+        return list(self._pool.map(function, range(len(self._sources))))
 
     def _known(self, state: State | None = None) -> _Kept:
         if self._kept is None or state not in (None, self._kept.state):
@@ -299,10 +315,6 @@ class Simulator:
             for part, keep in zip(parts, self.rows.keep, strict=True)
         ]
         return kept[0] if len(kept) == 1 else np.concatenate(kept, axis=-1)
-
-    def _chains(self, state: State) -> Iterator[RunChain]:
-        """Give the chain of each run."""
-        return (self._chain(state, i) for i in range(len(self._sources)))
 
     def _chain(self, state: State, i: int) -> RunChain:
         alone = replace(state, retuning=())
