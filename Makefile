@@ -27,11 +27,11 @@ lint: .venv/.test
 
 # a file of tests stays in one process; node tests mostly wait, and come when the rest is done;
 # what another program's burst made fail is asked once more, alone
-PARALLEL := -n 2 --dist loadfile
+PARALLEL := --dist loadfile
 
 pytest: .venv/.test
-	.venv/bin/pytest $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS)
-	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
+	.venv/bin/pytest -n 2 $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS)
+	.venv/bin/pytest -n 3 $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
 	.venv/bin/pytest --last-failed --last-failed-no-failures none test/nodes $(PYTEST_ARGS)
 
 # node processes over DDS alone
