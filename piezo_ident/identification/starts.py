@@ -50,8 +50,8 @@ PULL = 1e-3
 TURNS = 12
 #: smallest fall of the loss that is worth another turn, as a share of it
 WORTH = 1e-3
-#: a start is left out where H errs so many times more behind it, and what is behind it covers this
-#: share of the voltage
+#: a start is left out where H errs so many times more behind it, and the voltage rises and falls
+#: there by this share of its swing
 HARM, ENOUGH = 4.0, 0.8
 
 
@@ -252,7 +252,7 @@ def without_harm(
     """
     known = [replace(e, use=e.use & r.known) for e, r in zip(excerpts, runs, strict=True)]
     swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
-    enough = all(e.use.any() and np.ptp(e.u[e.use]) > ENOUGH * swing for e in known)
+    enough = all(_rise_and_fall(e.u[e.use]) > ENOUGH * swing for e in known)
     pairs = zip(excerpts, known, strict=True)
     if not enough or all(np.array_equal(a.use, b.use) for a, b in pairs):
         return list(runs), list(excerpts)
@@ -262,6 +262,14 @@ def without_harm(
     if both.left(R) < HARM**2 * alone.left(R):
         return list(runs), list(excerpts)
     return [replace(run, use=run.use & run.known) for run in runs], known
+
+
+def _rise_and_fall(u: Vector) -> float:
+    """Return the smaller of the largest rise and the largest fall of a voltage."""
+    if not u.size:
+        return 0.0
+    rise, fall = u - np.minimum.accumulate(u), np.maximum.accumulate(u) - u
+    return float(min(rise.max(), fall.max()))
 
 
 def _rule(u0: float, r: Vector, memory: Vector) -> Rule:
