@@ -20,7 +20,7 @@ from piezo_ident.identification.fast_motion import EDGES, FAINT, HIGH_PASS, rms_
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import Settings
 
-__all__ = ['MOVES', 'fitted_parts']
+__all__ = ['MOVES', 'fitted_parts', 'held_out_place']
 
 Mask = NDArray[np.bool_]
 
@@ -65,7 +65,7 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
         if n_held >= MIN_HELD and n_fit >= MIN_FIT:
-            start = n_fit if settings.hold_out else _place(run, n_held)
+            start = n_fit if settings.hold_out else held_out_place(run.u, rate, n_held)
             fitted = np.ones(piece.n, dtype=bool)
             fitted[start : start + n_held] = False
             enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
@@ -87,10 +87,21 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
     return chosen, masks
 
 
-def _place(run: Run, n_held: int) -> int:
-    """Return where the held-out stretch begins."""
-    u, n = run.u, run.u.size
-    above = [rms_above(u, run.piece.sample_rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]
+def held_out_place(u: NDArray[np.float64], rate: float, n_held: int) -> int:
+    """
+    Return where a stretch to be held out begins.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+        Normalised voltage.
+    rate : float
+        [Hz]
+    n_held : int
+        Length of the stretch [samples].
+    """
+    n = u.size
+    above = [rms_above(u, rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]
     bands = [np.maximum(b - h, 0.0) for b, h in itertools.pairwise([*above, np.zeros(n)])]
     energy = [np.cumsum(np.concatenate([[0.0], b])) for b in bands if b.max() > FAINT**2]
     travel = np.cumsum(np.concatenate([[0.0], np.abs(np.diff(u, prepend=u[0]))]))

@@ -27,7 +27,6 @@ from piezo_ident.identification.errors import (
     predictions_of,
     validation_errors,
 )
-from piezo_ident.identification.linear_part import without_pairs
 from piezo_ident.identification.prepare import Excerpt, prepare, Run
 from piezo_ident.identification.results import (
     DynamicsResult,
@@ -38,6 +37,7 @@ from piezo_ident.identification.results import (
     silent,
     Steps,
 )
+from piezo_ident.identification.slow_part import without_pairs
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
 from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step, WORTH

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.identification.fast_motion import FastMotion
 from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.slow_part import without_pairs, without_slow_part
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
@@ -39,24 +40,18 @@ from scipy import optimize, signal
 
 __all__ = [
     'LinearPart',
-    'fast_part',
     'find_linear_part',
     'refined_linear_part',
-    'without_pairs',
-    'without_slow_part',
 ]
 
 Vector = NDArray[np.float64]
 
-#: real poles below this are creep or what H lacks, never dynamics [Hz]
-SLOWEST = 40.0
-#: at low sampling rates, as a share of the rate
-SLOWEST_SHARE = 0.01
-#: a real pole and a real zero whose frequencies differ by less than this factor may be what H
-#: lacks of small motion, below this share of the frequency of the lowest mode that rings (damping)
-PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 #: delays [samples] that the scan tries, and its na and nb
 MAX_DELAY, SCAN_ORDER = 30, 8
+#: na of further starts by instrumental variables
+INSTRUMENTS = (4, 8)
+#: of the output error, which starts far from its optimum while H is rough
+ITERATIONS = 40
 #: held-out errors within this share count as equal; the smaller order goes first
 SLACK = 0.03
 #: poles that together add less than this share of the error go at once
@@ -143,60 +138,10 @@ def _pure_delay(motion: FastMotion) -> tuple[Delay, float]:
     return Delay(int(total), total - int(total)), error(total)
 
 
-def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
-    """Return G with G(1) = 1 and without its slow real poles; None where slow poles stay."""
-    slowest = min(SLOWEST, SLOWEST_SHARE * rate)
-    poles = G.poles
-    size = -np.log(np.maximum(np.abs(poles), 1e-300)) * rate / (2.0 * np.pi)
-    slow = np.hypot(size, np.angle(poles) * rate / (2.0 * np.pi)) < slowest
-    if not slow.any():
-        return G.normalised()
-    if np.any(poles[slow].imag != 0.0):
-        return None
-    faster = G.without_slow_poles(slowest, rate)
-    return faster.normalised() if faster.a.size < G.a.size else None
-
-
 def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128], Vector]:
     """Return residues and poles of G, and the terms without a pole."""
     residues, poles, direct = signal.residuez(G.b, np.concatenate([[1.0], G.a]))
     return residues, poles, np.real(np.atleast_1d(direct))
-
-
-def fast_part(G: Dynamics, rate: float, lean: bool = False) -> Dynamics:
-    """Return G with G(1) = 1, without slow real poles where it can; `lean`, without pairs too."""
-    G = without_pairs(G, rate) if lean else G
-    return without_slow_part(G, rate) or G.normalised()
-
-
-def without_pairs(G: Dynamics, rate: float) -> Dynamics:
-    """
-    Return G without pairs of a real pole and a near real zero far below its modes.
-
-    Small loops that open less than H says make such a pair, and so does hysteresis that depends on
-    the rate.
-    """
-    rings = [mode.frequency for mode in G.modes(rate) if mode.damping < RINGS]
-    poles, zeros = np.asarray(G.poles, dtype=complex), np.asarray(np.roots(G.b), dtype=complex)
-    highest = BELOW_MODES * min(rings, default=0.0)
-    for pole in sorted(poles[_between(poles, 0.0, highest, rate)].real, reverse=True):
-        size = -np.log(pole) * rate / (2.0 * np.pi)
-        near = np.flatnonzero(_between(zeros, size / PAIR, size * PAIR, rate))
-        if near.size:
-            zeros = np.delete(zeros, near[np.argmin(np.abs(zeros[near] - pole))])
-            poles = np.delete(poles, np.argmin(np.abs(poles - pole)))
-    if poles.size == G.a.size:
-        return G
-    a, b = (np.atleast_1d(np.real(np.poly(roots))) for roots in (poles, zeros))
-    return Dynamics(a[1:], b * G.gain * a.sum() / b.sum())
-
-
-def _between(
-    roots: NDArray[np.complex128], low: float, high: float, rate: float
-) -> NDArray[np.bool_]:
-    """Return the real roots that decay, with frequencies between two [Hz]."""
-    ends = np.exp(-2.0 * np.pi * np.array([high, low]) / rate)
-    return np.asarray((roots.imag == 0.0) & (roots.real > ends[0]) & (roots.real < ends[1]))
 
 
 def _supported(G: Dynamics, motion: FastMotion) -> bool:
@@ -262,14 +207,13 @@ def _refined(
     motion: FastMotion,
     G: Dynamics,
     delay: int,
-    maxiter: int,
     tick: Callable[[], None] | None = None,
 ) -> tuple[OutputErrorFit, float] | None:
-    """Return G by output error without slow poles, and its held-out error."""
+    """Return G by output error without slow poles and pairs, and its held-out error."""
     stretches = _moved(motion.fitted, delay)
     for _ in range(3):
-        fit = output_error(stretches, G, maxiter=maxiter, tick=tick)
-        faster = without_slow_part(fit.dynamics, motion.rate)
+        fit = output_error(stretches, G, maxiter=ITERATIONS, tick=tick)
+        faster = without_slow_part(without_pairs(fit.dynamics, motion.rate), motion.rate)
         if faster is None:
             return None
         if faster.a.size == fit.dynamics.a.size:
@@ -291,7 +235,7 @@ def _reduced(
     trial: Dynamics | None = start
     least = np.inf
     while trial is not None:
-        refined = _refined(motion, trial, delay, 8, tick)
+        refined = _refined(motion, trial, delay, tick)
         if refined is not None:
             trial = refined[0].dynamics
             if refined[1] > (1.0 + 2.0 * SLACK) * least:
@@ -326,13 +270,13 @@ def find_linear_part(
     max_order : int
         Largest na and nb.
     delays : sequence of int, optional
-        Delays to try besides those around the scan's [samples].
+        Delays to try besides none and those around the scan's [samples].
     given : int, optional
         The only delay to try [samples].
     order : tuple of int, optional
         The only (na, nb) to try.
     rough : bool, optional
-        One delay, and no order below the first that does: good enough to improve H by.
+        No order below the first that does: good enough to improve H by.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
 
@@ -361,8 +305,8 @@ def find_linear_part(
     low = min(SCAN_ORDER, size)
     loss = np.array([factor.fit(low, low, d)[1] for d in range(MAX_DELAY)])
     scan = delay_from_loss(loss)
-    tried = [given] if given is not None else [*delays, scan or 0, max(0, (scan or 0) - 1)]
-    tried = list(dict.fromkeys(tried))[: 1 if rough else None]
+    tried = [*delays, scan or 0, max(0, (scan or 0) - 1), 0] if given is None else [given]
+    tried = list(dict.fromkeys(tried))
     found: list[tuple[float, int, OutputErrorFit]] = []
     for i, d in enumerate(tried):
         held = _moved(motion.held, d)
@@ -373,9 +317,16 @@ def find_linear_part(
         near = [(n, n + more) for n in range(1, size) for more in (-1, 0, 1) if n + more > 0]
         orders = [order] if order else near
         ls = min((factor.dynamics(na, nb, d) for na, nb in orders), key=judged)
-        start = stabilised(min(ls, instruments_of(_moved(motion.whole, d), ls), key=judged))
-        fits = _reduced(motion, start, d, functools.partial(tick, i / len(tried)), rough)
-        found += [(error, d, fit) for fit, error in fits]
+        moved = _moved(motion.whole, d)
+        starts = [min(ls, instruments_of(moved, ls), key=judged)]
+        # noise bends least squares, and the more the higher the rate
+        first = [(n, n + 1) for n in INSTRUMENTS if order is None and n < size]
+        starts += [instruments_of(moved, factor.dynamics(*n, d)) for n in first]
+        starts.sort(key=judged)
+        done = functools.partial(tick, i / len(tried))
+        for start in starts[: 1 if rough else None]:
+            fits = _reduced(motion, stabilised(start), d, done, rough)
+            found += [(error, d, fit) for fit, error in fits]
     least = min((error for error, *_ in found), default=np.inf)
     if least > (1.0 - GAIN) * pure_error:
         return LinearPart(pure, None, scan, loss, errors, judges)
@@ -392,7 +343,7 @@ def refined_linear_part(motion: FastMotion, linear: LinearPart) -> LinearPart:
     if linear.fit is None:
         return linear
     both = replace(motion, fitted=motion.whole)
-    found = _refined(both, linear.fit.dynamics, linear.delay.samples, 6)
+    found = _refined(both, linear.fit.dynamics, linear.delay.samples)
     if found is None or not _supported(found[0].dynamics, both):
         return linear
     return replace(linear, fit=found[0])

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.delay_check import upheld
-from piezo_ident.identification.linear_part import fast_part
 from piezo_ident.identification.noise_segment import (
     band_of,
     longest_noise,
@@ -30,6 +29,7 @@ from piezo_ident.identification.noise_segment import (
 )
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
+from piezo_ident.identification.slow_part import fast_part
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
@@ -247,7 +247,7 @@ def second_step(
     """
     Find G, with the hysteresis undone; the dynamics returned are stable, with G(1) = 1.
 
-    Where `lean`, G goes without the pairs of `linear_part.without_pairs`.
+    Where `lean`, G goes without the pairs of `slow_part.without_pairs`.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
-from piezo_ident.identification.hold_out import fitted_parts, MOVES
+from piezo_ident.identification.hold_out import fitted_parts, held_out_place, MOVES
 from piezo_ident.identification.linear_part import (
     find_linear_part,
     LinearPart,
@@ -59,8 +59,8 @@ Mask = NDArray[np.bool_]
 
 #: how often starts, H and G are fitted in turn
 TURNS = 3
-#: share of the fitted samples, at their end, that chooses between models
-LATE = 0.25
+#: share of the fitted samples that chooses between models
+CHOOSES = 0.25
 #: G goes where its squares are by this share more than those of hysteresis alone on what chooses
 WORSE = 0.02
 
@@ -277,18 +277,18 @@ def fit_unlabelled(
     chosen, parts = fitted_parts(runs, settings)
     joint = joint_fit(chosen, parts, settings, progress)
     used, whole = without_harm(chosen, joint.excerpts, joint.G, joint.delay)
-    early, late = _early_and_late(whole)
-    joint = _simplest(joint, early, late)
+    divided = _divided(whole, rate)
+    joint = _simplest(joint, *divided)
     delay = Delay(joint.delay.samples, joint.delay.fraction)
     # what chooses the thresholds is a part of what is fitted, never the held-out end
-    judged = hysteresis = third_step(early, late, joint.G, delay, settings, progress, whole)
+    judged = hysteresis = third_step(*divided, joint.G, delay, settings, progress, whole)
     if judged.solver == 'least_squares':
         # a short record has no motion to waste on its own test
         everything = [
             replace(e, use=run.use & (e.use | ~mask))
             for run, e, mask in zip(used, whole, parts, strict=True)
         ]
-        hysteresis = _again(judged, everything, joint.G, delay, settings)
+        hysteresis = _again(judged, everything, rate, joint.G, delay, settings)
     model, tested = (model_of(rate, scaling, h, joint.G, delay) for h in (hysteresis, judged))
     low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
     model = within(model, low, high)
@@ -333,20 +333,23 @@ def fit_unlabelled(
     )
 
 
-def _early_and_late(excerpts: Sequence[Excerpt]) -> tuple[list[Excerpt], list[Excerpt]]:
-    """Return the samples used but for those at the end, and those at the end."""
-    early, late = [], []
+def _divided(excerpts: Sequence[Excerpt], rate: float) -> tuple[list[Excerpt], list[Excerpt]]:
+    """Return the samples used but for a stretch of them, and that stretch, which chooses."""
+    fitted, choosing = [], []
     for e in excerpts:
-        chooses = np.zeros(e.use.size, dtype=bool)
-        chooses[np.flatnonzero(e.use)[int((1.0 - LATE) * e.use.sum()) :]] = True
-        early.append(replace(e, use=e.use & ~chooses))
-        late.append(replace(e, use=e.use & chooses))
-    return early, late
+        used, chooses = np.flatnonzero(e.use), np.zeros(e.use.size, dtype=bool)
+        n = int(CHOOSES * used.size)
+        start = held_out_place(e.u[used], rate, n) if n else 0
+        chooses[used[start : start + n]] = True
+        fitted.append(replace(e, use=e.use & ~chooses))
+        choosing.append(replace(e, use=chooses))
+    return fitted, choosing
 
 
 def _again(
     fit: HysteresisFit,
     excerpts: Sequence[Excerpt],
+    rate: float,
     G: Dynamics,
     delay: Delay,
     settings: Settings,
@@ -355,7 +358,7 @@ def _again(
     if fit.law != 'plays':
         return fit_again(fit, excerpts, G, delay)
     found = third_step(
-        *_early_and_late(excerpts), G, delay, settings, silent, excerpts, laws=('plays',)
+        *_divided(excerpts, rate), G, delay, settings, silent, excerpts, laws=('plays',)
     )
     return replace(found, errors_of_laws=fit.errors_of_laws)
 
@@ -369,18 +372,18 @@ def _named(run: Run, fitted: Mask) -> str:
     return f'{run.record} without {start / rate:.4g} to {stop / rate:.4g} s, which are held out'
 
 
-def _simplest(joint: JointFit, early: Sequence[Excerpt], late: Sequence[Excerpt]) -> JointFit:
-    """Return the fit, without its G or its delay too where that errs less on the late part."""
+def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Excerpt]) -> JointFit:
+    """Return the fit, without its G or its delay too where that errs less on what chooses."""
     delay = Delay(joint.delay.samples, joint.delay.fraction)
     if joint.G.a.size + joint.G.b.size == 1 and delay.total == 0.0:
         return joint
     r = joint.hysteresis.thresholds
 
     def error(G: Dynamics, delay: Delay) -> float:
-        fit = fit_hysteresis(factorise(early, r, G, delay), r)
-        return fit.left(factorise(late, r, G, delay))
+        fit = fit_hysteresis(factorise(fitted, r, G, delay), r)
+        return fit.left(factorise(choosing, r, G, delay))
 
-    if not any(e.use.any() for e in late) or not all(e.use.any() for e in early):
+    if not any(e.use.any() for e in choosing) or not all(e.use.any() for e in fitted):
         return joint
     unit = Dynamics.unit()
     # what G is worth counts where it is fast, what it costs where the record goes on

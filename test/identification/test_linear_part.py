@@ -4,13 +4,11 @@
 """Delay and G from any fast motion, on modes in continuous time behind a held voltage."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
-from piezo_ident.identification.linear_part import (
-    fast_part,
-    find_linear_part,
-    without_slow_part,
-)
+from piezo_ident.identification.linear_part import find_linear_part
 from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.slow_part import fast_part, without_slow_part
 from piezo_ident.operators.dynamics import Dynamics
 import pytest
 from scipy import signal
@@ -77,6 +75,21 @@ def test_modes_antiresonance_and_delay_come_out_of_any_broad_motion(drive):
     np.testing.assert_allclose(G.response(f, FS) * late, expected, atol=0.02 * abs(expected).max())
     assert G.a.size <= 6
     assert found.errors['dynamics'] < 0.2 * found.errors['nothing']
+
+
+def test_a_chirp_in_much_noise_shows_both_modes():
+    w = chirp(1.2, 4000.0)
+    x = stage(w)
+    x += 0.2 * np.std(x) * np.random.default_rng(3).standard_normal(x.size)
+    modes = found_in(w, x).fit.dynamics.modes(FS)
+    assert [round(mode.frequency / 10.0) for mode in modes] == [90, 230]
+    assert_allclose([mode.damping for mode in modes], [0.01, 0.015], rtol=0.05)
+
+
+def test_a_delay_that_steps_misread_spoils_no_rough_search():
+    w = noise()
+    found = found_in(w, stage(w), delays=[20], rough=True)
+    assert found.methods['dynamics'] < 0.1 and found.delay.samples < 5
 
 
 def test_creep_in_the_displacement_leaves_no_slow_pole():

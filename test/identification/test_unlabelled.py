@@ -154,3 +154,16 @@ def test_the_only_chirp_is_not_held_out():
     result = identify(Record((Piece(v, STAGE.simulate(v), FS),), 'ends in a chirp'))
     assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
     assert 'held out' in result.warnings[0]
+
+
+def test_what_chooses_lies_within_what_is_fitted():
+    # the last quarter alone goes beyond 6 V
+    steps = np.repeat([0.0, 2, 0, 3, 0, 4, 0], 1500)
+    v = np.concatenate([steps, 0.6 * sine(4.0), sine(1.0), 0.5 * sine(1.5)])
+    rng = np.random.default_rng(0)
+    y = STAGE.simulate(v) + 2e-8 * rng.standard_normal(v.size)
+    result = identify(Record((Piece(v, y, FS),), 'grows'))
+    assert result.not_identified == ()
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    unseen = STAGE.simulate(v := sine(2.0, 3.0))
+    assert np.std(result.model.simulate(v) - unseen) < 2e-3 * np.ptp(unseen)
