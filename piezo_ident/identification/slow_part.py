@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from piezo_ident.operators.dynamics import Dynamics
 
 __all__ = ['fast_part', 'without_pairs', 'without_slow_part']
@@ -18,6 +18,8 @@ SLOWEST_SHARE = 0.01
 #: a real pole and a real zero whose frequencies differ by less than this factor may be what H
 #: lacks of small motion, below this share of the frequency of the lowest mode that rings (damping)
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
+#: damping from which two conjugate roots swing no more than two real ones
+DAMPED = 0.7
 
 
 def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
@@ -42,29 +44,40 @@ def fast_part(G: Dynamics, rate: float, lean: bool = False) -> Dynamics:
 
 def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     """
-    Return G without pairs of a real pole and a near real zero far below its modes.
+    Return G without poles that decay, far below its modes, each beside a near zero.
 
     Small loops that open less than H says make such a pair, and so does hysteresis that depends on
-    the rate.
+    the rate.  Least squares may also place two of them off the real axis, strongly damped.
     """
     rings = [mode.frequency for mode in G.modes(rate) if mode.damping < RINGS]
-    poles, zeros = np.asarray(G.poles, dtype=complex), np.asarray(np.roots(G.b), dtype=complex)
     highest = BELOW_MODES * min(rings, default=0.0)
-    for pole in sorted(poles[_between(poles, 0.0, highest, rate)].real, reverse=True):
-        size = -np.log(pole) * rate / (2.0 * np.pi)
-        near = np.flatnonzero(_between(zeros, size / PAIR, size * PAIR, rate))
-        if near.size:
-            zeros = np.delete(zeros, near[np.argmin(np.abs(zeros[near] - pole))])
-            poles = np.delete(poles, np.argmin(np.abs(poles - pole)))
+    poles, zeros = (np.asarray(roots, dtype=complex) for roots in (G.poles, np.roots(G.b)))
+    for pole in sorted(poles[_decaying(poles, 0.0, highest, rate)], key=abs, reverse=True):
+        size = float(_size(pole, rate))
+        near = np.flatnonzero(_decaying(zeros, size / PAIR, size * PAIR, rate))
+        # conjugate ones go together
+        count = 1 if pole.imag == 0.0 else 2
+        chosen = near[np.argsort(np.abs(zeros[near] - pole))][:count]
+        if pole.imag < 0.0 or chosen.size < count or abs(zeros[chosen].sum().imag) > 1e-9:
+            continue
+        zeros = np.delete(zeros, chosen)
+        poles = poles[~np.isin(poles, (pole, pole.conjugate()))]
     if poles.size == G.a.size:
         return G
     a, b = (np.atleast_1d(np.real(np.poly(roots))) for roots in (poles, zeros))
     return Dynamics(a[1:], b * G.gain * a.sum() / b.sum())
 
 
-def _between(
+def _size(roots: ArrayLike, rate: float) -> NDArray[np.float64]:
+    """Return the natural frequencies of roots [Hz]."""
+    z = np.asarray(roots, dtype=complex)
+    return np.asarray(np.abs(np.log(np.where(z == 0.0, 1e-300, z))) * rate / (2.0 * np.pi))
+
+
+def _decaying(
     roots: NDArray[np.complex128], low: float, high: float, rate: float
 ) -> NDArray[np.bool_]:
-    """Return the real roots that decay, with frequencies between two [Hz]."""
-    ends = np.exp(-2.0 * np.pi * np.array([high, low]) / rate)
-    return np.asarray((roots.imag == 0.0) & (roots.real > ends[0]) & (roots.real < ends[1]))
+    """Return the roots that decay without a swing, with frequencies between two [Hz]."""
+    size = _size(roots, rate)
+    decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)
+    return np.asarray((size > low) & (size < high) & (decay > DAMPED * size))

@@ -131,6 +131,23 @@ def test_a_real_pole_beside_a_real_zero_far_below_the_modes_goes():
     assert left.gain == pytest.approx(1.0)
 
 
+def test_poles_off_the_real_axis_that_decay_beside_such_zeros_go_too():
+    rings = np.exp(2.0 * np.pi * 636.0 / FS * (-0.005 + 1j))
+    pole, zero = np.exp(2.0 * np.pi / FS * np.array([-64.0 + 17.0j, -65.0 + 37.0j]))
+    modes = [rings, np.conj(rings)]
+    G = Dynamics(
+        np.real(np.poly([*modes, pole, np.conj(pole)]))[1:],
+        np.real(np.poly([zero, np.conj(zero)])),
+    )
+    left = fast_part(G, FS, lean=True)
+    np.testing.assert_allclose(
+        sorted(left.poles, key=np.imag), sorted(modes, key=np.imag), rtol=1e-9
+    )
+    # without a near zero they are a lag of the stage
+    far = Dynamics(G.a, np.poly([0.5, 0.4]))
+    assert fast_part(far, FS, lean=True).a.size == 4
+
+
 def test_pure_delay_is_found_to_a_part_of_a_sample():
     w = chirp(0.6, 400.0)
     later = np.interp(np.arange(w.size) - 1.4, np.arange(w.size), w)
