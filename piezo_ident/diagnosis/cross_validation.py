@@ -23,6 +23,7 @@ from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
     'NormalEquations',
+    'Pull',
     'block_products',
     'held_out_errors',
     'held_out_residual',
@@ -60,6 +61,28 @@ class NormalEquations:
     def only(self, chosen: NDArray[np.bool_]) -> NormalEquations:
         """Return those of some columns; shape (p,)."""
         return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """
+    Normal equations of what is known besides the blocks.
+
+    Attributes
+    ----------
+    A : ndarray, shape (p, p)
+    b : ndarray, shape (p,)
+    s : float
+        Sum of squares as it is.
+    """
+
+    A: Array
+    b: Array
+    s: float
+
+    def only(self, chosen: NDArray[np.bool_]) -> Pull:
+        """Return those of some columns; shape (p,)."""
+        return Pull(self.A[np.ix_(chosen, chosen)], self.b[chosen], self.s)
 
 
 def block_products(rows: Rows, M: Array, N: Array) -> Array:
@@ -122,13 +145,25 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
         ) from None
 
 
-def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: Array) -> Array:
+def _summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]:
+    """Return the normal equations of all blocks, and of a pull."""
+    A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+    return (A, b) if pull is None else (A + pull.A, b + pull.b[:, None])
+
+
+def held_out_errors(
+    equations: NormalEquations,
+    sets: NDArray[np.int64],
+    prior: Array,
+    pull: Pull | None = None,
+) -> Array:
     """
     Return the squares of every block, each predicted from other sets; shape (blocks, k).
 
     Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
+    The pull never is.
     """
-    A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+    A, b = _summed(equations, pull)
     errors = equations.s.copy()
     for one in np.unique(sets):
         out = sets == one
@@ -140,7 +175,12 @@ def held_out_errors(equations: NormalEquations, sets: NDArray[np.int64], prior: 
 
 
 def held_out_residual(
-    rows: Rows, M: Array, e: Array, prior: Array, sets: NDArray[np.int64]
+    rows: Rows,
+    M: Array,
+    e: Array,
+    prior: Array,
+    sets: NDArray[np.int64],
+    pull: Pull | None = None,
 ) -> Array:
     """
     Return the residual of every row, predicted with parameters fitted to other blocks.
@@ -151,7 +191,7 @@ def held_out_residual(
     Gauss-Newton step.
     """
     equations = normal_equations(rows, M, e[:, None])
-    A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+    A, b = _summed(equations, pull)
     left = e.copy()
     for one in np.unique(sets):
         out = sets == one

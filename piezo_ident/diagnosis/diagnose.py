@@ -35,6 +35,7 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, means, Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
     errors_of_laws,
@@ -230,6 +231,8 @@ def _diagnosed(
     if not findings.effects:
         whole = noise if single is None else single
         findings = with_refit(simulator, given, base, findings, selected, noise, whole, misfit)
+    laws = errors_of_laws(rows, (selected.fitted, plays, wide))
+    selected = replace(selected, fitted=toward_given(simulator, given, selected.fitted))
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
@@ -280,7 +283,7 @@ def _diagnosed(
         ),
         settings=settings,
         law=law.name if (law := selected.fitted.state.law) else '',
-        errors_of_laws=errors_of_laws(rows, (selected.fitted, plays, wide)),
+        errors_of_laws=laws,
         kinds=rows.kinds,
     )
 
@@ -289,9 +292,10 @@ def _missed(model: StageModel) -> float:
     """Return what the model missed of fast motion at its identification, % of stroke, or 0."""
     errors = model.identification.get('errors')
     known = errors if isinstance(errors, Mapping) else {}
-    fast = known.get('fast_motion')
-    # a file without it tells the error of all motion at least
-    told = known.values() if fast is None else (fast,)
+    # a file without the first tells the error of all motion at least; without labels fast motion
+    # was judged next to what was fitted, which the part held out was not
+    own = {key: known[key] for key in ('fast_motion', 'held_out') if key in known}
+    told = own.values() if 'fast_motion' in own else known.values()
     return max((float(x) for x in told if isinstance(x, int | float)), default=0.0)
 
 

@@ -23,6 +23,7 @@ from piezo_ident.diagnosis.cross_validation import (
     held_out_residual,
     normal_equations,
     NormalEquations,
+    Pull,
     right_sides,
     with_columns,
 )
@@ -94,6 +95,8 @@ class Fitted:
     prior : ndarray, shape (p,)
     errors, transfer : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets and in whole kinds.
+    pull : Pull or None
+        What was fitted besides the rows.
     """
 
     state: State
@@ -105,6 +108,7 @@ class Fitted:
     prior: Array
     errors: Array
     transfer: Array
+    pull: Pull | None = None
 
     @property
     def J(self) -> Array:
@@ -131,7 +135,8 @@ class Fitted:
         """
         prior = self.prior if sets is None else _firm(self.prior, self.moving)
         sets = rows.fold if sets is None else sets
-        return held_out_residual(rows, self.J, self.e, prior[self.free], sets)
+        pull = None if self.pull is None else self.pull.only(self.free)
+        return held_out_residual(rows, self.J, self.e, prior[self.free], sets, pull)
 
 
 def base_thresholds(swing: float) -> Array:
@@ -170,11 +175,13 @@ def fit_jointly(
     *,
     iterations: int = ITERATIONS,
     tick: Callable[[], None] = lambda: None,
+    pull_at: Callable[[State, int], Pull] | None = None,
 ) -> Fitted:
     """
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
+    `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 
     Raises
     ------
@@ -189,10 +196,11 @@ def fit_jointly(
     damping = DAMPING
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
+    pull = pull_at and pull_at(state, p)
     for _ in range(iterations):
-        before = float(e @ e)
+        before = _loss(e, pull)
         lower, upper = _room(state, parameters, p)
-        step = _Step(base, moving, e, _prior(rows, e, p, state))
+        step = _Step(base, moving, e, _prior(rows, e, p, state), pull)
         better = None
         for _ in range(ATTEMPTS):
             tick()
@@ -203,7 +211,8 @@ def fit_jointly(
             except ModelError:
                 damping *= 10.0
                 continue
-            after = float(left @ left)
+            new = pull_at and pull_at(trial, p)
+            after = _loss(left, new)
             if np.isfinite(after) and after < before:
                 better = trial
                 break
@@ -211,7 +220,7 @@ def fit_jointly(
         if better is None:
             break
         damping = max(damping / 10.0, 1e-9)
-        state, e = better, left
+        state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
         if after > (1.0 - TOLERANCE) * before:
             break
@@ -222,6 +231,7 @@ def fit_jointly(
     E = e[:, None]
     known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
     equations = with_columns(rows, known, base.columns, moving, E).only(free)
+    own, firm = pull and pull.only(free), _firm(prior, moving)
     return Fitted(
         state=state,
         base=base,
@@ -230,9 +240,14 @@ def fit_jointly(
         free=free,
         parameters=parameters,
         prior=prior,
-        errors=held_out_errors(equations, rows.fold, prior[free])[:, 0],
-        transfer=held_out_errors(equations, rows.group, _firm(prior, moving)[free])[:, 0],
+        errors=held_out_errors(equations, rows.fold, prior[free], own)[:, 0],
+        transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
+        pull=pull,
     )
+
+
+def _loss(e: Array, pull: Pull | None) -> float:
+    return float(e @ e) + (0.0 if pull is None else pull.s)
 
 
 def _firm(prior: Array, moving: Array) -> Array:
@@ -341,18 +356,28 @@ def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> 
 class _Step:
     """Normal equations of a step, scaled to columns of length one."""
 
-    def __init__(self, base: BaseColumns, moving: Array, e: Array, prior: Array) -> None:
+    def __init__(
+        self,
+        base: BaseColumns,
+        moving: Array,
+        e: Array,
+        prior: Array,
+        pull: Pull | None = None,
+    ) -> None:
         # one pass over the many columns
         known = base.columns.T @ np.concatenate([moving.T, e[None]]).T
         mixed = known[:, :-1]
         A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
+        b = np.concatenate([known[:, -1], moving.T @ e])
+        if pull is not None:
+            A, b = A + pull.A, b + pull.b
         size = np.sqrt(np.diag(A))
         self._size = np.where(size > 0.0, size, 1.0)
         self._A = A / np.outer(self._size, self._size)
         self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
         # a column of zeros stays where it is
         self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
-        self._b = np.concatenate([known[:, -1], moving.T @ e]) / self._size
+        self._b = b / self._size
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Return the bounded step; damping is a share of each column's own energy."""

@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
+#: effect that is a gain which changes with time
+WANDERS = 'gain_drift'
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,8 @@ def refine(
         offsets = fitted.state.offsets - shifts
         fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
     if not findings.effects or lasting(findings.effects):
-        refined = _model(simulator, fitted.state, findings, _range(simulator), errors)
+        state = _at_given_gain(simulator, given, fitted.state)
+        refined = _model(simulator, state, findings, _range(simulator), errors)
         return Refined(refined, fitted.state, metres)
     # what the model leaves out was there, and will be
     if _is_finding(simulator, given, fitted):
@@ -89,6 +92,27 @@ def refine(
     state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
     refined = _model(simulator, state, findings, model.scaling.range, errors[:1])
     return Refined(refined, fitted.state, metres, h_is_given=True)
+
+
+def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
+    """
+    Return a state with the effects of another record, where a gain wanders as far as given.
+
+    The mean gain of these records is no more that of the next than the one of the model is.
+    """
+    kept = [_elsewhere(added) for added in state.effects]
+    if not any(added.name == WANDERS for added in kept):
+        return state
+    others = tuple(added for added in kept if added.name != WANDERS)
+    of_record = simulator.rows.of_record
+    x, known = (
+        centred(simulator.run(s), of_record) for s in (replace(state, effects=others), given)
+    )
+    gain = float(x @ known / (x @ x)) - 1.0
+    effects = [
+        added if added.name != WANDERS else added.changed(None, 'gain', 0, gain) for added in kept
+    ]
+    return replace(state, effects=tuple(effects))
 
 
 def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:

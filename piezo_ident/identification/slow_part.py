@@ -18,8 +18,6 @@ SLOWEST_SHARE = 0.01
 #: a real pole and a real zero whose frequencies differ by less than this factor may be what H
 #: lacks of small motion, below this share of the frequency of the lowest mode that rings (damping)
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
-#: damping from which two conjugate roots swing no more than two real ones
-DAMPED = 0.7
 
 
 def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
@@ -77,7 +75,7 @@ def _size(roots: ArrayLike, rate: float) -> NDArray[np.float64]:
 def _decaying(
     roots: NDArray[np.complex128], low: float, high: float, rate: float
 ) -> NDArray[np.bool_]:
-    """Return the roots that decay without a swing, with frequencies between two [Hz]."""
+    """Return the roots that do not ring, with frequencies between two [Hz]."""
     size = _size(roots, rate)
     decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)
-    return np.asarray((size > low) & (size < high) & (decay > DAMPED * size))
+    return np.asarray((size > low) & (size < high) & (decay > RINGS * size))

@@ -1,0 +1,83 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What the H as given says of motion that the data do not hold.
+
+Records without labels hold motion of one kind.  Free there and nowhere else, a refit of H does
+anything under other motion.  The given H came from motion of its own, so it counts as data, too:
+
+    min  |e|^2 + WEIGHT n mean((h - h_0 - c)^2)
+
+with h and h_0 the new and the given H under loops of all widths and places in the range of the
+model, n the number of rows, and c the mean of the difference, which offsets make up for.  An
+effect of the voltage that was there at the identification has bent the given H: it does not count
+beside one.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.diagnosis.cross_validation import Pull
+from piezo_ident.diagnosis.forward_selection import TESTED
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.operators.play import initial_memory
+
+__all__ = ['loops', 'toward_given']
+
+Array = NDArray[np.float64]
+
+#: weight of the given H against the rows
+WEIGHT = 0.3
+#: samples of a sweep over the range
+SWEEP = 60
+
+
+def loops(low: float, high: float) -> Array:
+    """Return a motion from `low` through loops that hang from both ends, and some between."""
+    turns = [0.0]
+    for level in np.arange(1, 7) / 6:
+        turns += [level, 0.0]
+    turns.append(1.0)
+    for level in np.arange(1, 6) / 6:
+        turns += [level, 1.0]
+    turns.append(0.0)
+    for level in (0.3, 0.6, 0.9):
+        turns += [level, level - 0.15, level, level - 0.15]
+    turns.append(0.0)
+    sweeps = [
+        np.linspace(a, b, max(2, round(SWEEP * abs(b - a))), endpoint=False)
+        for a, b in itertools.pairwise(turns)
+    ]
+    return low + (high - low) * np.concatenate(sweeps)
+
+
+def toward_given(simulator: Simulator, given: State, fitted: Fitted) -> Fitted:
+    """Return a fit of rows of one kind of motion, drawn towards the H as given."""
+    law, rows = fitted.state.law, simulator.rows
+    is_bent = any(
+        not added.effect.time_driven and added.name not in TESTED for added in fitted.state.effects
+    )
+    if law is None or rows.kinds or is_bent:
+        return fitted
+    u = loops(*map(float, simulator.model.scaling.u(simulator.model.scaling.range)))
+    P = np.stack(list(law.columns(u, initial_memory(u[0], law.thresholds))), axis=1)
+    P -= P.mean(axis=0)
+    h = given.hysteresis(u, initial_memory(u[0], given.hysteresis.thresholds))
+    h = h - h.mean()
+    weight = WEIGHT * rows.n / u.size
+    A = weight * (P.T @ P)
+
+    def pull_at(state: State, size: int) -> Pull:
+        k = law.size
+        whole, right = np.zeros((size, size)), np.zeros(size)
+        left = h - P @ state.coefficients
+        whole[:k, :k], right[:k] = A, weight * (P.T @ left)
+        return Pull(whole, right, weight * float(left @ left))
+
+    state = fitted.state
+    return fit_jointly(simulator, state, base_at(simulator, state), pull_at=pull_at)
