@@ -81,6 +81,9 @@ GAIN = 0.005
 WARM_UP = 2000
 #: candidates that are refined and judged again
 CANDIDATES = 5
+#: most iterations that refine a candidate: beside a coarse converter at a high rate, least squares
+#: and instrumental variables start far from modes that ring for long
+REFINING = 40
 #: what is slower than this is creep, not dynamics: it is filtered out before G is refined [Hz]
 SLOWEST = 5.0
 #: share by which G refined beside another law of H must err less
@@ -230,7 +233,7 @@ def _orders(
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls
         # ticks repeat the share, so that the work can be stopped within an iteration
         tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
-        fit = output_error([refined_on], stabilised(start), maxiter=10, tick=tick)
+        fit = output_error([refined_on], stabilised(start), maxiter=REFINING, tick=tick)
         errors['output error'] = held_error(fit.dynamics)
         if np.isfinite(errors['output error']):
             result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)

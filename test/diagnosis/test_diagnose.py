@@ -491,7 +491,9 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
 @pytest.mark.parametrize(
     ('errors', 'missed'),
     [
-        ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2, 'fast_motion': 0.05}, 0.05),
+        ({'unit': '%', 'fitted': 0.1, 'selection': 0.2, 'fast_motion': 0.05}, 0.05),
+        # of records without labels
+        ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2, 'fast_motion': 0.05}, 0.2),
         # an older file
         ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2}, 0.2),
         (None, 0.0),

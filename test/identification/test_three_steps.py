@@ -24,12 +24,22 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program
 import pytest
+from scipy import signal
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
 PROGRAM = identification_program(steps=12, noise=1, slope=30)
+COARSE = """
+limits: [0, 100]
+slew: 300
+seed: 1
+segments:
+  - {signal: settle, bias: 50, amplitude: 4.8, cycles: 16, frequency: 20}
+  - {signal: noise, bias: 50, amplitude: 4, cutoff: 3000, duration: 2}
+  - {signal: triangle, slope: 160}
+"""
 
 
 def runs(*records):
@@ -94,6 +104,29 @@ def test_dynamics_are_refined_where_they_do_not_suit_h():
     )
     assert after.max() < 0.1 * before.max()
     assert refined[0].covariance.shape == (22, 22)
+
+
+def test_modes_that_ring_for_long_are_found_beside_a_coarse_converter():
+    # at 50 kHz least squares see none of them below the steps of 9 bits
+    fs, modes = 5e4, ((243.0, 0.012, 0.81), (679.0, 0.005, 0.1), (1551.0, 0.036, 0.09))
+    sequence = parse_program(COARSE).build(sample_rate=fs)
+    x = np.zeros(sequence.n)
+    for f, zeta, share in modes:
+        s = 2.0 * np.pi * f
+        b, a, _ = signal.cont2discrete(
+            ([share * s * s], [1.0, 2.0 * zeta * s, s * s]), 1.0 / fs, 'zoh'
+        )
+        x += signal.lfilter(np.ravel(b), a, sequence.v / 100.0)
+    y = 1e-5 * np.round(x * 512) / 512
+    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
+    piece = Piece(sequence.v, y, fs, segments=tuple(Segment(*label) for label in labels))
+    given = runs_of([Record((piece,), 'coarse')], fs, scaling_of([piece]))
+    _, G = second_step(given, Delay(0), Settings(), silent)
+    for f, zeta, _ in modes:
+        assert any(
+            m.frequency == pytest.approx(f, rel=0.01) and m.damping == pytest.approx(zeta, rel=0.1)
+            for m in G.modes(fs)
+        ), G.modes(fs)
 
 
 def test_short_and_silent_noise_are_refused():

@@ -1,0 +1,91 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A refit that knows one kind of motion alone, and the H that it was given."""
+
+from dataclasses import replace
+
+from diagnosis_examples import measured
+import numpy as np
+from piezo_ident.diagnosis.base_refit import refits
+from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
+from piezo_ident.diagnosis.refined_model import _at_given_gain
+from piezo_ident.diagnosis.rows import centred, make_rows
+from piezo_ident.diagnosis.simulator import Added, Simulator, State
+from piezo_ident.diagnosis.toward_given import loops, toward_given
+from piezo_ident.record.record import Record
+from programs import slow_model
+import pytest
+
+CREEP = Added('creep', ({'gain': [0.01], 'time_constant': [0.5]},))
+LINE = {'frequency': 50.0, 'harmonic': [1.0], 'amplitude': [1e-4], 'phase': [0.0]}
+HUM = Added('periodic_disturbance', (LINE,))
+
+
+def without_labels() -> Record:
+    (piece,) = measured().pieces
+    return Record((replace(piece, segments=()),), 'unlabelled')
+
+
+@pytest.fixture(scope='module')
+def refit():
+    """Return simulator, the state as given, and a refit of an H that is none of the data's."""
+    simulator = Simulator(slow_model(), make_rows(slow_model(), [without_labels()]))
+    h = slow_model().hysteresis
+    given = State(replace(h, weights=h.weights[::-1].copy()), np.zeros(1))
+    return simulator, given, refits(simulator, given)[0]
+
+
+def distance(given: State, state: State) -> float:
+    """Return by how much two H differ under loops, their means aside."""
+    u = loops(0.0, 1.0)
+    return float(np.std(state.hysteresis(u) - given.hysteresis(u)))
+
+
+def test_a_refit_of_one_kind_of_motion_stays_nearer_to_the_given_h(refit):
+    simulator, given, fitted = refit
+    near = toward_given(simulator, given, fitted)
+    rows = simulator.rows
+    as_given = np.mean(centred(rows.x - simulator.run(given), rows.of_record) ** 2)
+    assert distance(given, near.state) < 0.9 * distance(given, fitted.state)
+    assert fitted.mean_square < near.mean_square < as_given
+
+
+def test_the_given_h_is_never_held_out(refit):
+    simulator, given, fitted = refit
+    near, rows = toward_given(simulator, given, fitted), refit[0].rows
+    left = near.held_out_residual(rows, rows.group)
+    out = (rows.group == 3)[rows.block]
+    M, pull = near.J, near.pull.only(near.free)
+    A, b = M[~out].T @ M[~out] + pull.A, M[~out].T @ near.e[~out] + pull.b
+    theta = solve(A, b, near.prior[near.free])
+    np.testing.assert_allclose(left[out], (near.e - M @ theta)[out], atol=1e-9)
+    # and without it the data alone tell the rest
+    alone = held_out_residual(rows, M, near.e, near.prior[near.free], rows.group)
+    assert np.sum(alone**2) < np.sum(left**2)
+
+
+def test_several_kinds_of_motion_tell_h_by_themselves(refit):
+    _, given, _ = refit
+    simulator = Simulator(slow_model(), make_rows(slow_model(), [measured()]))
+    fitted = refits(simulator, given)[0]
+    assert simulator.rows.kinds
+    assert toward_given(simulator, given, fitted) is fitted
+
+
+@pytest.mark.parametrize(('effect', 'stays'), [(CREEP, True), (HUM, False)])
+def test_an_effect_of_the_voltage_has_bent_the_given_h(refit, effect, stays):
+    simulator, given, fitted = refit
+    beside = replace(fitted, state=fitted.state.with_effect(effect))
+    assert (toward_given(simulator, given, beside) is beside) == stays
+
+
+def test_a_gain_that_wanders_is_elsewhere_as_far_as_given(refit):
+    simulator, _, fitted = refit
+    given = replace(fitted.state, offsets=np.zeros(1))
+    # H takes a quarter less, and the gain makes up for that on the whole
+    theta = 0.75 * given.coefficients
+    wanders = Added('gain_drift', ({'time': [0.0, 10.0], 'gain': [0.2, 0.5]},))
+    state = given.with_coefficients(given.law, theta).with_effect(wanders)
+    [added] = _at_given_gain(simulator, given, state).effects
+    assert added.values[0]['gain'] == pytest.approx([1.0 / 3.0], rel=1e-6)
