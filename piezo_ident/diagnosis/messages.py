@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import TUNED
-from piezo_ident.diagnosis.refined_model import Refined
+from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.simulator import Added
 from piezo_ident.diagnosis.verdict import Findings
@@ -62,8 +62,9 @@ def warnings_of(
             f'{100.0 * max(bent, 0.0):.0f} % of what a refit of the hysteresis leaves goes with '
             'that alone: an effect bent them at the identification, or they have changed since'
         )
+    stay = bool(lasting(findings.effects))
     found += [
-        _of_time_driven(a, refined.h_is_given) for a in state.effects if a.effect.time_driven
+        _of_time_driven(a, refined.h_is_given, stay) for a in state.effects if a.effect.time_driven
     ]
     for shift in refined.shifts[refined.shifts != 0.0]:
         found.append(
@@ -79,11 +80,13 @@ def warnings_of(
     return found
 
 
-def _of_time_driven(added: Added, h_is_given: bool) -> str:
+def _of_time_driven(added: Added, h_is_given: bool, beside_others: bool) -> str:
     effect = added.effect
     is_off = all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
     # a refitted H was fitted to the mean of what wanders
     kept = 'it switched off' if h_is_given or is_off else 'its mean'
+    if beside_others and added.name == WANDERS:
+        kept = 'the gain of the given one'
     if h_is_given:
         kept += ', and the hysteresis as it was given'
     return (

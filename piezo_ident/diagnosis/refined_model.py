@@ -19,7 +19,7 @@ from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['Refined', 'lasting', 'moved_zeros', 'refine']
+__all__ = ['WANDERS', 'Refined', 'lasting', 'moved_zeros', 'refine']
 
 Array = NDArray[np.float64]
 
@@ -96,9 +96,9 @@ def refine(
 
 def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     """
-    Return a state with the effects of another record, where a gain wanders as far as given.
+    Return a state whose gain, where it wanders, is the one of the model as given.
 
-    The mean gain of these records is no more that of the next than the one of the model is.
+    The mean gain of these records is no more that of the next than the given one.
     """
     kept = [_elsewhere(added) for added in state.effects]
     if not any(added.name == WANDERS for added in kept):
