@@ -7,7 +7,7 @@ What the H as given says of motion that the data do not hold.
 Records without labels hold motion of one kind.  Free there and nowhere else, a refit of H does
 anything under other motion.  The given H came from motion of its own, so it counts as data, too:
 
-    min  |e|^2 + WEIGHT n mean((h - h_0 - c)^2)
+    min  |e|^2 + n mean((h - h_0 - c)^2)
 
 with h and h_0 the new and the given H under loops of all widths and places in the range of the
 model, n the number of rows, and c the mean of the difference, which offsets make up for.  An
@@ -31,8 +31,6 @@ __all__ = ['loops', 'toward_given']
 
 Array = NDArray[np.float64]
 
-#: weight of the given H against the rows
-WEIGHT = 0.3
 #: samples of a sweep over the range
 SWEEP = 60
 
@@ -69,7 +67,8 @@ def toward_given(simulator: Simulator, given: State, fitted: Fitted) -> Fitted:
     P -= P.mean(axis=0)
     h = given.hysteresis(u, initial_memory(u[0], given.hysteresis.thresholds))
     h = h - h.mean()
-    weight = WEIGHT * rows.n / u.size
+    # as much as the rows: a smaller weight gained more here, and lost more under other motion
+    weight = rows.n / u.size
     A = weight * (P.T @ P)
 
     def pull_at(state: State, size: int) -> Pull:
