@@ -231,8 +231,9 @@ def _diagnosed(
     if not findings.effects:
         whole = noise if single is None else single
         findings = with_refit(simulator, given, base, findings, selected, noise, whole, misfit)
-    laws = errors_of_laws(rows, (selected.fitted, plays, wide))
-    selected = replace(selected, fitted=toward_given(simulator, given, selected.fitted))
+    last = selected.fitted
+    if not findings.keeps_given:
+        last = toward_given(simulator, given, last)
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
@@ -240,11 +241,11 @@ def _diagnosed(
         for e in (
             rows.x - simulator.run(given),
             base.held_out_residual(rows),
-            selected.fitted.held_out_residual(rows, rows.group),
+            last.held_out_residual(rows, rows.group),
         )
     )
     overall = before.overall, after.overall
-    refined = refine(simulator, given, selected.fitted, findings, overall)
+    refined = refine(simulator, given, last, findings, overall)
     if refined.is_given:
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)
@@ -262,7 +263,7 @@ def _diagnosed(
         sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
         given=model,
         model=refined.model,
-        effects=found_effects(rows, base, selected, explainable),
+        effects=found_effects(rows, base, selected, explainable, last),
         group=findings.group,
         unexplained=rest,
         candidates=candidates_of(rows, selected.rounds, findings, noise, aside),
@@ -283,19 +284,20 @@ def _diagnosed(
         ),
         settings=settings,
         law=law.name if (law := selected.fitted.state.law) else '',
-        errors_of_laws=laws,
+        errors_of_laws=errors_of_laws(rows, (selected.fitted, plays, wide)),
         kinds=rows.kinds,
     )
 
 
 def _missed(model: StageModel) -> float:
-    """Return what the model missed of fast motion at its identification, % of stroke, or 0."""
+    """Return what the model missed at its identification, % of stroke, or 0: of fast motion."""
     errors = model.identification.get('errors')
     known = errors if isinstance(errors, Mapping) else {}
-    # a file without the first tells the error of all motion at least; without labels fast motion
-    # was judged next to what was fitted, which the part held out was not
-    own = {key: known[key] for key in ('fast_motion', 'held_out') if key in known}
-    told = own.values() if 'fast_motion' in own else known.values()
+    # a file without that tells the error of all motion at least; without labels, and so without a
+    # part that selects, fast motion was judged next to what was fitted
+    keys = ('fast_motion',) if 'selection' in known else ('fast_motion', 'held_out')
+    own = [known[key] for key in keys if key in known]
+    told = own if 'fast_motion' in known else known.values()
     return max((float(x) for x in told if isinstance(x, int | float)), default=0.0)
 
 

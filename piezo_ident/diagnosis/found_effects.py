@@ -15,22 +15,22 @@ __all__ = ['found_effects']
 
 
 def found_effects(
-    rows: Rows, base: Fitted, selected: Selected, explainable: float
+    rows: Rows, base: Fitted, selected: Selected, explainable: float, last: Fitted
 ) -> tuple[FoundEffect, ...]:
     """
     Return the effects that were added, with parameters as in the record with most rows.
 
-    `explainable` is the mean square that there was to explain.
+    `explainable` is the mean square that there was to explain, and `last` the fit that the refined
+    model comes from.
     """
     if not selected.taken:
         return ()
-    fitted = selected.fitted
-    std = standard_deviations(rows, fitted)
+    std = standard_deviations(rows, last)
     steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
-    levels = [base.mean_square, *steps, fitted.mean_square]
+    levels = [base.mean_square, *steps, selected.fitted.mean_square]
     found = []
     for i, (added, level, left) in enumerate(
-        zip(fitted.state.effects, levels[:-1], levels[1:], strict=True)
+        zip(last.state.effects, levels[:-1], levels[1:], strict=True)
     ):
         gain = max(level - left, 0.0)
         values = added.values[rows.longest]

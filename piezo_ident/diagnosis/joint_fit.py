@@ -96,7 +96,7 @@ class Fitted:
     errors, transfer : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets and in whole kinds.
     pull : Pull or None
-        What was fitted besides the rows.
+        What was fitted besides the rows, shape (p, p): the given H as data.
     """
 
     state: State
@@ -271,7 +271,11 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     M = fitted.J
     size = np.linalg.norm(M, axis=0)
     equations = normal_equations(rows, M, fitted.e[:, None])
-    A = equations.A.sum(axis=0) / np.outer(size, size)
+    A = equations.A.sum(axis=0)
+    if fitted.pull is not None:
+        # the given H is no observation, but it holds what these leave open
+        A = A + fitted.pull.only(fitted.free).A
+    A = A / np.outer(size, size)
     A[np.diag_indices_from(A)] += 1e-10
     gradients = equations.b[:, :, 0] / size
     inverse = np.linalg.pinv(A, hermitian=True)

@@ -78,7 +78,9 @@ def refine(
         fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
     if not findings.effects or lasting(findings.effects):
         state = _at_given_gain(simulator, given, fitted.state)
-        refined = _model(simulator, state, findings, _range(simulator), errors)
+        # what a gain makes of the next record, these do not tell
+        told = errors if state is fitted.state else errors[:1]
+        refined = _model(simulator, state, findings, _range(simulator), told)
         return Refined(refined, fitted.state, metres)
     # what the model leaves out was there, and will be
     if _is_finding(simulator, given, fitted):
@@ -98,7 +100,8 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     """
     Return a state whose gain, where it wanders, is the one of the model as given.
 
-    The mean gain of these records is no more that of the next than the given one.
+    The next record need not have the mean gain of these, and H was identified with the given one:
+    with the effects that were added, too, as far as they were there.
     """
     kept = [_elsewhere(added) for added in state.effects]
     if not any(added.name == WANDERS for added in kept):

@@ -4,15 +4,15 @@
 """
 What the H as given says of motion that the data do not hold.
 
-Records without labels hold motion of one kind.  Free there and nowhere else, a refit of H does
-anything under other motion.  The given H came from motion of its own, so it counts as data, too:
+Of records without labels, or of one kind, nothing tells how a refit of H does under other motion.
+The given H came from motion of its own, so it counts as data, too:
 
     min  |e|^2 + n mean((h - h_0 - c)^2)
 
-with h and h_0 the new and the given H under loops of all widths and places in the range of the
-model, n the number of rows, and c the mean of the difference, which offsets make up for.  An
-effect of the voltage that was there at the identification has bent the given H: it does not count
-beside one.
+with h and h_0 the new and the given H under loops over the range of the model, n the number of
+rows, and c the mean of the difference, which offsets make up for.  An effect of the voltage that
+was there at the identification has bent the given H, which then does not count.  Nor does it where
+the data cover a part of the range alone: the refined model holds there and nowhere else.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.operators.play import initial_memory
 
 __all__ = ['loops', 'toward_given']
 
@@ -55,17 +55,20 @@ def loops(low: float, high: float) -> Array:
 
 
 def toward_given(simulator: Simulator, given: State, fitted: Fitted) -> Fitted:
-    """Return a fit of rows of one kind of motion, drawn towards the H as given."""
-    law, rows = fitted.state.law, simulator.rows
+    """Return a fit of rows without kinds of motion, drawn towards the H as given."""
+    law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
+    pieces = [run.piece for run in rows.runs]
+    reach = max(float(p.v.max()) for p in pieces) - min(float(p.v.min()) for p in pieces)
+    is_part = reach < COVERED * (scaling.range[1] - scaling.range[0])
     is_bent = any(
         not added.effect.time_driven and added.name not in TESTED for added in fitted.state.effects
     )
-    if law is None or rows.kinds or is_bent:
+    if law is None or rows.kinds or is_bent or is_part:
         return fitted
-    u = loops(*map(float, simulator.model.scaling.u(simulator.model.scaling.range)))
-    P = np.stack(list(law.columns(u, initial_memory(u[0], law.thresholds))), axis=1)
+    u = loops(*map(float, scaling.u(scaling.range)))
+    P = np.stack(list(law.columns(u)), axis=1)
     P -= P.mean(axis=0)
-    h = given.hysteresis(u, initial_memory(u[0], given.hysteresis.thresholds))
+    h = given.hysteresis(u)
     h = h - h.mean()
     # as much as the rows: a smaller weight gained more here, and lost more under other motion
     weight = rows.n / u.size

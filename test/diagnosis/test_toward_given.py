@@ -53,7 +53,7 @@ def test_a_refit_of_one_kind_of_motion_stays_nearer_to_the_given_h(refit):
 
 def test_the_given_h_is_never_held_out(refit):
     simulator, given, fitted = refit
-    near, rows = toward_given(simulator, given, fitted), refit[0].rows
+    near, rows = toward_given(simulator, given, fitted), simulator.rows
     left = near.held_out_residual(rows, rows.group)
     out = (rows.group == 3)[rows.block]
     M, pull = near.J, near.pull.only(near.free)
@@ -70,6 +70,16 @@ def test_several_kinds_of_motion_tell_h_by_themselves(refit):
     simulator = Simulator(slow_model(), make_rows(slow_model(), [measured()]))
     fitted = refits(simulator, given)[0]
     assert simulator.rows.kinds
+    assert toward_given(simulator, given, fitted) is fitted
+
+
+def test_data_of_a_part_of_the_range_tell_h_there_by_themselves():
+    (piece,) = without_labels().pieces
+    half = replace(piece, v=0.5 * piece.v)
+    half = replace(half, y=slow_model().predict_piece(half))
+    simulator = Simulator(slow_model(), make_rows(slow_model(), [Record((half,), 'half')]))
+    given = State(slow_model().hysteresis, np.zeros(1))
+    fitted = refits(simulator, given)[0]
     assert toward_given(simulator, given, fitted) is fitted
 
 
