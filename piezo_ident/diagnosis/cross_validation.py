@@ -32,6 +32,7 @@ __all__ = [
     'right_sides',
     'solve',
     'standard_errors',
+    'summed',
     'taken_by_gain',
     'with_columns',
 ]
@@ -145,7 +146,7 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
         ) from None
 
 
-def _summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]:
+def summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]:
     """Return the normal equations of all blocks, and of a pull."""
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
     return (A, b) if pull is None else (A + pull.A, b + pull.b[:, None])
@@ -163,7 +164,7 @@ def held_out_errors(
     Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
     The pull never is.
     """
-    A, b = _summed(equations, pull)
+    A, b = summed(equations, pull)
     errors = equations.s.copy()
     for one in np.unique(sets):
         out = sets == one
@@ -191,7 +192,7 @@ def held_out_residual(
     Gauss-Newton step.
     """
     equations = normal_equations(rows, M, e[:, None])
-    A, b = _summed(equations, pull)
+    A, b = summed(equations, pull)
     left = e.copy()
     for one in np.unique(sets):
         out = sets == one

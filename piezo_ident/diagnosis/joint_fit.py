@@ -25,6 +25,7 @@ from piezo_ident.diagnosis.cross_validation import (
     NormalEquations,
     Pull,
     right_sides,
+    summed,
     with_columns,
 )
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
@@ -96,7 +97,7 @@ class Fitted:
     errors, transfer : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets and in whole kinds.
     pull : Pull or None
-        What was fitted besides the rows, shape (p, p): the given H as data.
+        What was fitted besides the rows, of the free columns: the given H as data.
     """
 
     state: State
@@ -135,8 +136,7 @@ class Fitted:
         """
         prior = self.prior if sets is None else _firm(self.prior, self.moving)
         sets = rows.fold if sets is None else sets
-        pull = None if self.pull is None else self.pull.only(self.free)
-        return held_out_residual(rows, self.J, self.e, prior[self.free], sets, pull)
+        return held_out_residual(rows, self.J, self.e, prior[self.free], sets, self.pull)
 
 
 def base_thresholds(swing: float) -> Array:
@@ -242,7 +242,7 @@ def fit_jointly(
         prior=prior,
         errors=held_out_errors(equations, rows.fold, prior[free], own)[:, 0],
         transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
-        pull=pull,
+        pull=own,
     )
 
 
@@ -271,11 +271,8 @@ def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, st
     M = fitted.J
     size = np.linalg.norm(M, axis=0)
     equations = normal_equations(rows, M, fitted.e[:, None])
-    A = equations.A.sum(axis=0)
-    if fitted.pull is not None:
-        # the given H is no observation, but it holds what these leave open
-        A = A + fitted.pull.only(fitted.free).A
-    A = A / np.outer(size, size)
+    # the given H is no observation, but it holds what these leave open
+    A = summed(equations, fitted.pull)[0] / np.outer(size, size)
     A[np.diag_indices_from(A)] += 1e-10
     gradients = equations.b[:, :, 0] / size
     inverse = np.linalg.pinv(A, hermitian=True)

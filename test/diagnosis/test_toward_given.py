@@ -56,7 +56,7 @@ def test_the_given_h_is_never_held_out(refit):
     near, rows = toward_given(simulator, given, fitted), simulator.rows
     left = near.held_out_residual(rows, rows.group)
     out = (rows.group == 3)[rows.block]
-    M, pull = near.J, near.pull.only(near.free)
+    M, pull = near.J, near.pull
     A, b = M[~out].T @ M[~out] + pull.A, M[~out].T @ near.e[~out] + pull.b
     theta = solve(A, b, near.prior[near.free])
     np.testing.assert_allclose(left[out], (near.e - M @ theta)[out], atol=1e-9)
