@@ -28,8 +28,8 @@ from piezo_ident.diagnosis.joint_fit import (
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
-from piezo_ident.diagnosis.search import score_trials
 from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.trial_scores import score_trials
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS

@@ -22,9 +22,10 @@ from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round, score_trials, search_round
+from piezo_ident.diagnosis.search import Round, search_round
 from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.trial_scores import score_trials
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
@@ -313,7 +314,11 @@ class ForwardSelection:
             rounds.append(this)
         if len(fitted.state.effects) > 1:
             fitted = polished(
-                self._simulator, fitted, self._lines, lambda: self._progress('candidates', 0.95)
+                self._simulator,
+                fitted,
+                self._lines,
+                self._noise,
+                lambda: self._progress('candidates', 0.95),
             )
             # an effect that was not fitted to the end leaves something for another one to explain
             fitted, dropped = without_needless(

@@ -47,7 +47,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-ITERATIONS, ATTEMPTS, TOLERANCE = 20, 5, 1e-3
+ITERATIONS, ATTEMPTS, TOLERANCE = 20, 10, 1e-3
 #: first damping, a share of the energy of each column
 DAMPING = 1e-4
 #: share of what shows a parameter that other kinds of excitation must hold to tell it
@@ -174,12 +174,14 @@ def fit_jointly(
     base: BaseColumns,
     *,
     iterations: int = ITERATIONS,
+    enough: float = 0.0,
     tick: Callable[[], None] = lambda: None,
     pull_at: Callable[[State, int], Pull] | None = None,
 ) -> Fitted:
     """
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
+    A step that lowers the mean square by less than `enough` is the last one.
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
     `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 
@@ -209,20 +211,20 @@ def fit_jointly(
                 trial = _moved(state, parameters, delta)
                 left = rows.x - simulator.remember(trial)
             except ModelError:
-                damping *= 10.0
+                damping *= 3.0
                 continue
             new = pull_at and pull_at(trial, p)
             after = _loss(left, new)
             if np.isfinite(after) and after < before:
                 better = trial
                 break
-            damping *= 10.0
+            damping *= 3.0
         if better is None:
             break
         damping = max(damping / 10.0, 1e-9)
         state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
-        if after > (1.0 - TOLERANCE) * before:
+        if before - after < max(TOLERANCE * before, enough * e.size):
             break
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
@@ -319,19 +321,17 @@ def _derivatives(
     quick = simulator.filtered(
         [(p.effect, p.name, p.index or 0, s) for p, s in zip(parameters, steps, strict=True)]
     )
-    for j, (parameter, step) in enumerate(zip(parameters, steps, strict=True)):
-        if j in quick:
-            columns[j] = quick[j]
-            continue
-        tick()
-        try:
-            moved = parameter.moved(state, step)
-            place = parameter.effect
-            effect = None if place is None else state.effects[place].effect
-            columns[j] = simulator.varied(moved, effect) / step
-        except ModelError:
-            # a bound that depends on other parameters: this one stays
-            continue
+    others = [(j, p) for j, p in enumerate(parameters) if j not in quick]
+    moved = [
+        (p.moved(state, steps[j]), None if p.effect is None else state.effects[p.effect].effect)
+        for j, p in others
+    ]
+    for j, column in quick.items():
+        columns[j] = column
+    for (j, _), change in zip(others, simulator.varied(moved), strict=True):
+        # one that cannot be moved, by a bound that depends on other parameters, stays
+        if change is not None:
+            columns[j] = change / steps[j]
     return columns.T
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.search import score_trials, started
 from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.trial_scores import score_trials, started
 
 __all__ = ['polished', 'without_needless']
 
@@ -29,30 +29,41 @@ def without_needless(
     dropped: list[int] = []
     for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        without = fit_jointly(simulator, replace(fitted.state, effects=rest), fitted.base)
+        state = replace(fitted.state, effects=rest)
+        # whether it is needed shows before the end
+        without = fit_jointly(simulator, state, fitted.base, enough=criteria.OF_WORTH * least)
         # what the others make up for by values that cannot be, they do not explain
         can_be = all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values)
         if can_be and without.mean_square - fitted.mean_square < least:
-            fitted = without
+            fitted = fit_jointly(simulator, without.state, fitted.base)
             dropped.append(i)
     return fitted, tuple(dropped)
 
 
 def polished(
-    simulator: Simulator, fitted: Fitted, lines: Sequence[float], tick: Callable[[], None]
+    simulator: Simulator,
+    fitted: Fitted,
+    lines: Sequence[float],
+    noise: float,
+    tick: Callable[[], None],
 ) -> Fitted:
     """
     Fit several effects again, each from fresh starts now that the others are known.
 
     An effect that was found before others were in the model took a law that made up for them.
+    `noise` is the mean square of the noise of a row.
     """
+    enough = noise + (criteria.INDISTINCT * simulator.rows.stroke / 100.0) ** 2
     for i in range(len(fitted.state.effects)):
-        for fresh in _afresh(simulator, fitted, i, lines, tick):
+        if fitted.mean_square < enough:
+            break
+        for fresh in _afresh(simulator, fitted, i, lines, noise, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
     for _ in range(criteria.POLISHING):
         state = fitted.state
-        fresh = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
+        base, least = base_at(simulator, state), criteria.OF_NOISE * noise
+        fresh = fit_jointly(simulator, state, base, enough=least, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
             break
         fitted = fresh
@@ -64,10 +75,12 @@ def _afresh(
     fitted: Fitted,
     i: int,
     lines: Sequence[float],
+    noise: float,
     tick: Callable[[], None],
 ) -> Iterator[Fitted]:
     """Yield fits in which effect i starts again from its best trials."""
     rows, own = simulator.rows, fitted.state.effects[i]
+    least = criteria.OF_NOISE * noise
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
@@ -77,7 +90,7 @@ def _afresh(
         effects = (*others[:i], started(rows, start), *others[i:])
         state = replace(rest.state, effects=effects)
         try:
-            yield fit_jointly(simulator, state, fitted.base, tick=tick)
+            yield fit_jointly(simulator, state, fitted.base, enough=least, tick=tick)
         except (ModelError, IdentificationError):
             # the fit that is there already stays
             continue

@@ -82,9 +82,11 @@ class _Once(HysteresisOperator):
 
     def process(self, block: Block) -> Block:
         """Return the block with H applied to its signal."""
-        known = self._answer
-        if not known or known[0] is not self.hysteresis or known[1] is not block.x:
-            known[:] = self.hysteresis, block.x, super().process(block).x
+        # read once: another thread may put its own in the place
+        known = self._answer[0] if self._answer else None
+        if known is None or known[0] is not self.hysteresis or known[1] is not block.x:
+            known = self.hysteresis, block.x, super().process(block).x
+            self._answer[:] = [known]
         return block.with_signal(known[2])
 
 

@@ -12,7 +12,7 @@ promising ones are fitted together with everything else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,72 +22,27 @@ from piezo_ident.diagnosis.criteria import (
     AHEAD,
     FINAL,
     FIRST,
+    INDISTINCT,
     JOINT_FITS,
-    ON_AMPLITUDE,
+    OF_NOISE,
     POLISHING,
     SIMPLER,
     STARTS,
     SURROGATES,
+    WORTH_END,
     WORTH_FIT,
-)
-from piezo_ident.diagnosis.cross_validation import (
-    held_out_errors,
-    normal_equations,
-    NormalEquations,
-    solve,
-    with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
-from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import shows
-from piezo_ident.diagnosis.simulator import Added, Simulator, State
-from piezo_ident.effects import Effect, Trial, View
-from piezo_ident.effects.trials import number_of
+from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.trial_scores import score_trials, Scored, started, Tick
+from piezo_ident.effects import Effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Round', 'Scored', 'score_trials', 'search_round', 'started']
+__all__ = ['Round', 'search_round']
 
 Array = NDArray[np.float64]
-
-#: called with the share of the work that is done; may raise `Cancelled`
-Tick = Callable[[float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """
-    One trial of a candidate and what it would gain.
-
-    Attributes
-    ----------
-    effect, trial
-    coefficients : ndarray, shape (c,)
-        Steps of its columns that fit best.
-    errors : ndarray, shape (blocks,)
-        Sum of squares of each block, held out in spread sets.
-    chance : float
-        Largest gain in the sum of squares of a surrogate.
-    visible : float
-        Share of its columns that everything else in the model cannot make up for.
-    is_possible : bool
-        False where the data speak against it: an effect without amplitudes that should come out
-        of the fit about once, and does not.
-    """
-
-    effect: type[Effect]
-    trial: Trial
-    coefficients: Array
-    errors: Array
-    chance: float
-    visible: float
-    is_possible: bool = True
-
-    @property
-    def error(self) -> float:
-        """Sum of the held-out squares."""
-        return float(self.errors.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,13 +202,18 @@ def _contenders(
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
+    enough = noise + (INDISTINCT * simulator.rows.stroke / 100.0) ** 2
     for i, contender in enumerate(contenders[:FINAL]):
+        gained, most = (before.mean_square - c.mean_square for c in (contender, contenders[0]))
+        if gained < WORTH_END * most:
+            break
         try:
-            contenders[i] = _to_the_end(simulator, contender, alive)
+            contenders[i] = _to_the_end(simulator, contender, noise, alive)
+            is_done = contenders[i].mean_square < enough
             other = beside_wide[contender.name]
-            if other is not contender:
+            if other is not contender and not (is_done and shows(simulator, contenders[i], noise)):
                 # a few iterations do not tell which base leads further
-                other = _to_the_end(simulator, other, alive)
+                other = _to_the_end(simulator, other, noise, alive)
                 ahead = contenders[i].mean_square < other.mean_square / AHEAD
                 if shows(simulator, other, noise) and not (
                     ahead and shows(simulator, contenders[i], noise)
@@ -266,12 +226,16 @@ def _contenders(
     return contenders, warnings
 
 
-def _to_the_end(simulator: Simulator, fitted: Fitted, tick: Callable[[], None]) -> Fitted:
+def _to_the_end(
+    simulator: Simulator, fitted: Fitted, noise: float, tick: Callable[[], None]
+) -> Fitted:
     """Return a fit with fresh columns of H, as long as that makes a difference."""
+    enough = OF_NOISE * noise
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square
-        fitted = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-        if fitted.mean_square > (1.0 - WORTH_FIT) * before:
+        base = base_at(simulator, state)
+        fitted = fit_jointly(simulator, state, base, enough=enough, tick=tick)
+        if before - fitted.mean_square < max(WORTH_FIT * before, enough):
             break
     return fitted
 
@@ -284,113 +248,3 @@ def _simplest_first(contenders: list[Fitted], noise: float) -> list[Fitted]:
     good = [c for c in contenders if c.mean_square <= limit]
     simplest = min(good, key=lambda c: len(c.parameters))
     return [simplest, *(c for c in contenders if c is not simplest)]
-
-
-# -- scores of trials ----------------------------------------------------------------------------
-
-
-def score_trials(
-    simulator: Simulator,
-    fitted: Fitted,
-    effects: Sequence[type[Effect]],
-    lines: Sequence[float],
-    surrogates: Array,
-    tick: Tick = lambda share: None,
-) -> Iterator[Scored]:
-    """Score every trial of every effect on the residual of a fit; surrogates, shape (n, k)."""
-    rows = simulator.rows
-    simulator.remember(fitted.state)
-    M, prior = fitted.J, fitted.prior[fitted.free]
-    E = np.column_stack([fitted.e, surrogates])
-    equations = normal_equations(rows, M, E)
-    alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)
-    view = _view_of(simulator, lines)
-    trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
-    for done, (effect, trial) in enumerate(trials):
-        tick(done / len(trials))
-        try:
-            C = _columns(simulator, effect, trial)
-        except ModelError:
-            continue
-        if not np.all(np.isfinite(C)) or not np.any(C):
-            continue
-        both = with_columns(rows, equations, M, C, E)
-        wide = np.concatenate([prior, np.zeros(C.shape[1])])
-        theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[M.shape[1] :]
-        visible = _visible(both, M.shape[1], wide)
-        if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
-            yield Scored(effect, trial, theta, equations.s[:, 0], 0.0, visible, False)
-            continue
-        errors = held_out_errors(both, rows.fold, wide)
-        chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
-        yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
-
-
-def _columns(simulator: Simulator, effect: type[Effect], trial: Trial) -> Array:
-    """
-    Return what an effect would add to the rows for a step of each of its amplitudes.
-
-    Shape (n, c): for an effect that is driven by time, a column for each record and amplitude.
-    """
-    rows = simulator.rows
-    count = len(rows.names)
-    columns = []
-    for setting in trial.settings():
-        column = simulator.added(Added(effect.name, (setting,) * count))
-        if effect.time_driven:
-            columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
-        else:
-            columns.append(column)
-    return np.array(columns).T
-
-
-def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
-    """Return the largest share of a column that the first p columns cannot make."""
-    A = equations.A.sum(axis=0)
-    shares = []
-    for j in range(p, A.shape[0]):
-        theta = solve(A[:p, :p], A[:p, j], prior[:p])
-        left = A[j, j] - 2.0 * A[:p, j] @ theta + theta @ A[:p, :p] @ theta
-        shares.append(float(left / A[j, j]) if A[j, j] > 0.0 else 0.0)
-    return max(shares)
-
-
-def started(rows: Rows, scored: Scored) -> Added:
-    """Return the effect with the amplitudes of its score, where a joint fit may start."""
-    effect, trial = scored.effect, scored.trial
-    added = Added(effect.name, (trial.values,) * len(rows.names))
-    known = {p.name: p for p in effect.parameters}
-    steps = iter(scored.coefficients)
-    for (name, index), step in zip(trial.moves, trial.steps, strict=True):
-        for k in range(len(rows.names)) if effect.time_driven else (None,):
-            value = number_of(added.values[k or 0], name, index) + float(next(steps)) * step
-            added = added.changed(k, name, index, float(known[name].clip(value)))
-    return added
-
-
-def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
-    rows, model = simulator.rows, simulator.model
-    speeds = []
-    channels: dict[str, list[Array]] = {}
-    for run in rows.runs:
-        # over a row, so that converter steps do not count as speed
-        speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
-        for name, x in run.piece.channels.items():
-            channels.setdefault(name, []).append(x)
-    speed = np.concatenate(speeds)
-    moving = speed[speed > 1e-3 * speed.max(initial=0.0)]
-    quantiles = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 0.999])
-    # of all records that have it: the axis may rest in one of them
-    whole = {name: np.concatenate(parts) for name, parts in channels.items()}
-    return View(
-        sample_rate=model.sample_rate,
-        low=min(float(run.u.min()) for run in rows.runs),
-        high=max(float(run.u.max()) for run in rows.runs),
-        speeds=np.quantile(moving, quantiles) if moving.size else np.zeros(quantiles.size),
-        duration=rows.duration,
-        channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
-        lines=tuple(lines),
-        modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
-        max_frequency=rows.highest_frequency,
-        thresholds=model.hysteresis.thresholds,
-    )

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.diagnosis.retuning import (
     BEYOND,
@@ -137,7 +138,7 @@ class Simulator:
         #: what G makes of the columns of the law that was asked for last
         self._of_law: tuple[Any, Array] | None = None
         #: compiled loops leave the interpreter to others, so runs go side by side
-        self._pool = ThreadPoolExecutor(min(len(rows.runs), os.cpu_count() or 1))
+        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -243,24 +244,35 @@ class Simulator:
             self._kept = _Kept(state, tuple(chains), self._predicted(state, outputs))
         return self._kept.prediction
 
-    def added(self, effect: Added) -> Array:
-        """Return by how much rows of the remembered state change with one more effect."""
-        return self.varied(self._known().state.with_effect(effect), effect.effect)
+    def added(self, effects: Sequence[Added]) -> list[Array | None]:
+        """Return by how much rows of the remembered state change with one more effect each."""
+        state = self._known().state
+        return self.varied([(state.with_effect(added), added.effect) for added in effects])
 
-    def varied(self, state: State, effect: type[Effect] | None) -> Array:
+    def varied(self, changes: Sequence[tuple[State, type[Effect] | None]]) -> list[Array | None]:
         """
-        Return by how much the rows of a state differ from those of the remembered one.
+        Return by how much the rows of states differ from those of the remembered one.
 
-        The states differ in one place, an effect or (None) the factor of G; the chain is only run
-        from there.
+        Each differs in one place, an effect or (None) the factor of G; the chain is only run from
+        there.  None stands for a state that cannot run.
         """
-        chains = self._known().chains
+        chains, runs = self._known().chains, range(len(self._sources))
 
-        def of_run(i: int) -> Array:
-            after = self._chain(state, i)
-            return after.difference(chains[i], place_of(effect, after.operators), self.rows.m)
+        def of_run(task: tuple[State, type[Effect] | None, int]) -> Array | None:
+            state, effect, i = task
+            try:
+                after = self._chain(state, i)
+                return after.difference(chains[i], place_of(effect, after.operators), self.rows.m)
+            except ModelError:
+                return None
 
-        return self._joined(self._of_runs(of_run))
+        # a run alone leaves the other processors to the other states
+        parts = list(self._pool.map(of_run, [(*change, i) for change in changes for i in runs]))
+        found: list[Array | None] = []
+        for k in range(0, len(parts), len(runs)):
+            known = [part for part in parts[k : k + len(runs)] if part is not None]
+            found.append(self._joined(known) if len(known) == len(runs) else None)
+        return found
 
     def filtered(self, wanted: Sequence[tuple[int | None, str, int, float]]) -> dict[int, Array]:
         """

@@ -11,7 +11,7 @@ from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.hysteresis import HysteresisOperator, LANES, POWERS
+from piezo_ident.operators.hysteresis import HysteresisOperator, LANES
 from piezo_ident.operators.kernels import curve, held
 
 __all__ = ['RateDependentHysteresis']
@@ -37,7 +37,7 @@ def _widened(
     out: NDArray[np.float64],
 ) -> None:
     # memory: plays with growing thresholds; still: the same plays with fixed ones;
-    # low_v and c: as in `wide_hysteresis`
+    # low_v and c: as in `wide_hysteresis`; loops of few arrays each run in vector lanes
     n_r = r.size
     for k in range(v.size):
         x = v[k]
@@ -46,15 +46,18 @@ def _widened(
         ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
         w = 0.0
         for i in range(n_r):
-            g = held(still[i], x - r[i], x)
-            still[i] = g
+            still[i] = held(still[i], x - r[i], x)
+        for i in range(n_r):
             width = r[i] * wide + more
             low = x - (width if width > 0.0 else 0.0)
             high = x + r[i] * ahead_wide + ahead
-            f = held(memory[i], low, low if high < low else high)
-            memory[i] = f
-            w += (q[i] + c[3, i] * (x - low_v)) * (f - g)
-            w += curve(c, i, f - low_v) - curve(c, i, g - low_v)
+            memory[i] = held(memory[i], low, low if high < low else high)
+        for i in range(n_r):
+            w += q[i] * (memory[i] - still[i])
+        if c.shape[0]:
+            for i in range(n_r):
+                f, g = memory[i] - low_v, still[i] - low_v
+                w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f) - curve(c, i, g)
         out[k] = w
 
 
@@ -165,7 +168,6 @@ class RateDependentHysteresis(Effect):
         """Return the block with H applied and its plays widened."""
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
-        c = c if c.size else np.zeros((POWERS + 2, r.size))
         power = self._power(v, self._speed)
         more = np.empty(v.size)
         _widened(

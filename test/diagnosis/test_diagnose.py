@@ -558,7 +558,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing(truths):
         added = Added(name, (values,))
         added = Added(name, (added.effect.check(values),))
         np.testing.assert_allclose(
-            now + simulator.added(added), simulator.run(state.with_effect(added)), atol=1e-12
+            now + simulator.added([added])[0], simulator.run(state.with_effect(added)), atol=1e-12
         )
 
 
@@ -605,11 +605,11 @@ def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
         effect = None if parameter.effect is None else chosen[parameter.effect].effect
         # a difference of whole runs holds the rounding of both
         np.testing.assert_allclose(
-            simulator.varied(moved, effect), whole.run(moved) - now, atol=1e-10
+            simulator.varied([(moved, effect)])[0], whole.run(moved) - now, atol=1e-10
         )
         if j in filtered:
             np.testing.assert_allclose(
-                filtered[j] * parameter.step, simulator.varied(moved, effect), atol=1e-9
+                filtered[j] * parameter.step, simulator.varied([(moved, effect)])[0], atol=1e-9
             )
 
 
