@@ -205,7 +205,7 @@ def _contenders(
     enough = noise + (INDISTINCT * simulator.rows.stroke / 100.0) ** 2
     for i, contender in enumerate(contenders[:FINAL]):
         gained, most = (before.mean_square - c.mean_square for c in (contender, contenders[0]))
-        if gained < WORTH_END * most:
+        if i and most > 0.0 and gained < WORTH_END * most:
             break
         try:
             contenders[i] = _to_the_end(simulator, contender, noise, alive)

@@ -533,6 +533,41 @@ def test_columns_near_the_optimum_are_derivatives(truths):
     assert fitted.mean_square < 1e-6
 
 
+def test_a_fit_ends_when_a_step_gains_too_little(truths):
+    model, record, _ = measured('creep', 0.3, 1)
+    simulator = Simulator(model, make_rows(model, [record]))
+    law = HysteresisLaw('plays', base_thresholds(1.0))
+    state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), law)
+    values = find_effect('creep').check({'gain': [1e-3] * 3, 'time_constant': [0.03, 0.3, 3.0]})
+    state = state.with_effect(Added('creep', (values,)))
+    whole_steps, early_steps = [], []
+    whole = fit_jointly(simulator, state, base, tick=lambda: whole_steps.append(0))
+    early = fit_jointly(simulator, state, base, enough=1e-7, tick=lambda: early_steps.append(0))
+    assert len(early_steps) < len(whole_steps)
+    assert 0.0 <= early.mean_square - whole.mean_square < 1e-6
+
+
+def test_states_run_side_by_side_as_they_do_alone(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    simulator = Simulator(model, make_rows(model, [record]))
+    simulator.remember(State(model.hysteresis, np.zeros(1)))
+    each = [
+        Added(name, (find_effect(name).check(values),))
+        for name, values in (
+            ('backlash', {'width': 0.01, 'gain': 0.2}),
+            ('rate_dependent_hysteresis', {'gain': 1e-3, 'exponent': 0.7, 'cutoff': 900.0}),
+            ('rate_dependent_hysteresis', {'gain': 1e-3, 'exponent': 1.3, 'cutoff': 900.0}),
+        )
+    ]
+    # a limit below the other one: no such effect runs
+    values = find_effect('saturation').check({'high': 0.5})
+    impossible = Added('saturation', ({**values, 'low': 0.9},))
+    *columns, none = simulator.added([*each, impossible])
+    assert none is None
+    for added, column in zip(each, columns, strict=True):
+        assert np.array_equal(column, simulator.added([added])[0]) and np.any(column)
+
+
 @pytest.mark.parametrize('m', [12, 30, 49])
 def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
     model, record, _ = measured('creep', 0.3, 1)

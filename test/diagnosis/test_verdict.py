@@ -6,7 +6,7 @@
 from types import SimpleNamespace
 
 import numpy as np
-from piezo_ident.diagnosis import criteria, forward_selection
+from piezo_ident.diagnosis import criteria, forward_selection, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
 from piezo_ident.diagnosis.forward_selection import takes
 from piezo_ident.diagnosis.messages import sentence
@@ -224,6 +224,32 @@ def test_what_the_h_of_the_model_does_not_leave_needs_no_effect(
     found = search.beside(plays, wide, as_given, none)
     assert bool(found.taken) == is_taken
     assert found.fitted is (best if is_taken else wide)
+
+
+@pytest.mark.parametrize(
+    ('shares', 'ended'),
+    [
+        ((0.1, 0.4), ['creep', 'backlash']),
+        # little against what the best explains
+        ((0.1, 0.7), ['creep']),
+        # a few iterations may leave more than there was: they tell nothing
+        ((1.2, 1.5), ['creep', 'backlash']),
+    ],
+)
+def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
+    rows, monkeypatch, shares, ended
+):
+    fits = {
+        name: contender(name, x) for name, x in zip(('creep', 'backlash'), shares, strict=True)
+    }
+    seen = []
+    monkeypatch.setattr(search, 'fit_jointly', lambda s, state, *_, **__: fits[state])
+    monkeypatch.setattr(search, 'shows', lambda *_: True)
+    monkeypatch.setattr(search, '_to_the_end', lambda s, c, *_: seen.append(c.name) or c)
+    before = SimpleNamespace(mean_square=WHOLE, base=None)
+    starts = [(SimpleNamespace(name=name), [name]) for name in fits]
+    search._contenders(SimpleNamespace(rows=rows), before, starts, 0.0, lambda _: None)
+    assert seen == ended
 
 
 def test_an_effect_that_costs_a_kind_is_not(rows):
