@@ -233,7 +233,7 @@ def _diagnosed(
         findings = with_refit(simulator, given, base, findings, selected, noise, whole, misfit)
     last = selected.fitted
     if not findings.keeps_given:
-        last = toward_given(simulator, given, last)
+        last = toward_given(simulator, given, last, lambda: progress('verdict', 0.5))
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (

@@ -17,6 +17,7 @@ the data cover a part of the range alone: the refined model holds there and nowh
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import itertools
 
 import numpy as np
@@ -54,7 +55,9 @@ def loops(low: float, high: float) -> Array:
     return low + (high - low) * np.concatenate(sweeps)
 
 
-def toward_given(simulator: Simulator, given: State, fitted: Fitted) -> Fitted:
+def toward_given(
+    simulator: Simulator, given: State, fitted: Fitted, tick: Callable[[], None] = lambda: None
+) -> Fitted:
     """Return a fit of rows without kinds of motion, drawn towards the H as given."""
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     pieces = [run.piece for run in rows.runs]
@@ -82,4 +85,4 @@ def toward_given(simulator: Simulator, given: State, fitted: Fitted) -> Fitted:
         return Pull(whole, right, weight * float(left @ left))
 
     state = fitted.state
-    return fit_jointly(simulator, state, base_at(simulator, state), pull_at=pull_at)
+    return fit_jointly(simulator, state, base_at(simulator, state), tick=tick, pull_at=pull_at)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from diagnosis_examples import measured
 import numpy as np
+from piezo_ident.common.errors import Cancelled
 from piezo_ident.diagnosis.base_refit import refits
 from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain
@@ -49,6 +50,14 @@ def test_a_refit_of_one_kind_of_motion_stays_nearer_to_the_given_h(refit):
     as_given = np.mean(centred(rows.x - simulator.run(given), rows.of_record) ** 2)
     assert distance(given, near.state) < 0.9 * distance(given, fitted.state)
     assert fitted.mean_square < near.mean_square < as_given
+
+
+def test_it_can_be_cancelled(refit):
+    def cancel():
+        raise Cancelled('toward the given H')
+
+    with pytest.raises(Cancelled):
+        toward_given(*refit, cancel)
 
 
 def test_the_given_h_is_never_held_out(refit):
