@@ -95,6 +95,8 @@ def _selected(
         simulator,
         replace(given, effects=found.fitted.state.effects, retuning=(0.0,) * len(RETUNING)),
         _offsets(simulator.rows),
+        # whether it leaves little shows before the end
+        enough=criteria.OF_WORTH * simulator.rows.square(criteria.SMALLEST_EFFECT),
     )
     both = search.beside(beside, widest, as_given, found)
     if both.imitated in both.taken:
@@ -105,7 +107,8 @@ def _selected(
         again = search.retuned(wide)
         fitted = again if _is_better(again, wide) else wide
     for narrower in _NARROWER:
-        other = _refit(simulator, fitted.state, narrower)
+        is_known = narrower == 'plays' and bool(found.taken)
+        other = beside if is_known else _refit(simulator, fitted.state, narrower)
         if not _is_better(fitted, other):
             fitted = other
             break

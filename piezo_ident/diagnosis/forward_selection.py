@@ -256,12 +256,12 @@ class ForwardSelection:
     @property
     def _least(self) -> float:
         """Mean square of the smallest effect."""
-        return (self._smallest * self._simulator.rows.stroke / 100.0) ** 2
+        return self._simulator.rows.square(self._smallest)
 
     @property
     def _indistinct(self) -> float:
         """Mean square of a difference that means nothing."""
-        return (criteria.INDISTINCT * self._simulator.rows.stroke / 100.0) ** 2
+        return self._simulator.rows.square(criteria.INDISTINCT)
 
     @staticmethod
     def _gain(this: Round) -> float:

@@ -53,7 +53,7 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    enough = noise + (criteria.INDISTINCT * simulator.rows.stroke / 100.0) ** 2
+    enough = noise + simulator.rows.square(criteria.INDISTINCT)
     for i in range(len(fitted.state.effects)):
         if fitted.mean_square < enough:
             break

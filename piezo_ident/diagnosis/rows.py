@@ -147,6 +147,10 @@ class Rows:
         """Return a mean square, normalised, as rms in % of stroke."""
         return percent(np.sqrt(max(mean_square, 0.0)), self.stroke)
 
+    def square(self, size: float) -> float:
+        """Return an rms in % of stroke as a mean square, normalised."""
+        return (size * self.stroke / 100.0) ** 2
+
     def errors(self, e: Array, noise: float = 0.0) -> Errors:
         """
         Return the errors of a residual of the rows, shape (n,), normalised.

@@ -202,7 +202,7 @@ def _contenders(
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
-    enough = noise + (INDISTINCT * simulator.rows.stroke / 100.0) ** 2
+    enough = noise + simulator.rows.square(INDISTINCT)
     for i, contender in enumerate(contenders[:FINAL]):
         gained, most = (before.mean_square - c.mean_square for c in (contender, contenders[0]))
         if i and most > 0.0 and gained < WORTH_END * most:

@@ -111,7 +111,7 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
         size = rows.percent(left)
         # beside much noise little is left that its estimate might not have missed
         doubt = (1.0 + criteria.NOISE_KNOWN) ** 2 - 1.0
-        least = (criteria.SMALLEST_EFFECT * rows.stroke / 100.0) ** 2 + doubt * noise
+        least = rows.square(criteria.SMALLEST_EFFECT) + doubt * noise
         # what is hardly beyond the limit is claimed if it is so by more than it scatters
         each = (noise + least) * np.bincount(rows.block, minlength=fitted.errors.size)
         scatters = standard_errors(fitted.errors - each) < criteria.STANDARD_ERRORS
@@ -162,10 +162,7 @@ def rivals_of(
     `plays` says whether the hysteresis is a sum of them.
     """
     best, *others = contenders
-    floor, least = (
-        (size * rows.stroke / 100.0) ** 2
-        for size in (criteria.INDISTINCT, criteria.SMALLEST_EFFECT)
-    )
+    floor, least = (rows.square(size) for size in (criteria.INDISTINCT, criteria.SMALLEST_EFFECT))
     # what another hysteresis leaves may favour one look-alike
     doubtful = not plays and best.mean_square - noise > least
     alike = look_alikes(best.name) if doubtful else ()

@@ -29,6 +29,7 @@ def rows():
         n=BLOCKS * SIZE,
         stroke=1.0,
         percent=lambda mean_square: 100.0 * np.sqrt(max(mean_square, 0.0)),
+        square=lambda size: (size / 100.0) ** 2,
         block=np.repeat(np.arange(BLOCKS), SIZE),
         group=np.arange(BLOCKS) // 10,
         labels=tuple(f'kind {i}' for i in range(8)),
