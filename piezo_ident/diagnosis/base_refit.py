@@ -96,7 +96,7 @@ def _selected(
         replace(given, effects=found.fitted.state.effects, retuning=(0.0,) * len(RETUNING)),
         _offsets(simulator.rows),
         # whether it leaves little shows before the end
-        enough=criteria.OF_WORTH * simulator.rows.square(criteria.SMALLEST_EFFECT),
+        enough=criteria.OF_LEAST * simulator.rows.square(criteria.SMALLEST_EFFECT),
     )
     both = search.beside(beside, widest, as_given, found)
     if both.imitated in both.taken:

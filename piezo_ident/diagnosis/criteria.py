@@ -100,9 +100,9 @@ BENT = 0.25
 WORTH_FIT, JOINT_FITS = 0.05, 4
 #: share of the gain of the best after a few iterations below which a fit is not brought to its end
 WORTH_END = 0.5
-#: share of the mean square of the noise that a further step of a fit has to gain, and of that of
-#: the smallest effect, where a fit has to tell no more than whether an effect is needed
-OF_NOISE, OF_WORTH = 0.01, 0.02
+#: a step that gains less ends a fit: share of the noise, or of the smallest effect if that is less;
+#: mean squares
+OF_LEAST = 0.01
 #: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
 #: round are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2

@@ -12,10 +12,16 @@ import numpy as np
 from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
-__all__ = ['polished', 'without_needless']
+__all__ = ['least_gain', 'polished', 'without_needless']
+
+
+def least_gain(rows: Rows, noise: float) -> float:
+    """Return the gain that a step of a fit has to bring, beside a noise; both mean squares."""
+    return criteria.OF_LEAST * min(noise, rows.square(criteria.SMALLEST_EFFECT))
 
 
 def without_needless(
@@ -31,11 +37,13 @@ def without_needless(
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
         state = replace(fitted.state, effects=rest)
         # whether it is needed shows before the end
-        without = fit_jointly(simulator, state, fitted.base, enough=criteria.OF_WORTH * least)
+        without = fit_jointly(simulator, state, fitted.base, enough=criteria.OF_LEAST * least)
+        if without.mean_square - fitted.mean_square >= least:
+            continue
+        without = fit_jointly(simulator, without.state, fitted.base)
         # what the others make up for by values that cannot be, they do not explain
-        can_be = all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values)
-        if can_be and without.mean_square - fitted.mean_square < least:
-            fitted = fit_jointly(simulator, without.state, fitted.base)
+        if all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values):
+            fitted = without
             dropped.append(i)
     return fitted, tuple(dropped)
 
@@ -53,16 +61,16 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    enough = noise + simulator.rows.square(criteria.INDISTINCT)
+    done = noise + simulator.rows.square(criteria.INDISTINCT)
     for i in range(len(fitted.state.effects)):
-        if fitted.mean_square < enough:
+        if fitted.mean_square < done:
             break
         for fresh in _afresh(simulator, fitted, i, lines, noise, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
     for _ in range(criteria.POLISHING):
         state = fitted.state
-        base, least = base_at(simulator, state), criteria.OF_NOISE * noise
+        base, least = base_at(simulator, state), least_gain(simulator.rows, noise)
         fresh = fit_jointly(simulator, state, base, enough=least, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
             break
@@ -80,7 +88,7 @@ def _afresh(
 ) -> Iterator[Fitted]:
     """Yield fits in which effect i starts again from its best trials."""
     rows, own = simulator.rows, fitted.state.effects[i]
-    least = criteria.OF_NOISE * noise
+    least = least_gain(rows, noise)
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)

@@ -24,7 +24,6 @@ from piezo_ident.diagnosis.criteria import (
     FIRST,
     INDISTINCT,
     JOINT_FITS,
-    OF_NOISE,
     POLISHING,
     SIMPLER,
     STARTS,
@@ -34,6 +33,7 @@ from piezo_ident.diagnosis.criteria import (
 )
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
+from piezo_ident.diagnosis.polishing import least_gain
 from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.trial_scores import score_trials, Scored, started, Tick
@@ -202,23 +202,21 @@ def _contenders(
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
-    enough = noise + simulator.rows.square(INDISTINCT)
+    done = noise + simulator.rows.square(INDISTINCT)
+    gains = [before.mean_square - c.mean_square for c in contenders]
+    is_shown = False
     for i, contender in enumerate(contenders[:FINAL]):
-        gained, most = (before.mean_square - c.mean_square for c in (contender, contenders[0]))
-        if i and most > 0.0 and gained < WORTH_END * most:
+        if is_shown and gains[0] > 0.0 and gains[i] < WORTH_END * gains[0]:
             break
         try:
-            contenders[i] = _to_the_end(simulator, contender, noise, alive)
-            is_done = contenders[i].mean_square < enough
-            other = beside_wide[contender.name]
-            if other is not contender and not (is_done and shows(simulator, contenders[i], noise)):
+            fitted = contenders[i] = _to_the_end(simulator, contender, noise, alive)
+            is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
+            if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
                 other = _to_the_end(simulator, other, noise, alive)
-                ahead = contenders[i].mean_square < other.mean_square / AHEAD
-                if shows(simulator, other, noise) and not (
-                    ahead and shows(simulator, contenders[i], noise)
-                ):
-                    contenders[i] = other
+                ahead = fitted.mean_square < other.mean_square / AHEAD
+                if shows(simulator, other, noise) and not (ahead and is_shown):
+                    contenders[i], is_shown = other, True
         except IdentificationError as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
     contenders = [c for c in contenders if shows(simulator, c, noise)]
@@ -230,12 +228,12 @@ def _to_the_end(
     simulator: Simulator, fitted: Fitted, noise: float, tick: Callable[[], None]
 ) -> Fitted:
     """Return a fit with fresh columns of H, as long as that makes a difference."""
-    enough = OF_NOISE * noise
+    enough = least_gain(simulator.rows, noise)
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square
         base = base_at(simulator, state)
         fitted = fit_jointly(simulator, state, base, enough=enough, tick=tick)
-        if before - fitted.mean_square < max(WORTH_FIT * before, enough):
+        if fitted.mean_square > (1.0 - WORTH_FIT) * before:
             break
     return fitted
 

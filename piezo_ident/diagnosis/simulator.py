@@ -54,6 +54,9 @@ __all__ = [
 Array = NDArray[np.float64]
 T = TypeVar('T')
 
+#: runs that go side by side at most
+MOST_THREADS = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Added:
@@ -137,8 +140,9 @@ class Simulator:
         self._kept: _Kept | None = None
         #: what G makes of the columns of the law that was asked for last
         self._of_law: tuple[Any, Array] | None = None
-        #: compiled loops leave the interpreter to others, so runs go side by side
-        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
+        #: compiled loops leave the interpreter to others, so runs and states go side by side; each
+        #: holds some signals as long as a run
+        self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1))
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""

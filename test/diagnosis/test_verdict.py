@@ -228,25 +228,31 @@ def test_what_the_h_of_the_model_does_not_leave_needs_no_effect(
 
 
 @pytest.mark.parametrize(
-    ('shares', 'ended'),
+    ('shares', 'is_shown', 'ended'),
     [
-        ((0.1, 0.4), ['creep', 'backlash']),
+        ((0.1, 0.4), True, ['creep', 'backlash']),
         # little against what the best explains
-        ((0.1, 0.7), ['creep']),
+        ((0.1, 0.7), True, ['creep']),
+        # by then, not at its end
+        ((0.4, 0.51), True, ['creep', 'backlash']),
+        # nothing is ahead that does not show where it should
+        ((0.1, 0.7), False, ['creep', 'backlash']),
         # a few iterations may leave more than there was: they tell nothing
-        ((1.2, 1.5), ['creep', 'backlash']),
+        ((1.2, 1.5), True, ['creep', 'backlash']),
     ],
 )
 def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
-    rows, monkeypatch, shares, ended
+    rows, monkeypatch, shares, is_shown, ended
 ):
     fits = {
         name: contender(name, x) for name, x in zip(('creep', 'backlash'), shares, strict=True)
     }
     seen = []
     monkeypatch.setattr(search, 'fit_jointly', lambda s, state, *_, **__: fits[state])
-    monkeypatch.setattr(search, 'shows', lambda *_: True)
-    monkeypatch.setattr(search, '_to_the_end', lambda s, c, *_: seen.append(c.name) or c)
+    monkeypatch.setattr(search, 'shows', lambda *_: is_shown)
+    monkeypatch.setattr(
+        search, '_to_the_end', lambda s, c, *_: seen.append(c.name) or contender(c.name, 0.01)
+    )
     before = SimpleNamespace(mean_square=WHOLE, base=None)
     starts = [(SimpleNamespace(name=name), [name]) for name in fits]
     search._contenders(SimpleNamespace(rows=rows), before, starts, 0.0, lambda _: None)
