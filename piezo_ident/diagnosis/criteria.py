@@ -100,8 +100,8 @@ BENT = 0.25
 WORTH_FIT, JOINT_FITS = 0.05, 4
 #: share of the gain of the best after a few iterations below which a fit is not brought to its end
 WORTH_END = 0.5
-#: a step that gains less ends a fit: share of the noise, or of the smallest effect if that is less;
-#: mean squares
+#: a step that gains less ends a fit: share of the mean square of the noise, or of that of the
+#: smallest effect if it is less
 OF_LEAST = 0.01
 #: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
 #: round are fitted to the end
