@@ -65,9 +65,8 @@ def _is_better(wide: Fitted, narrow: Fitted) -> bool:
 
 
 def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:
-    runs = simulator.rows.runs
-    low, high = min(float(run.u.min()) for run in runs), max(float(run.u.max()) for run in runs)
-    swing = max(float(np.ptp(run.u)) for run in runs)
+    low, high = simulator.rows.reach
+    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
     return fit_jointly(simulator, *fit_base(simulator, state, law))
 

@@ -61,17 +61,19 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    done = noise + simulator.rows.square(criteria.INDISTINCT)
+    done, least = (
+        noise + simulator.rows.square(criteria.INDISTINCT),
+        least_gain(simulator.rows, noise),
+    )
     for i in range(len(fitted.state.effects)):
         if fitted.mean_square < done:
             break
-        for fresh in _afresh(simulator, fitted, i, lines, noise, tick):
+        for fresh in _afresh(simulator, fitted, i, lines, least, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
     for _ in range(criteria.POLISHING):
         state = fitted.state
-        base, least = base_at(simulator, state), least_gain(simulator.rows, noise)
-        fresh = fit_jointly(simulator, state, base, enough=least, tick=tick)
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=least, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
             break
         fitted = fresh
@@ -83,12 +85,11 @@ def _afresh(
     fitted: Fitted,
     i: int,
     lines: Sequence[float],
-    noise: float,
+    least: float,
     tick: Callable[[], None],
 ) -> Iterator[Fitted]:
     """Yield fits in which effect i starts again from its best trials."""
     rows, own = simulator.rows, fitted.state.effects[i]
-    least = least_gain(rows, noise)
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)

@@ -167,11 +167,10 @@ def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
 
 def _range(simulator: Simulator) -> tuple[float, float]:
     """Return the voltages between which an H refitted to the rows holds."""
-    pieces = [run.piece for run in simulator.rows.runs]
-    low, high = min(float(p.v.min()) for p in pieces), max(float(p.v.max()) for p in pieces)
+    low, high = simulator.rows.driven
     least, most = simulator.model.scaling.range
     # plays of larger thresholds than what was driven have no weight any more
-    if high - low < criteria.COVERED * (most - least):
+    if not simulator.rows.covers((least, most)):
         return low, high
     return min(least, low), max(most, high)
 

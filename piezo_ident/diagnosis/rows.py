@@ -17,6 +17,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
@@ -118,11 +119,25 @@ class Rows:
         """The frequency below which all but a millionth of the moving power of any run lies."""
         return max(_highest_frequency(run.u, run.piece.sample_rate) for run in self.runs)
 
+    @functools.cached_property
+    def reach(self) -> tuple[float, float]:
+        """The lowest and the highest command, normalised."""
+        return _extremes([run.u for run in self.runs])
+
+    @functools.cached_property
+    def driven(self) -> tuple[float, float]:
+        """The lowest and the highest voltage [V]."""
+        return _extremes([run.piece.v for run in self.runs])
+
+    def covers(self, span: Sequence[float]) -> bool:
+        """Return whether they were driven over enough of a span [V] for H to hold in all of it."""
+        low, high = self.driven
+        return high - low >= COVERED * (span[1] - span[0])
+
     @property
     def passes(self) -> float:
         """How often the command passed over its range, there or back."""
-        low = min(float(run.u.min()) for run in self.runs)
-        high = max(float(run.u.max()) for run in self.runs)
+        low, high = self.reach
         # over rows, so that converter steps and noise are no travel
         travel = sum(float(np.abs(np.diff(block_means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
@@ -337,6 +352,10 @@ def _memory(model: StageModel, run: Run) -> Memory:
     value = np.concatenate([[u0], fit_memory(model, run.piece)[: at.size - 1]])
     # a play output falls by at most its threshold; between known ones it is interpolated
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)
+
+
+def _extremes(signals: Sequence[Array]) -> tuple[float, float]:
+    return min(float(x.min()) for x in signals), max(float(x.max()) for x in signals)
 
 
 def _highest_frequency(u: Array, rate: float) -> float:

@@ -22,7 +22,6 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
@@ -60,13 +59,10 @@ def toward_given(
 ) -> Fitted:
     """Return a fit of rows without kinds of motion, drawn towards the H as given."""
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
-    pieces = [run.piece for run in rows.runs]
-    reach = max(float(p.v.max()) for p in pieces) - min(float(p.v.min()) for p in pieces)
-    is_part = reach < COVERED * (scaling.range[1] - scaling.range[0])
     is_bent = any(
         not added.effect.time_driven and added.name not in TESTED for added in fitted.state.effects
     )
-    if law is None or rows.kinds or is_bent or is_part:
+    if law is None or rows.kinds or is_bent or not rows.covers(scaling.range):
         return fitted
     u = loops(*map(float, scaling.u(scaling.range)))
     P = np.stack(list(law.columns(u)), axis=1)

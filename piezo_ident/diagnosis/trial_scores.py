@@ -168,8 +168,8 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     whole = {name: np.concatenate(parts) for name, parts in channels.items()}
     return View(
         sample_rate=model.sample_rate,
-        low=min(float(run.u.min()) for run in rows.runs),
-        high=max(float(run.u.max()) for run in rows.runs),
+        low=rows.reach[0],
+        high=rows.reach[1],
         speeds=np.quantile(moving, quantiles) if moving.size else np.zeros(quantiles.size),
         duration=rows.duration,
         channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
