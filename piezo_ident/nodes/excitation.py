@@ -85,6 +85,7 @@ class Playing:
     clock: Schedule | None = None
     work: float = 0.0
     segment: str = ''
+    is_over: bool = False
 
     @property
     def sequence(self) -> Sequence:
@@ -165,11 +166,16 @@ class ExcitationNode(LabNode):
     # services
 
     def _is_playing(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+        thread, playing = self._thread, self._playing
+        # the thread lives on for a moment after it has said so
+        is_over = playing is None or playing.is_over
+        return thread is not None and thread.is_alive() and not is_over
 
     def _start(self) -> str:
         if self._is_playing():
             raise ConfigError('a program is being played already; call ~/stop first')
+        if self._thread is not None:
+            self._thread.join()
         playing = Playing(
             self._build(self.values['program']),
             self.values['block_size'],
@@ -210,7 +216,14 @@ class ExcitationNode(LabNode):
         else:
             late = playing.clock.late if playing.clock else 0
             behind = f', {late} blocks late' if late else ''
-            self.report_status('done', 100.0, f'{_name(playing.sequence)} played{behind}')
+            self._end(playing, 'done', 100.0, f'{_name(playing.sequence)} played{behind}')
+
+    def _end(
+        self, playing: Playing, state: str, progress: float, message: str, level: bytes = OK
+    ) -> None:
+        """Say what came of it; whoever hears that may start again."""
+        playing.is_over = True
+        self.report_status(state, progress, message, level)
 
     def _await_graph(self, playing: Playing) -> None:
         needed, limit = self.values['subscribers'], self.values['wait_limit']
@@ -258,7 +271,7 @@ class ExcitationNode(LabNode):
                 'stopping', progress, f'ramping to {settings.rest:g} {self._unit}', level
             )
             self._send_ramp(playing, [Guard(settings, voltage) for voltage in playing.voltages])
-        self.report_status(state, progress, message, level)
+        self._end(playing, state, progress, message, level)
 
     def _send_ramp(self, playing: Playing, guards: list[Guard]) -> None:
         settings = guards[0].settings
