@@ -222,6 +222,7 @@ def _diagnosed(
         certain=shown,
         smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * doubt),
         missed=missed,
+        misfit=misfit,
         given=left,
     )
     base, selected = effects_beside(simulator, given, search, plays, wide)

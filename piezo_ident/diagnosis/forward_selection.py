@@ -53,8 +53,8 @@ class Selected:
     imitated : Round or None
         Effects that follow the path of the command alone, beside plays.
     linear : tuple of str
-        Changes of the dynamics, best first, that do half of what a retuned G does, where nothing
-        was taken and that does the larger part.
+        Changes of the dynamics, best first, that do half of what a retuned G does, where that does
+        the larger part and no effect fits its law.
     """
 
     rounds: tuple[Round, ...]
@@ -71,9 +71,9 @@ class ForwardSelection:
     Effects are added one after another as long as held-out data gain.
 
     `certain` are effects that a test of their own has shown, whatever they explain of the rest;
-    `smallest` is the rms of the smallest other effect that is taken, and `missed` what the model
+    `smallest` is the rms of the smallest other effect that is taken, `missed` what the model
     missed of fast motion when it was identified, % of stroke: no change of the dynamics since is
-    smaller.
+    smaller; and `misfit` what a wider H takes, % of stroke.
     `given` is the mean square that the model leaves as it was given: where a refit of H leaves
     more, an effect has to gain against that.
     """
@@ -89,6 +89,7 @@ class ForwardSelection:
         certain: Sequence[str] = (),
         smallest: float = criteria.SMALLEST_EFFECT,
         missed: float = 0.0,
+        misfit: float = 0.0,
         given: float = np.inf,
     ) -> None:
         self._simulator = simulator
@@ -96,6 +97,7 @@ class ForwardSelection:
         self._noise = noise
         self._smallest = smallest
         self._missed = missed
+        self._misfit = misfit
         self._given = given
         self._certain = certain
         #: fits, and the same with G retuned
@@ -136,11 +138,20 @@ class ForwardSelection:
         news = [effect for effect in self._allowed if effect.in_dynamics]
         if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
             return self._from(retuned, self._round(retuned), shown)
-        found = self._beside_a_linear_change(base, retuned, news, shown)
+        linear = self._round(base, news) if news else None
+        found = self._beside_a_linear_change(base, retuned, linear, shown)
         size = self._simulator.rows.percent(base.mean_square - retuned.mean_square)
         if len(found.taken) > len(shown) or size < self._smallest:
             return found
-        return replace(found, linear=self._instead(base, retuned))
+        found = replace(found, linear=self._instead(base, retuned))
+        # what exceeds all that was missed, and all that H misses, is no side effect on G
+        is_found = size >= max(criteria.NEWS * self._missed, self._misfit)
+        if linear is None or not linear.contenders or not is_found:
+            return found
+        most = criteria.AHEAD * (self._beyond_noise(retuned) + self._indistinct)
+        if linear.contenders[0].name not in found.linear or self._left(linear) > most:
+            return found
+        return replace(found, taken=(*found.taken, linear), fitted=linear.contenders[0])
 
     def _of_tests(self, fitted: Fitted) -> tuple[list[Round], Fitted]:
         """Return what tests of their own have shown, and the fit with that."""
@@ -158,13 +169,13 @@ class ForwardSelection:
         self,
         base: Fitted,
         retuned: Fitted,
-        news: Sequence[type[Effect]],
+        linear: Round | None,
         shown: Sequence[Round],
     ) -> Selected:
-        if not news:
+        if linear is None:
             return self._from(retuned, self._round(retuned), shown)
         # a linear change is the larger part: is it the whole of it?
-        linear, bent = self._round(base, news), None
+        bent = None
         is_linear = self._takes(linear, self._explainable(base), first=True)
         if not is_linear or self._left(linear) > self._least:
             bent = self._round(retuned)
@@ -326,13 +337,11 @@ class ForwardSelection:
             )
             for i in dropped:
                 del taken[i]
-        left = self._beyond_noise(fitted)
         new = [find_effect(this.contenders[0].name) for this in taken[len(shown) :]]
-        if left > (1.0 - self._wanted(new)) * explainable:
+        if self._beyond_noise(fitted) > (1.0 - self._wanted(new)) * explainable:
             taken = [*shown]
         self._progress('candidates', 1.0)
-        tried = self._have | {effect.name for effect in self._candidates}
-        left_out = frozenset(catalogue()) - tried
+        left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}
         if len(taken) == len(shown):
             fitted = shown[-1].contenders[0] if shown else self._base
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)

@@ -136,7 +136,9 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0) + noise
         whole = (base if i == 0 else this.before).mean_square
         rivals = rivals_of(rows, contenders, rest, whole - rest, plays=plays)
-        names = tuple(dict.fromkeys(c.name for c in (contenders[0], *rivals)))
+        # of a G that changed none of the laws need be the cause
+        like = selected.linear if contenders[0].name in selected.linear else ()
+        names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
             return _class((*names, *untried)[: criteria.CLASS_SIZE], untried)

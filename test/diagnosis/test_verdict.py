@@ -144,7 +144,7 @@ def test_standard_errors_pair_the_blocks():
 
 def verdict(rows, taken, left, bent=None):
     selected = SimpleNamespace(
-        fitted=fitted(left * WHOLE), taken=taken, bent=bent, left_out=frozenset()
+        fitted=fitted(left * WHOLE), taken=taken, bent=bent, left_out=frozenset(), linear=()
     )
     return judge(rows, fitted(WHOLE), selected, 0.0)
 
@@ -310,14 +310,14 @@ def test_what_another_axis_leaves_by_its_form_is_no_line(rows, left, names):
 def choose(rows):
     """Return what a search starts from, given what either round leaves, and the rival it keeps."""
 
-    def chosen(linear, bent):
+    def chosen(linear, bent, fits=True, misfit=0.0):
         search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(
             rows=SimpleNamespace(**vars(rows), passes=9.0),
             model=SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2))),
         )
         search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
-        search._certain, search._given = (), np.inf
+        search._certain, search._given, search._misfit = (), np.inf, misfit
         names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
         search._candidates = [find_effect(n) for n in names]
         rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
@@ -330,14 +330,16 @@ def choose(rows):
         search._instead = lambda *_: ('changed_dynamics', 'amplifier_lag')
 
         def selected(start, first, shown, bent=None):
-            taken = (first,) if search._takes(first, first.before.mean_square, first=True) else ()
+            takes = fits and search._takes(first, first.before.mean_square, first=True)
+            taken = (first,) if takes else ()
             return forward_selection.Selected((first,), taken, start, bent, frozenset())
 
         search._from = selected
         found = search.run(starts['as it is'])
         # what acts behind G competes, what only follows the path does not
         assert [effect.name for effect in search._allowed] == list(names[:3])
-        start = next(k for k, v in starts.items() if v is found.fitted)
+        of_taken = {this.contenders[0].name: this.contenders[0] for this in found.taken}
+        start = next(k for k, v in (starts | of_taken).items() if v is found.fitted)
         return start, found.bent, found.linear
 
     return chosen
@@ -360,6 +362,35 @@ def test_what_the_retuning_makes_and_no_effect_is_no_linear_effect(choose):
     assert start == 'retuned' and bent is None
     # but it says which could be meant
     assert linear == ('changed_dynamics', 'amplifier_lag')
+
+
+@pytest.mark.parametrize(
+    ('left', 'misfit', 'start'),
+    [
+        # no law of the dynamics fits, but one does as well as any other G
+        (0.07, 0.9, 'changed_dynamics'),
+        (0.07, 1.0, 'as it is'),
+        (0.09, 0.9, 'as it is'),
+    ],
+)
+def test_another_g_beyond_all_that_h_misses_is_a_change(choose, left, misfit, start):
+    linear, other = contender('changed_dynamics', left), contender('saturation', 0.05)
+    found, _, names = choose(linear, other, fits=False, misfit=misfit)
+    assert (found, names) == (start, ('changed_dynamics', 'amplifier_lag'))
+
+
+def test_which_law_of_a_changed_g_it_is_stays_open(rows):
+    this = a_round(contender('changed_dynamics', 0.1), contender('delay_change', 0.9))
+    selected = SimpleNamespace(
+        taken=(this,),
+        fitted=this.contenders[0],
+        bent=None,
+        left_out=(),
+        linear=('changed_dynamics', 'amplifier_lag'),
+    )
+    found = judge(rows, fitted(WHOLE), selected, 0.0)
+    assert (found.verdict, found.effects) == ('partly_explained', ('changed_dynamics',))
+    assert found.group.names == ('changed_dynamics', 'amplifier_lag')
 
 
 @pytest.mark.parametrize(
