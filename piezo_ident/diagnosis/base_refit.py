@@ -13,12 +13,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import (
-    base_thresholds,
     BaseColumns,
     fit_base,
     fit_jointly,
@@ -34,7 +34,7 @@ from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
-__all__ = ['effects_beside', 'refits', 'with_refit']
+__all__ = ['base_thresholds', 'effects_beside', 'refits', 'with_refit']
 
 #: laws that are tried in the place of the widest, the narrowest first
 _NARROWER: tuple[LawName, ...] = ('plays', 'preisach')
@@ -53,6 +53,12 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
     plays, wide = (_refit(simulator, given, name) for name in ('plays', LAWS[-1]))
     return plays, wide
+
+
+def base_thresholds(swing: float) -> NDArray[np.float64]:
+    """Return nineteen even thresholds over the swing, and four fine ones near zero."""
+    fine = np.array([0.005, 0.012, 0.025, 0.037])
+    return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
 def _is_better(wide: Fitted, narrow: Fitted) -> bool:
@@ -96,6 +102,8 @@ def _selected(
         _offsets(simulator.rows),
         # whether it leaves little shows before the end
         enough=criteria.OF_LEAST * simulator.rows.square(criteria.SMALLEST_EFFECT),
+        # more than plays leave says nothing
+        goal=beside.mean_square,
     )
     both = search.beside(beside, widest, as_given, found)
     if both.imitated in both.taken:

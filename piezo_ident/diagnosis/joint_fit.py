@@ -38,7 +38,6 @@ __all__ = [
     'BaseColumns',
     'Fitted',
     'base_at',
-    'base_thresholds',
     'fit_base',
     'fit_jointly',
     'offset_columns',
@@ -139,12 +138,6 @@ class Fitted:
         return held_out_residual(rows, self.J, self.e, prior[self.free], sets, self.pull)
 
 
-def base_thresholds(swing: float) -> Array:
-    """Return nineteen even thresholds over the swing, and four fine ones near zero."""
-    fine = np.array([0.005, 0.012, 0.025, 0.037])
-    return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
-
-
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Return H refitted as one of a family, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, law.size
@@ -175,13 +168,15 @@ def fit_jointly(
     *,
     iterations: int = ITERATIONS,
     enough: float = 0.0,
+    goal: float = np.inf,
     tick: Callable[[], None] = lambda: None,
     pull_at: Callable[[State, int], Pull] | None = None,
 ) -> Fitted:
     """
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
-    A step that lowers the mean square by less than `enough` is the last one.
+    A step that lowers the mean square by less than `enough` is the last one, and so is one after
+    which the steps that are left, were they like it, would not reach the mean square `goal`.
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
     `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 
@@ -199,7 +194,7 @@ def fit_jointly(
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
     pull = pull_at and pull_at(state, p)
-    for _ in range(iterations):
+    for done in range(iterations):
         before = _loss(e, pull)
         lower, upper = _room(state, parameters, p)
         step = _Step(base, moving, e, _prior(rows, e, p, state), pull)
@@ -224,7 +219,8 @@ def fit_jointly(
         damping = max(damping / 10.0, 1e-9)
         state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
-        if before - after < max(TOLERANCE * before, enough * e.size):
+        gain, more = before - after, iterations - 1 - done
+        if gain < max(TOLERANCE * before, enough * e.size) or after - more * gain > goal * e.size:
             break
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0

@@ -37,10 +37,18 @@ def without_needless(
         rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
         state = replace(fitted.state, effects=rest)
         # whether it is needed shows before the end
-        without = fit_jointly(simulator, state, fitted.base, enough=criteria.OF_LEAST * least)
+        without = fit_jointly(
+            simulator,
+            state,
+            fitted.base,
+            enough=criteria.OF_LEAST * least,
+            goal=fitted.mean_square + least,
+        )
         if without.mean_square - fitted.mean_square >= least:
             continue
         without = fit_jointly(simulator, without.state, fitted.base)
+        if without.mean_square - fitted.mean_square >= least:
+            continue
         # what the others make up for by values that cannot be, they do not explain
         if all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values):
             fitted = without
@@ -99,7 +107,9 @@ def _afresh(
         effects = (*others[:i], started(rows, start), *others[i:])
         state = replace(rest.state, effects=effects)
         try:
-            yield fit_jointly(simulator, state, fitted.base, enough=least, tick=tick)
+            yield fit_jointly(
+                simulator, state, fitted.base, enough=least, goal=fitted.mean_square, tick=tick
+            )
         except (ModelError, IdentificationError):
             # the fit that is there already stays
             continue

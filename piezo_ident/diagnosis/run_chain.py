@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -102,20 +102,24 @@ def asked_once(operator: Operator, answer: list[Any]) -> Operator:
     return operator
 
 
-def columns_of(chain: RunChain, core: int, law: HysteresisLaw, memory: Array) -> Iterator[Array]:
+def columns_of(
+    chain: RunChain, core: int, law: HysteresisLaw, memory: Array, places: Container[int]
+) -> Iterator[Array]:
     """
-    Give what H, and what effects around it make of it, adds for each coefficient.
+    Give what H, and what effects around it make of it, adds for some of the coefficients.
 
-    Of a chain whose blocks are kept, with H in the place `core`; `memory` as of
+    Of a chain whose blocks are kept, with H in the place `core`; `memory` and `places` as of
     `HysteresisLaw.columns`.
     """
     before = chain.blocks[core]
     around = effects_around(chain.operators[core])
     around = [effect for effect in around if effect.of_hysteresis != 'not']
     if not around:
-        yield from law.columns(before.x, memory)
+        yield from law.columns(before.x, memory, places)
         return
-    for part, own in law.parts():
+    for i, (part, own) in enumerate(law.parts()):
+        if i not in places:
+            continue
         operator: Operator = HysteresisOperator(part, memory[own])
         for effect in reversed(around):
             operator = type(effect)(effect.sample_rate, effect.values, part, operator)

@@ -177,7 +177,7 @@ def _contenders(
     """Return the candidates that show, fitted jointly, best first, and the fits that failed."""
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
-    at = 0.5
+    at, least = 0.5, before.mean_square
 
     def alive() -> None:
         tick(at)
@@ -187,10 +187,15 @@ def _contenders(
         alive()
         fits, failure = [], ''
         for state in states:
+            # what will not gain a share of the best is none of those that are fitted to the end
+            goal = before.mean_square - WORTH_END * (before.mean_square - least)
             try:
                 fits.append(
-                    fit_jointly(simulator, state, before.base, iterations=FIRST, tick=alive)
+                    fit_jointly(
+                        simulator, state, before.base, iterations=FIRST, goal=goal, tick=alive
+                    )
                 )
+                least = min(least, fits[-1].mean_square)
             except ModelError:
                 # the law cannot run with these parameters
                 continue
@@ -208,12 +213,14 @@ def _contenders(
     for i, contender in enumerate(contenders[:FINAL]):
         if is_shown and gains[0] > 0.0 and gains[i] < WORTH_END * gains[0]:
             break
+        # one that stays behind the first is no rival of it
+        goal = AHEAD * contenders[0].mean_square if is_shown else np.inf
         try:
-            fitted = contenders[i] = _to_the_end(simulator, contender, noise, alive)
+            fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
-                other = _to_the_end(simulator, other, noise, alive)
+                other = _to_the_end(simulator, other, noise, goal, alive)
                 ahead = fitted.mean_square < other.mean_square / AHEAD
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
@@ -225,14 +232,18 @@ def _contenders(
 
 
 def _to_the_end(
-    simulator: Simulator, fitted: Fitted, noise: float, tick: Callable[[], None]
+    simulator: Simulator,
+    fitted: Fitted,
+    noise: float,
+    goal: float,
+    tick: Callable[[], None],
 ) -> Fitted:
     """Return a fit with fresh columns of H, as long as that makes a difference."""
     enough = least_gain(simulator.rows, noise)
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square
         base = base_at(simulator, state)
-        fitted = fit_jointly(simulator, state, base, enough=enough, tick=tick)
+        fitted = fit_jointly(simulator, state, base, enough=enough, goal=goal, tick=tick)
         if fitted.mean_square > (1.0 - WORTH_FIT) * before:
             break
     return fitted

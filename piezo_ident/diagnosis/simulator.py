@@ -142,7 +142,8 @@ class Simulator:
         self._of_law: tuple[Any, Array] | None = None
         #: compiled loops leave the interpreter to others, so runs and states go side by side; each
         #: holds some signals as long as a run
-        self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1))
+        self._threads = min(MOST_THREADS, os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(self._threads)
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -178,16 +179,16 @@ class Simulator:
         key = (wide.name, wide.span, tuple(wide.thresholds))
         if self._of_law is None or self._of_law[0] != key:
             self._of_law = None
-            self._of_law = key, self._joined(self._of_runs(lambda i: self._behind_G(wide, i)))
+            self._of_law = key, self._of_columns(wide.size, partial(self._behind_G, wide))
         whole = self._of_law[1]
         return whole if law.name == wide.name else whole[law.within(wide)]
 
-    def _behind_G(self, law: HysteresisLaw, i: int) -> Array:
-        """Return all rows of the columns of a law in a run."""
+    def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Array:
+        """Return all rows of some columns of a law in a run."""
         links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
         source = self._sources[i]
         behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
-        raw = law.columns(source.x, self.rows.memories[i](law.thresholds))
+        raw = law.columns(source.x, self.rows.memories[i](law.thresholds), places)
         return np.stack([behind.rows(x, float(x[0])) for x in raw])
 
     def columns(self, state: State, law: HysteresisLaw, step: float) -> Array:
@@ -198,25 +199,27 @@ class Simulator:
         """
         chains = self._known(state).chains
 
-        def of_run(i: int) -> Array:
-            chain = chains[i]
+        def of_run(i: int, places: range) -> Array:
+            # links of its own: another thread may run the same chain
+            chain = self._chain(state, i)
+            chain.blocks = chains[i].blocks
             core = place_of_core(chain.operators)
             behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
             memory = self.rows.memories[i](law.thresholds)
             kinds = {effect.of_hysteresis for effect in effects_around(chain.operators[core])}
             changes: Iterator[Array]
             if kinds <= {'not', 'linear'}:
-                changes = (step * raw for raw in columns_of(chain, core, law, memory))
+                changes = (step * raw for raw in columns_of(chain, core, law, memory, places))
             else:
                 moved = (
                     state.with_coefficients(law, state.coefficients + delta)
-                    for delta in step * np.eye(law.size)
+                    for delta in step * np.eye(law.size)[places]
                 )
                 cores = (self._chain(s, i).operators[core] for s in moved)
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
             return np.stack([behind.rows(x, float(x[0])) / step for x in changes])
 
-        return self._joined(self._of_runs(of_run))
+        return self._of_columns(law.size, of_run)
 
     def bare(self, state: State) -> Array:
         """Return the rows of H, G and the delay alone; shape (n,)."""
@@ -315,6 +318,18 @@ class Simulator:
     def _of_runs(self, function: Callable[[int], T]) -> list[T]:
         """Return what a function of the place of a run gives for each."""
         return list(self._pool.map(function, range(len(self._sources))))
+
+    def _of_columns(self, size: int, function: Callable[[int, range], Array]) -> Array:
+        """Return the columns that a function of a run and of their places gives."""
+        runs = range(len(self._sources))
+        # all processors share a run alone
+        share = -(-self._threads // len(runs))
+        tasks = [(i, range(k, size, share)) for i in runs for k in range(min(share, size))]
+        parts = list(self._pool.map(lambda task: function(*task), tasks))
+        whole = [np.empty((size, keep.size)) for keep in self.rows.keep]
+        for (i, places), part in zip(tasks, parts, strict=True):
+            whole[i][places] = part
+        return self._joined(whole)
 
     def _known(self, state: State | None = None) -> _Kept:
         if self._kept is None or state not in (None, self._kept.state):

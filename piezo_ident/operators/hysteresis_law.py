@@ -21,7 +21,7 @@ doi:10.1007/978-1-4612-4048-8.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 import functools
 from math import comb
@@ -211,7 +211,10 @@ class HysteresisLaw:
             yield part, moved
 
     def columns(
-        self, v: NDArray[np.float64], memory: ArrayLike | None = None
+        self,
+        v: NDArray[np.float64],
+        memory: ArrayLike | None = None,
+        places: Container[int] | None = None,
     ) -> Iterator[NDArray[np.float64]]:
         """
         Give what H adds for each coefficient, one after the other.
@@ -223,6 +226,8 @@ class HysteresisLaw:
         memory : array_like, shape (m,), optional
             Play outputs before the first sample; those of a stage that last came down to zero
             when absent.
+        places : container of int, optional
+            Of the coefficients that are wanted; all when absent.
 
         Yields
         ------
@@ -230,6 +235,8 @@ class HysteresisLaw:
         """
         start = None if memory is None else np.asarray(memory, dtype=np.float64)
         for i, (part, moved) in enumerate(self.parts()):
+            if places is not None and i not in places:
+                continue
             own = None if start is None else start[moved]
             # a single play runs faster by itself
             single = i < self.thresholds.size

@@ -19,8 +19,9 @@ import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings, search
 from piezo_ident.diagnosis import rows as rows_module
+from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
-from piezo_ident.diagnosis.joint_fit import base_at, base_thresholds, fit_base, fit_jointly
+from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly
 from piezo_ident.diagnosis.parameters import free_parameters
 from piezo_ident.diagnosis.retuning import retuned
 from piezo_ident.diagnosis.rows import make_rows
