@@ -10,6 +10,7 @@ The stages come from benchmarks/truths: their laws are not those of the candidat
 from dataclasses import replace
 from functools import cache
 import importlib
+import os
 from pathlib import Path
 import sys
 from types import SimpleNamespace
@@ -546,6 +547,32 @@ def test_a_fit_ends_when_a_step_gains_too_little(truths):
     early = fit_jointly(simulator, state, base, enough=1e-7, tick=lambda: early_steps.append(0))
     assert len(early_steps) < len(whole_steps)
     assert 0.0 <= early.mean_square - whole.mean_square < 1e-6
+    # nor does it go on towards what it will not reach
+    hopeless_steps = []
+    hopeless = fit_jointly(simulator, state, base, goal=0.0, tick=lambda: hopeless_steps.append(0))
+    assert len(hopeless_steps) < len(whole_steps)
+    assert hopeless.mean_square >= whole.mean_square
+    near = fit_jointly(simulator, state, base, goal=2.0 * whole.mean_square)
+    assert near.mean_square == whole.mean_square
+
+
+@pytest.mark.parametrize('name', ['creep', 'rate_dependent_hysteresis'])
+def test_processors_that_share_a_run_give_the_columns_of_one(truths, monkeypatch, name):
+    model, record, _ = measured(None, 0.0, 1)
+    law = HysteresisLaw('preisach', base_thresholds(1.0)[::6])
+    values = {
+        'creep': {'gain': [0.01], 'time_constant': [0.3]},
+        'rate_dependent_hysteresis': {'gain': 1e-3, 'exponent': 0.7, 'cutoff': 900.0},
+    }
+    effect = Added(name, (find_effect(name).check(values[name]),))
+    found = []
+    for count in (1, 3, 99):
+        monkeypatch.setattr(os, 'cpu_count', lambda count=count: count)
+        simulator = Simulator(model, make_rows(model, [record]))
+        state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), law)
+        found.append((base.columns, base_at(simulator, state.with_effect(effect)).columns))
+    for columns in found[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(columns, found[0], strict=True))
 
 
 def test_states_run_side_by_side_as_they_do_alone(truths):

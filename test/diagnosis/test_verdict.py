@@ -6,12 +6,13 @@
 from types import SimpleNamespace
 
 import numpy as np
-from piezo_ident.diagnosis import criteria, forward_selection, search
+from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
 from piezo_ident.diagnosis.forward_selection import takes
 from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
+from piezo_ident.diagnosis.simulator import State
 from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
 import pytest
@@ -225,6 +226,25 @@ def test_what_the_h_of_the_model_does_not_leave_needs_no_effect(
     found = search.beside(plays, wide, as_given, none)
     assert bool(found.taken) == is_taken
     assert found.fitted is (best if is_taken else wide)
+
+
+@pytest.mark.parametrize(('end', 'dropped'), [(0.101, (0,)), (0.5, ())])
+def test_what_is_needless_shows_when_the_rest_is_fitted_to_its_end(
+    rows, monkeypatch, end, dropped
+):
+    added = SimpleNamespace(effect=SimpleNamespace(is_plausible=lambda _: True), values=({},))
+    state = State(None, np.zeros(1), effects=(added, added))
+    whole = SimpleNamespace(**(vars(fitted(0.1 * WHOLE)) | {'state': state}), base=None)
+    fits = iter([fitted(0.1005 * WHOLE), fitted(end * WHOLE)])
+
+    def fit(simulator, state, base, **kwargs):
+        return SimpleNamespace(**(vars(next(fits)) | {'state': state}))
+
+    monkeypatch.setattr(polishing, 'fit_jointly', fit)
+    simulator = SimpleNamespace(rows=rows)
+    found, gone = polishing.without_needless(simulator, whole, 0.01 * WHOLE, 0)
+    assert gone == dropped
+    assert (found is whole) == (not dropped)
 
 
 @pytest.mark.parametrize(
