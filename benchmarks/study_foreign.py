@@ -338,6 +338,12 @@ def lasting(row: Row) -> bool:
     return all(n in ADDED or row.left[n] >= row.misfit for n in counted(row))
 
 
+def refit_holds_it(row: Row) -> bool:
+    """Return whether a refit is the finding, and all that counts is in its class."""
+    truth = set(counted(row))
+    return row.verdict == 'refitted' and bool(truth) and truth <= set(row.group)
+
+
 def false_faults(row: Row) -> tuple[str, ...]:
     """Return the faults of the data that are reported and are none; a coarse step may be real."""
     true = NAMES.get(row.fault, ())
@@ -444,6 +450,14 @@ def summary(rows: Sequence[Row]) -> str:
         ['- one of two', share('part')],
         ['- abstained', share('abstained')],
         ['- no name, and it is among what may hide in the base model', share('hidden')],
+        [
+            '- its name, its class, or the class of a refit (`refitted`)',
+            some(outcome(r) in ('named', 'class') or refit_holds_it(r) for r in large),
+        ],
+        [
+            '- no name, and the class of a refit does not hold it',
+            some(r.verdict == 'refitted' and not r.fault and not refit_holds_it(r) for r in large),
+        ],
         [
             '- where a refit of forty plays leaves the misfit at least: its name or class',
             some(outcome(r) in ('named', 'class') for r in large if lasting(r)),
