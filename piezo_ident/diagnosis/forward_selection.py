@@ -21,15 +21,14 @@ from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
 from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round, search_round
+from piezo_ident.diagnosis.search import Round, search_round, takes
 from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.trial_scores import score_trials
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
-__all__ = ['TESTED', 'ForwardSelection', 'Selected', 'takes']
+__all__ = ['TESTED', 'ForwardSelection', 'Selected']
 
 #: effects that have a test of their own, by lines and by coherence with a further channel
 TESTED = ('periodic_disturbance', 'cross_coupling')
@@ -136,22 +135,28 @@ class ForwardSelection:
             # they were there at the identification, too: it takes no more for G to be off
             return self._from(retuned, self._round(retuned), shown)
         news = [effect for effect in self._allowed if effect.in_dynamics]
-        if base.mean_square - retuned.mean_square < criteria.LINEAR * explainable:
+        gain = base.mean_square - retuned.mean_square
+        if gain < criteria.LINEAR * explainable:
             return self._from(retuned, self._round(retuned), shown)
         linear = self._round(base, news) if news else None
         found = self._beside_a_linear_change(base, retuned, linear, shown)
-        size = self._simulator.rows.percent(base.mean_square - retuned.mean_square)
+        size = self._simulator.rows.percent(gain)
         if len(found.taken) > len(shown) or size < self._smallest:
             return found
         found = replace(found, linear=self._instead(base, retuned))
         # what exceeds all that was missed, and all that H misses, is no side effect on G
-        is_found = size >= max(criteria.NEWS * self._missed, self._misfit)
+        is_found = size >= max(criteria.REFIT_FINDING, self._missed, self._misfit)
         if linear is None or not linear.contenders or not is_found:
             return found
-        most = criteria.AHEAD * (self._beyond_noise(retuned) + self._indistinct)
-        if linear.contenders[0].name not in found.linear or self._left(linear) > most:
+        best, whole = linear.contenders[0], gain >= criteria.TOGETHER * explainable
+        if (
+            not whole
+            or best.name not in found.linear
+            or self._gain(linear) < criteria.NAMED * gain
+        ):
             return found
-        return replace(found, taken=(*found.taken, linear), fitted=linear.contenders[0])
+        # the rest of what another G does is no other effect
+        return replace(found, taken=(*found.taken, linear), fitted=self.retuned(best))
 
     def _of_tests(self, fitted: Fitted) -> tuple[list[Round], Fitted]:
         """Return what tests of their own have shown, and the fit with that."""
@@ -354,47 +359,3 @@ class ForwardSelection:
             return criteria.TOGETHER
         # any G that is a little off looks partly like a change of the dynamics
         return criteria.NAMED if self._is_new else criteria.LAW_FITS
-
-
-# -- is it an effect? ----------------------------------------------------------------------------
-
-
-def takes(
-    rows: Rows,
-    this: Round,
-    before: float,
-    noise: float,
-    explainable: float,
-    smallest: float,
-    *,
-    first: bool,
-) -> bool:
-    """
-    Return whether the best contender of a round is an effect, the `first` one or a further one.
-
-    `before` is the mean square that is left without it and `noise` that of the noise of a row,
-    `explainable` what there was to be explained before anything was added, `smallest` the least
-    size [% of stroke].
-    """
-    if not this.contenders:
-        return False
-    best = this.contenders[0]
-    # nothing is gained below the noise
-    gain, left = before - max(best.mean_square, noise), max(before - noise, 1e-300)
-    if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
-        return False
-    # what follows time alone fits a shifted residual as well; its lines and trends have tests
-    # of their own
-    chance = 0.0 if find_effect(best.name).time_driven else this.chance.get(best.name, 0.0)
-    if gain < criteria.BEYOND_CHANCE * chance:
-        return False
-    if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
-        return False
-    # what shows where it alone acts has no need of a proof by all kinds of excitation
-    return has_place(best.name) or not _harms(rows, this.before, best)
-
-
-def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:
-    """Return whether what an effect costs some kinds of excitation is much of what it gains."""
-    change = np.bincount(rows.group, after.errors - before.errors)
-    return bool(change[change > 0.0].sum() > -criteria.HARM * change.sum())

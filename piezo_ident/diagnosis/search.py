@@ -18,29 +18,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError, ModelError
-from piezo_ident.diagnosis.criteria import (
-    AHEAD,
-    FINAL,
-    FIRST,
-    INDISTINCT,
-    JOINT_FITS,
-    POLISHING,
-    SIMPLER,
-    STARTS,
-    SURROGATES,
-    WORTH_END,
-    WORTH_FIT,
-)
+from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.polishing import least_gain
-from piezo_ident.diagnosis.signature import shows
+from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.trial_scores import score_trials, Scored, started, Tick
-from piezo_ident.effects import Effect
+from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['Round', 'search_round']
+__all__ = ['Round', 'search_round', 'takes']
 
 Array = NDArray[np.float64]
 
@@ -91,11 +80,11 @@ def search_round(
     `rng` draws the shifts of the surrogates.
     """
     n = simulator.rows.n
-    shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
+    shifts = rng.integers(n // 20, n - n // 20, 4 * criteria.SURROGATES)
     shifted = [np.roll(before.e, int(k)) for k in shifts]
     # of a residual that repeats, a shift by a period is no surrogate
     shifted.sort(key=lambda e: abs(float(e @ before.e)))
-    surrogates = np.stack(shifted[:SURROGATES], axis=1)
+    surrogates = np.stack(shifted[: criteria.SURROGATES], axis=1)
     trials: dict[str, list[Scored]] = {}
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
@@ -111,18 +100,23 @@ def search_round(
         scores.sort(key=lambda s: s.error)
     best = {name: scores[0] for name, scores in trials.items()}
     total = float(before.errors.sum())
-    least = WORTH_FIT * max(total - noise * n, 1e-300)
+    least = criteria.WORTH_FIT * max(total - noise * n, 1e-300)
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
-    chosen = promising[:JOINT_FITS]
+    chosen = promising[: criteria.JOINT_FITS]
     # a small step does not tell from its like what an effect does in full
     alike = look_alikes(chosen[0][0].effect.name) if chosen else ()
-    chosen += [scores for scores in promising[JOINT_FITS:] if scores[0].effect.name in alike]
+    chosen += [
+        scores for scores in promising[criteria.JOINT_FITS :] if scores[0].effect.name in alike
+    ]
     starts = [
         (
             scores[0].effect,
             # a law that looks best while it is small need not be the one that fits best
-            [before.state.with_effect(started(simulator.rows, s)) for s in scores[:STARTS]],
+            [
+                before.state.with_effect(started(simulator.rows, s))
+                for s in scores[: criteria.STARTS]
+            ],
         )
         for scores in chosen
     ]
@@ -188,11 +182,16 @@ def _contenders(
         fits, failure = [], ''
         for state in states:
             # what will not gain a share of the best is none of those that are fitted to the end
-            goal = before.mean_square - WORTH_END * (before.mean_square - least)
+            goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
             try:
                 fits.append(
                     fit_jointly(
-                        simulator, state, before.base, iterations=FIRST, goal=goal, tick=alive
+                        simulator,
+                        state,
+                        before.base,
+                        iterations=criteria.FIRST,
+                        goal=goal,
+                        tick=alive,
                     )
                 )
                 least = min(least, fits[-1].mean_square)
@@ -203,29 +202,31 @@ def _contenders(
                 failure = f'{effect.name} was not judged: {error}'
         if fits:
             contenders.append(min(fits, key=lambda f: f.mean_square))
-            beside_wide[effect.name] = min(fits[:STARTS], key=lambda f: f.mean_square)
+            beside_wide[effect.name] = min(fits[: criteria.STARTS], key=lambda f: f.mean_square)
         elif failure:
             warnings.append(failure)
     contenders.sort(key=lambda c: c.mean_square)
-    done = noise + simulator.rows.square(INDISTINCT)
+    done = noise + simulator.rows.square(criteria.INDISTINCT)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
-    for i, contender in enumerate(contenders[:FINAL]):
-        if is_shown and gains[0] > 0.0 and gains[i] < WORTH_END * gains[0]:
+    for i, contender in enumerate(contenders[: criteria.FINAL]):
+        if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
         # one that stays behind the first is no rival of it
-        goal = AHEAD * contenders[0].mean_square if is_shown else np.inf
+        goal = criteria.AHEAD * contenders[0].mean_square if is_shown else np.inf
         try:
             fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
                 other = _to_the_end(simulator, other, noise, goal, alive)
-                ahead = fitted.mean_square < other.mean_square / AHEAD
+                ahead = fitted.mean_square < other.mean_square / criteria.AHEAD
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
         except IdentificationError as error:
-            warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
+            warnings.append(
+                f'{contender.name} was fitted in {criteria.FIRST} iterations only: {error}'
+            )
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
@@ -240,11 +241,11 @@ def _to_the_end(
 ) -> Fitted:
     """Return a fit with fresh columns of H, as long as that makes a difference."""
     enough = least_gain(simulator.rows, noise)
-    for _ in range(POLISHING):
+    for _ in range(criteria.POLISHING):
         state, before = fitted.state, fitted.mean_square
         base = base_at(simulator, state)
         fitted = fit_jointly(simulator, state, base, enough=enough, goal=goal, tick=tick)
-        if fitted.mean_square > (1.0 - WORTH_FIT) * before:
+        if fitted.mean_square > (1.0 - criteria.WORTH_FIT) * before:
             break
     return fitted
 
@@ -253,7 +254,51 @@ def _simplest_first(contenders: list[Fitted], noise: float) -> list[Fitted]:
     """Move the effect with the fewest parameters to the front of those that fit as well."""
     if not contenders:
         return contenders
-    limit = SIMPLER * max(contenders[0].mean_square - noise, 0.0) + noise
+    limit = criteria.SIMPLER * max(contenders[0].mean_square - noise, 0.0) + noise
     good = [c for c in contenders if c.mean_square <= limit]
     simplest = min(good, key=lambda c: len(c.parameters))
     return [simplest, *(c for c in contenders if c is not simplest)]
+
+
+# -- is it an effect? ----------------------------------------------------------------------------
+
+
+def takes(
+    rows: Rows,
+    this: Round,
+    before: float,
+    noise: float,
+    explainable: float,
+    smallest: float,
+    *,
+    first: bool,
+) -> bool:
+    """
+    Return whether the best contender of a round is an effect, the `first` one or a further one.
+
+    `before` is the mean square that is left without it and `noise` that of the noise of a row,
+    `explainable` what there was to be explained before anything was added, `smallest` the least
+    size [% of stroke].
+    """
+    if not this.contenders:
+        return False
+    best = this.contenders[0]
+    # nothing is gained below the noise
+    gain, left = before - max(best.mean_square, noise), max(before - noise, 1e-300)
+    if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
+        return False
+    # what follows time alone fits a shifted residual as well; its lines and trends have tests
+    # of their own
+    chance = 0.0 if find_effect(best.name).time_driven else this.chance.get(best.name, 0.0)
+    if gain < criteria.BEYOND_CHANCE * chance:
+        return False
+    if gain < (criteria.ADDED if first else criteria.FURTHER) * left:
+        return False
+    # what shows where it alone acts has no need of a proof by all kinds of excitation
+    return has_place(best.name) or not _harms(rows, this.before, best)
+
+
+def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:
+    """Return whether what an effect costs some kinds of excitation is much of what it gains."""
+    change = np.bincount(rows.group, after.errors - before.errors)
+    return bool(change[change > 0.0].sum() > -criteria.HARM * change.sum())

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
-from piezo_ident.diagnosis.forward_selection import takes
 from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
+from piezo_ident.diagnosis.search import takes
 from piezo_ident.diagnosis.simulator import State
 from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
@@ -330,22 +330,24 @@ def test_what_another_axis_leaves_by_its_form_is_no_line(rows, left, names):
 def choose(rows):
     """Return what a search starts from, given what either round leaves, and the rival it keeps."""
 
-    def chosen(linear, bent, fits=True, misfit=0.0):
+    def chosen(linear, bent, fits=True, misfit=0.0, missed=0.0, retuned_left=0.05):
         search = object.__new__(forward_selection.ForwardSelection)
         search._simulator = SimpleNamespace(
             rows=SimpleNamespace(**vars(rows), passes=9.0),
             model=SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2))),
         )
-        search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
+        search._noise, search._missed, search._smallest = 0.0, missed, 0.05
         search._certain, search._given, search._misfit = (), np.inf, misfit
         names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
         search._candidates = [find_effect(n) for n in names]
-        rounds = {'as it is': a_round(linear), 'retuned': a_round(bent, before=0.05 * WHOLE)}
+        again = a_round(bent, before=retuned_left * WHOLE)
+        rounds = {'as it is': a_round(linear), 'retuned': again}
         starts = {
             key: SimpleNamespace(mean_square=this.before.mean_square, state=None, base=None)
             for key, this in rounds.items()
         }
-        search.retuned = lambda fitted: starts['retuned']
+        both = SimpleNamespace()
+        search.retuned = lambda fitted: both if fitted is linear else starts['retuned']
         search._round = lambda start, *_: rounds[next(k for k, v in starts.items() if v is start)]
         search._instead = lambda *_: ('changed_dynamics', 'amplifier_lag')
 
@@ -358,8 +360,8 @@ def choose(rows):
         found = search.run(starts['as it is'])
         # what acts behind G competes, what only follows the path does not
         assert [effect.name for effect in search._allowed] == list(names[:3])
-        of_taken = {this.contenders[0].name: this.contenders[0] for this in found.taken}
-        start = next(k for k, v in (starts | of_taken).items() if v is found.fitted)
+        ends = starts | {f'{linear.name}, retuned': both}
+        start = next(k for k, v in ends.items() if v is found.fitted)
         return start, found.bent, found.linear
 
     return chosen
@@ -385,18 +387,29 @@ def test_what_the_retuning_makes_and_no_effect_is_no_linear_effect(choose):
 
 
 @pytest.mark.parametrize(
-    ('left', 'misfit', 'start'),
+    ('left', 'misfit', 'missed', 'retuned_left', 'is_found'),
     [
-        # no law of the dynamics fits, but one does as well as any other G
-        (0.07, 0.9, 'changed_dynamics'),
-        (0.07, 1.0, 'as it is'),
-        (0.09, 0.9, 'as it is'),
+        # no law of the dynamics fits, but one does nearly all that another G does
+        (0.15, 0.9, 0.9, 0.1, True),
+        # H misses as much, or G did at the identification
+        (0.15, 1.0, 0.0, 0.1, False),
+        (0.15, 0.0, 0.96, 0.1, False),
+        # the law does less than another G does
+        (0.25, 0.0, 0.0, 0.1, False),
+        # another G is but a part of it
+        (0.3, 0.0, 0.0, 0.3, False),
     ],
 )
-def test_another_g_beyond_all_that_h_misses_is_a_change(choose, left, misfit, start):
-    linear, other = contender('changed_dynamics', left), contender('saturation', 0.05)
-    found, _, names = choose(linear, other, fits=False, misfit=misfit)
-    assert (found, names) == (start, ('changed_dynamics', 'amplifier_lag'))
+def test_another_g_beyond_all_that_h_misses_is_a_change(
+    choose, left, misfit, missed, retuned_left, is_found
+):
+    linear, other = contender('changed_dynamics', left), contender('saturation', retuned_left)
+    found, _, names = choose(
+        linear, other, fits=False, misfit=misfit, missed=missed, retuned_left=retuned_left
+    )
+    # whatever else another G does stays in the fit
+    assert found == ('changed_dynamics, retuned' if is_found else 'as it is')
+    assert names == ('changed_dynamics', 'amplifier_lag')
 
 
 def test_which_law_of_a_changed_g_it_is_stays_open(rows):
