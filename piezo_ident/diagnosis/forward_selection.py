@@ -144,19 +144,33 @@ class ForwardSelection:
         if len(found.taken) > len(shown) or size < self._smallest:
             return found
         found = replace(found, linear=self._instead(base, retuned))
-        # what exceeds all that was missed, and all that H misses, is no side effect on G
-        is_found = size >= max(criteria.REFIT_FINDING, self._missed, self._misfit)
-        if linear is None or not linear.contenders or not is_found:
+        if linear is None or not self._is_change(linear, retuned, found):
             return found
-        best, whole = linear.contenders[0], gain >= criteria.TOGETHER * explainable
-        if (
-            not whole
-            or best.name not in found.linear
-            or self._gain(linear) < criteria.NAMED * gain
-        ):
-            return found
-        # the rest of what another G does is no other effect
-        return replace(found, taken=(*found.taken, linear), fitted=self.retuned(best))
+        k, rounds = len(shown), found.rounds
+        if not any(one is linear for one in rounds):
+            rounds = (*rounds[:k], linear, *rounds[k:])
+        return replace(
+            found, rounds=rounds, taken=(*found.taken, linear), fitted=linear.contenders[0]
+        )
+
+    def _is_change(self, linear: Round, retuned: Fitted, found: Selected) -> bool:
+        """
+        Return whether a G that has changed is the finding, though none of its laws fits.
+
+        What exceeds all that was missed, and all that H misses, is no side effect on G.
+        """
+        explainable = self._explainable(linear.before)
+        gain = explainable - self._beyond_noise(retuned)
+        size = self._simulator.rows.percent(gain)
+        return (
+            size >= max(criteria.REFIT_FINDING, self._missed, self._misfit)
+            and gain >= criteria.TOGETHER * explainable
+            and len(found.taken) < self._most
+            and self._takes(linear, explainable, first=True)
+            and linear.contenders[0].name in found.linear
+            # one law does nearly all that another G does
+            and explainable - self._left(linear) >= criteria.NAMED * gain
+        )
 
     def _of_tests(self, fitted: Fitted) -> tuple[list[Round], Fitted]:
         """Return what tests of their own have shown, and the fit with that."""
@@ -193,7 +207,7 @@ class ForwardSelection:
 
     def _instead(self, base: Fitted, retuned: Fitted) -> tuple[str, ...]:
         """Return changes of the dynamics, best first, that do half of what a retuned G does."""
-        effects = [effect for effect in self._candidates if effect.in_dynamics]
+        effects = [e for e in self._candidates if e.in_dynamics and e.name not in self._have]
         none = np.zeros((self._simulator.rows.n, 0))
         left: dict[str, float] = {}
         for scored in score_trials(self._simulator, base, effects, self._lines, none):

@@ -176,7 +176,8 @@ def fit_jointly(
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
     A step that lowers the mean square by less than `enough` is the last one, and so is one after
-    which the steps that are left, were they like it, would not reach the mean square `goal`.
+    which the steps that are left, were they like it, would not reach the mean square `goal` of
+    what is fitted.
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
     `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 
@@ -220,7 +221,9 @@ def fit_jointly(
         state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
         gain, more = before - after, iterations - 1 - done
-        if gain < max(TOLERANCE * before, enough * e.size) or after - more * gain > goal * e.size:
+        # a first step tells little of those behind it
+        hopeless = done > 0 and after - more * gain > goal * e.size
+        if hopeless or gain < max(TOLERANCE * before, enough * e.size):
             break
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0

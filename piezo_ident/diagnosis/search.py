@@ -181,7 +181,7 @@ def _contenders(
         alive()
         fits, failure = [], ''
         for state in states:
-            # what will not gain a share of the best is none of those that are fitted to the end
+            # what will not gain a share of the best is hardly one of those fitted to the end
             goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
             try:
                 fits.append(
@@ -212,8 +212,8 @@ def _contenders(
     for i, contender in enumerate(contenders[: criteria.FINAL]):
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
-        # one that stays behind the first is no rival of it
-        goal = criteria.AHEAD * contenders[0].mean_square if is_shown else np.inf
+        # one that stays further behind the first is no rival of it
+        goal = criteria.FORM_RATIO * contenders[0].mean_square + done if is_shown else np.inf
         try:
             fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]

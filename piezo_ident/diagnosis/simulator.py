@@ -325,10 +325,14 @@ class Simulator:
         # all processors share a run alone
         share = -(-self._threads // len(runs))
         tasks = [(i, range(k, size, share)) for i in runs for k in range(min(share, size))]
-        parts = list(self._pool.map(lambda task: function(*task), tasks))
         whole = [np.empty((size, keep.size)) for keep in self.rows.keep]
-        for (i, places), part in zip(tasks, parts, strict=True):
-            whole[i][places] = part
+
+        def fill(task: tuple[int, range]) -> None:
+            i, places = task
+            whole[i][places] = function(i, places)
+
+        for _ in self._pool.map(fill, tasks):
+            pass
         return self._joined(whole)
 
     def _known(self, state: State | None = None) -> _Kept:

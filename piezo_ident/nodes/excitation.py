@@ -168,7 +168,7 @@ class ExcitationNode(LabNode):
     def _is_playing(self) -> bool:
         thread, playing = self._thread, self._playing
         # the thread lives on for a moment after it has said so
-        is_over = playing is None or playing.is_over
+        is_over = playing is not None and playing.is_over
         return thread is not None and thread.is_alive() and not is_over
 
     def _start(self) -> str:
@@ -251,6 +251,8 @@ class ExcitationNode(LabNode):
             text = f'{_name(sequence)}, segment {label}{warning}'
             brief = f'{percent} %: {text}'
             self.report_status('running', percent, text, level, brief=brief, segment=label)
+        # a stop during the last block
+        self._sleep(playing, time.monotonic())
 
     def _send(self, playing: Playing, voltages: Many[NDArray[np.float64]], label: str) -> None:
         begin, n = time.perf_counter(), voltages[0].size
