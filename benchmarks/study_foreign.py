@@ -43,6 +43,7 @@ from foreign.sizes import scaled
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis import diagnose
+from piezo_ident.effects import find_effect
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run
@@ -338,6 +339,11 @@ def lasting(row: Row) -> bool:
     return all(n in ADDED or row.left[n] >= row.misfit for n in counted(row))
 
 
+def follows_path(row: Row) -> bool:
+    """Return whether something that counts follows the path of the voltage: a wide H is one."""
+    return any(find_effect(name).rate_independent for name in counted(row))
+
+
 def refit_holds_it(row: Row) -> bool:
     """Return whether a refit is the finding, and all that counts is in its class."""
     truth = set(counted(row))
@@ -446,6 +452,14 @@ def summary(rows: Sequence[Row]) -> str:
             some(r.group for r in nothing),
         ],
         ['an effect that counts: its name or class', share('named', 'class')],
+        [
+            '- where it follows the path of the voltage alone',
+            some(outcome(r) in ('named', 'class') for r in large if follows_path(r)),
+        ],
+        [
+            '- elsewhere',
+            some(outcome(r) in ('named', 'class') for r in large if not follows_path(r)),
+        ],
         ['- a false name instead or beside', share('false')],
         ['- one of two', share('part')],
         ['- abstained', share('abstained')],
