@@ -442,6 +442,9 @@ def summary(rows: Sequence[Row]) -> str:
     def share(*kinds: str) -> str:
         return part_of(sum(outcome(r) in kinds for r in large), len(large))
 
+    def is_found(row: Row) -> bool:
+        return outcome(row) in ('named', 'class')
+
     def most(ratios: Iterable[float]) -> str:
         return f'{max(ratios, default=0.0):.2f}'
 
@@ -454,11 +457,11 @@ def summary(rows: Sequence[Row]) -> str:
         ['an effect that counts: its name or class', share('named', 'class')],
         [
             '- where it follows the path of the voltage alone',
-            some(outcome(r) in ('named', 'class') for r in large if follows_path(r)),
+            some(is_found(r) for r in large if follows_path(r)),
         ],
         [
             '- elsewhere',
-            some(outcome(r) in ('named', 'class') for r in large if not follows_path(r)),
+            some(is_found(r) for r in large if not follows_path(r)),
         ],
         ['- a false name instead or beside', share('false')],
         ['- one of two', share('part')],
@@ -466,7 +469,7 @@ def summary(rows: Sequence[Row]) -> str:
         ['- no name, and it is among what may hide in the base model', share('hidden')],
         [
             '- its name, its class, or the class of a refit (`refitted`)',
-            some(outcome(r) in ('named', 'class') or refit_holds_it(r) for r in large),
+            some(is_found(r) or refit_holds_it(r) for r in large),
         ],
         [
             '- no name, and the class of a refit does not hold it',
@@ -474,7 +477,7 @@ def summary(rows: Sequence[Row]) -> str:
         ],
         [
             '- where a refit of forty plays leaves the misfit at least: its name or class',
-            some(outcome(r) in ('named', 'class') for r in large if lasting(r)),
+            some(is_found(r) for r in large if lasting(r)),
         ],
         ['a smaller effect: a false name', some(false_names(r) for r in small)],
         ['a fault of the data that is none', some(false_faults(r) for r in sound)],

@@ -29,7 +29,7 @@ from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.trial_scores import score_trials
+from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
@@ -205,11 +205,8 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
         prior=np.zeros(count),
     )
     effects = [effect for effect in catalogue().values() if effect.rate_independent]
-    left: dict[str, float] = {}
-    for scored in score_trials(simulator, start, effects, (), np.zeros((rows.n, 0))):
-        name = scored.effect.name
-        if scored.is_possible:
-            left[name] = min(left.get(name, np.inf), scored.error)
+    best = best_trials(simulator, start, effects, ())
+    left = {name: scored.error for name, scored in best.items()}
     whole, least = float(e @ e), float(refit.errors.sum())
     found = [name for name, x in left.items() if whole - x > 0.5 * (whole - least)]
     return sorted(found, key=lambda name: left[name])

@@ -24,7 +24,7 @@ from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.search import Round, search_round, takes
 from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.trial_scores import score_trials
+from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
@@ -143,7 +143,7 @@ class ForwardSelection:
         size = self._simulator.rows.percent(gain)
         if len(found.taken) > len(shown) or size < self._smallest:
             return found
-        found = replace(found, linear=self._instead(base, retuned))
+        found = replace(found, linear=self._instead(base, retuned, linear))
         if linear is None or not self._is_change(linear, retuned, found):
             return found
         k, rounds = len(shown), found.rounds
@@ -205,14 +205,14 @@ class ForwardSelection:
             return self._from(retuned, bent, shown)
         return self._from(base, linear, shown, bent if is_bent else None)
 
-    def _instead(self, base: Fitted, retuned: Fitted) -> tuple[str, ...]:
+    def _instead(self, base: Fitted, retuned: Fitted, linear: Round | None) -> tuple[str, ...]:
         """Return changes of the dynamics, best first, that do half of what a retuned G does."""
-        effects = [e for e in self._candidates if e.in_dynamics and e.name not in self._have]
-        none = np.zeros((self._simulator.rows.n, 0))
-        left: dict[str, float] = {}
-        for scored in score_trials(self._simulator, base, effects, self._lines, none):
-            if scored.is_possible:
-                left[scored.effect.name] = min(left.get(scored.effect.name, np.inf), scored.error)
+        if linear is None:
+            effects = [e for e in self._candidates if e.in_dynamics and e.name not in self._have]
+            best = best_trials(self._simulator, base, effects, self._lines)
+        else:
+            best = linear.best
+        left = {name: scored.error for name, scored in best.items()}
         most = 0.5 * float(base.errors.sum() + retuned.errors.sum())
         return tuple(sorted((name for name in left if left[name] < most), key=left.__getitem__))
 

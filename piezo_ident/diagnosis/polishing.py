@@ -69,10 +69,8 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    done, least = (
-        noise + simulator.rows.square(criteria.INDISTINCT),
-        least_gain(simulator.rows, noise),
-    )
+    done = noise + simulator.rows.square(criteria.INDISTINCT)
+    least = least_gain(simulator.rows, noise)
     for i in range(len(fitted.state.effects)):
         if fitted.mean_square < done:
             break

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,7 +103,7 @@ def asked_once(operator: Operator, answer: list[Any]) -> Operator:
 
 
 def columns_of(
-    chain: RunChain, core: int, law: HysteresisLaw, memory: Array, places: Container[int]
+    chain: RunChain, core: int, law: HysteresisLaw, memory: Array, places: Sequence[int]
 ) -> Iterator[Array]:
     """
     Give what H, and what effects around it make of it, adds for some of the coefficients.
@@ -117,9 +117,7 @@ def columns_of(
     if not around:
         yield from law.columns(before.x, memory, places)
         return
-    for i, (part, own) in enumerate(law.parts()):
-        if i not in places:
-            continue
+    for part, own in law.parts(places):
         operator: Operator = HysteresisOperator(part, memory[own])
         for effect in reversed(around):
             operator = type(effect)(effect.sample_rate, effect.values, part, operator)

@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.polishing import least_gain
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator, State
-from piezo_ident.diagnosis.trial_scores import score_trials, Scored, started, Tick
+from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored, started, Tick
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
@@ -150,12 +150,7 @@ def _add_plain_starts(
     plays = HysteresisLaw('plays', law.thresholds, law.span)
     plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays))
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
-    best: dict[str, Scored] = {}
-    none = np.zeros((simulator.rows.n, 0))
-    for scored in score_trials(simulator, plain, [effect for effect, _ in starts], lines, none):
-        name = scored.effect.name
-        if scored.is_possible and (name not in best or scored.error < best[name].error):
-            best[name] = scored
+    best = best_trials(simulator, plain, [effect for effect, _ in starts], lines)
     for effect, states in starts:
         if effect.name in best:
             states.append(state.with_effect(started(simulator.rows, best[effect.name])))

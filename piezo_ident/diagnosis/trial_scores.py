@@ -30,7 +30,7 @@ from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Scored', 'Tick', 'score_trials', 'started']
+__all__ = ['Scored', 'Tick', 'best_trials', 'score_trials', 'started']
 
 Array = NDArray[np.float64]
 
@@ -105,6 +105,19 @@ def score_trials(
         errors = held_out_errors(both, rows.fold, wide)
         chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
         yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
+
+
+def best_trials(
+    simulator: Simulator, fitted: Fitted, effects: Sequence[type[Effect]], lines: Sequence[float]
+) -> dict[str, Scored]:
+    """Return the best possible trial of every effect that has one, on the residual of a fit."""
+    best: dict[str, Scored] = {}
+    none = np.zeros((simulator.rows.n, 0))
+    for scored in score_trials(simulator, fitted, effects, lines, none):
+        name = scored.effect.name
+        if scored.is_possible and (name not in best or scored.error < best[name].error):
+            best[name] = scored
+    return best
 
 
 def _columns(simulator: Simulator, effect: type[Effect], trial: Trial) -> Array | None:

@@ -21,7 +21,7 @@ doi:10.1007/978-1-4612-4048-8.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import functools
 from math import comb
@@ -188,11 +188,17 @@ class HysteresisLaw:
         variance = np.sum(T * (covariance @ T), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def parts(self) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
-        """Give the H of each coefficient alone, and which thresholds it has; shape (m,)."""
+    def parts(
+        self, places: Sequence[int] | None = None
+    ) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
+        """
+        Give the H of each coefficient alone, and which thresholds it has; shape (m,).
+
+        Of those in some places, or of all.
+        """
         r, m = self.thresholds, self.thresholds.size
         n = (POWERS + 2) * m
-        for row in self._parameters:
+        for row in self._parameters if places is None else self._parameters[list(places)]:
             plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
             moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
             rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])
@@ -214,7 +220,7 @@ class HysteresisLaw:
         self,
         v: NDArray[np.float64],
         memory: ArrayLike | None = None,
-        places: Container[int] | None = None,
+        places: Sequence[int] | None = None,
     ) -> Iterator[NDArray[np.float64]]:
         """
         Give what H adds for each coefficient, one after the other.
@@ -226,7 +232,7 @@ class HysteresisLaw:
         memory : array_like, shape (m,), optional
             Play outputs before the first sample; those of a stage that last came down to zero
             when absent.
-        places : container of int, optional
+        places : sequence of int, optional
             Of the coefficients that are wanted; all when absent.
 
         Yields
@@ -234,9 +240,8 @@ class HysteresisLaw:
         ndarray, shape (n,)
         """
         start = None if memory is None else np.asarray(memory, dtype=np.float64)
-        for i, (part, moved) in enumerate(self.parts()):
-            if places is not None and i not in places:
-                continue
+        places = range(self.size) if places is None else places
+        for i, (part, moved) in zip(places, self.parts(places), strict=True):
             own = None if start is None else start[moved]
             # a single play runs faster by itself
             single = i < self.thresholds.size
