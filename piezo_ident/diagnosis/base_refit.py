@@ -18,16 +18,10 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
-from piezo_ident.diagnosis.joint_fit import (
-    BaseColumns,
-    fit_base,
-    fit_jointly,
-    Fitted,
-    offset_columns,
-)
+from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.rows import centred, Rows
+from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.diagnosis.verdict import Findings
@@ -99,7 +93,7 @@ def _selected(
     as_given = fit_jointly(
         simulator,
         replace(given, effects=found.fitted.state.effects, retuning=(0.0,) * len(RETUNING)),
-        _offsets(simulator.rows),
+        base_at(simulator, given),
         # whether it leaves little shows before the end
         enough=criteria.OF_LEAST * simulator.rows.square(criteria.SMALLEST_EFFECT),
         # more than plays leave says nothing
@@ -193,7 +187,7 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     """Return the effects, best first, that do half of what a refit does."""
     rows = simulator.rows
     e = centred(rows.x - simulator.run(given), rows.of_record)
-    base = _offsets(rows)
+    base = base_at(simulator, given)
     count = base.columns.shape[1]
     start = replace(
         refit,
@@ -210,8 +204,3 @@ def _instead(simulator: Simulator, given: State, refit: Fitted) -> list[str]:
     whole, least = float(e @ e), float(refit.errors.sum())
     found = [name for name, x in left.items() if whole - x > 0.5 * (whole - least)]
     return sorted(found, key=lambda name: left[name])
-
-
-def _offsets(rows: Rows) -> BaseColumns:
-    """Return the columns of an H that stays as it is: offsets alone."""
-    return BaseColumns.of(rows, offset_columns(rows))

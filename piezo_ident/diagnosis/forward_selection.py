@@ -52,8 +52,8 @@ class Selected:
     imitated : Round or None
         Effects that follow the path of the command alone, beside plays.
     linear : tuple of str
-        Changes of the dynamics, best first, that do half of what a retuned G does, where that does
-        the larger part and no effect fits its law.
+        What goes with the speed, best first, and does half of what a retuned G does, where that
+        does the larger part and no effect fits its law.
     """
 
     rounds: tuple[Round, ...]
@@ -206,12 +206,15 @@ class ForwardSelection:
         return self._from(base, linear, shown, bent if is_bent else None)
 
     def _instead(self, base: Fitted, retuned: Fitted, linear: Round | None) -> tuple[str, ...]:
-        """Return changes of the dynamics, best first, that do half of what a retuned G does."""
-        if linear is None:
-            effects = [e for e in self._candidates if e.in_dynamics and e.name not in self._have]
-            best = best_trials(self._simulator, base, effects, self._lines)
-        else:
-            best = linear.best
+        """Return what goes with the speed, best first, and does half of what a retuned G does."""
+        best = {} if linear is None else dict(linear.best)
+        effects = [
+            effect
+            for effect in self._candidates
+            if effect.name not in {*self._have, *best, *TESTED}
+            and not (effect.rate_independent or effect.time_driven or has_place(effect.name))
+        ]
+        best |= best_trials(self._simulator, base, effects, self._lines)
         left = {name: scored.error for name, scored in best.items()}
         most = 0.5 * float(base.errors.sum() + retuned.errors.sum())
         return tuple(sorted((name for name in left if left[name] < most), key=left.__getitem__))

@@ -153,12 +153,17 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
 
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
-    """Return the columns of a refit of H in a state, its effects and a retuned G included."""
+    """
+    Return the columns of a refit of H in a state, its effects and a retuned G included.
+
+    An H of no law stays as it is: offsets alone.
+    """
+    rows, offsets = simulator.rows, offset_columns(simulator.rows)
     if state.law is None:
-        raise ValueError('an H of no law has no columns')
+        return BaseColumns.of(rows, offsets)
     simulator.remember(state)
-    rows, columns = simulator.rows, simulator.columns(state, state.law, WEIGHT_STEP)
-    return BaseColumns.of(rows, np.concatenate([columns, offset_columns(rows).T]).T)
+    columns = simulator.columns(state, state.law, WEIGHT_STEP)
+    return BaseColumns.of(rows, np.concatenate([columns, offsets.T]).T)
 
 
 def fit_jointly(
