@@ -339,6 +339,11 @@ def lasting(row: Row) -> bool:
     return all(n in ADDED or row.left[n] >= row.misfit for n in counted(row))
 
 
+def is_lacked(row: Row) -> bool:
+    """Return whether the model errs by half the mean square of what counts: it holds the rest."""
+    return all(n in ADDED or row.before**2 >= 0.5 * row.truth[n] ** 2 for n in counted(row))
+
+
 def follows_path(row: Row) -> bool:
     """Return whether something that counts follows the path of the voltage: a wide H is one."""
     return any(find_effect(name).rate_independent for name in counted(row))
@@ -478,6 +483,14 @@ def summary(rows: Sequence[Row]) -> str:
         [
             '- where a refit of forty plays leaves the misfit at least: its name or class',
             some(is_found(r) for r in large if lasting(r)),
+        ],
+        [
+            '- where the model as identified errs by half its mean square at least',
+            some(is_found(r) for r in large if is_lacked(r)),
+        ],
+        [
+            '- where both hold',
+            some(is_found(r) for r in large if lasting(r) and is_lacked(r)),
         ],
         ['a smaller effect: a false name', some(false_names(r) for r in small)],
         ['a fault of the data that is none', some(false_faults(r) for r in sound)],
