@@ -5,6 +5,13 @@
 
 from __future__ import annotations
 
+from .collective_cores import (
+    frustrated_dipoles,
+    loaded_contacts,
+    moving_preisach,
+    rugged_walls,
+    turning_friction,
+)
 from .cores import bouc_wen, coleman_hodgdon, uneven
 from .more_cores import (
     dahl,
@@ -15,11 +22,11 @@ from .more_cores import (
     turning_curves,
 )
 from .unseen_cores import (
-    frustrated_dipoles,
-    loaded_contacts,
-    moving_preisach,
-    rugged_walls,
-    turning_friction,
+    back_stresses,
+    growing_domains,
+    phase_fractions,
+    rotating_grains,
+    tetragonal_grains,
 )
 
 __all__ = ['LAWS', 'SETS']
@@ -39,10 +46,14 @@ LAWS = {
     'turning-friction': turning_friction,
     'rugged-walls': rugged_walls,
     'frustrated-dipoles': frustrated_dipoles,
+    'back-stresses': back_stresses,
+    'growing-domains': growing_domains,
+    'phase-fractions': phase_fractions,
+    'rotating-grains': rotating_grains,
+    'tetragonal-grains': tetragonal_grains,
 }
 
-#: how often each is dealt; the laws of 'tuning' and 'known' may be looked at, those of 'final' are
-#: for judging alone
+#: how often each is dealt; the laws of 'final' are for judging alone, all others may be looked at
 SETS = {
     'tuning': ('preisach', 'preisach', 'bouc-wen', 'duhem'),
     'known': (
@@ -54,11 +65,18 @@ SETS = {
         'dahl',
         'turning-curves',
     ),
-    'final': (
+    'past': (
         'moving-preisach',
         'loaded-contacts',
         'turning-friction',
         'rugged-walls',
         'frustrated-dipoles',
+    ),
+    'final': (
+        'back-stresses',
+        'growing-domains',
+        'phase-fractions',
+        'rotating-grains',
+        'tetragonal-grains',
     ),
 }
