@@ -139,16 +139,16 @@ def with_refit(
         selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
     gain = float(np.mean(e * e)) - refit.mean_square
-    if (
-        # noise moved the weights when they were identified, too
-        rows.percent(gain - single) >= criteria.REFIT_FINDING
-        and gain >= refit.mean_square - noise
-        and refit_holds(rows, e, refit.transfer)
-    ):
+    # noise moved the weights when they were identified, too
+    is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
+    if is_large and gain >= refit.mean_square - noise:
+        unsettled = findings.unsettled(rows.percent(float(np.mean(e * e)) - noise))
+        if not refit_holds(rows, e, refit.transfer):
+            # other motion does not bear it out, and yet the given model errs
+            return unsettled
         if _is_gain(simulator, given, refit) and not selected.linear:
             # of another record a gain that wanders says nothing
-            names = ('gain_drift', *look_alikes('gain_drift')[:1])
-            return findings.unsettled(rows.percent(float(np.mean(e * e)) - noise)).hiding(names)
+            return unsettled.hiding(('gain_drift', *look_alikes('gain_drift')[:1]))
         findings = findings.refitted(rows.percent(refit.mean_square - noise))
     elif misfit < criteria.REFIT_FINDING and not selected.linear:
         return findings

@@ -21,19 +21,23 @@ import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.base_refit import effects_beside, refits, with_refit
-from piezo_ident.diagnosis.forward_selection import (
-    ForwardSelection,
-)
+from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.found_effects import found_effects
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.messages import left_over, part_searched, sentence, warnings_of
+from piezo_ident.diagnosis.messages import (
+    left_over,
+    part_judged,
+    part_searched,
+    sentence,
+    warnings_of,
+)
 from piezo_ident.diagnosis.refined_model import refine, Refined
 from piezo_ident.diagnosis.results import (
     Diagnosis,
     DiagnosisSettings,
     Residual,
 )
-from piezo_ident.diagnosis.rows import centred, make_rows, means, Rows
+from piezo_ident.diagnosis.rows import centred, make_rows, means
 from piezo_ident.diagnosis.simulator import Simulator, State
 from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import (
@@ -47,6 +51,7 @@ from piezo_ident.diagnosis.verdict import (
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Record, records_of
 from piezo_ident.residual import (
     all_stretches,
@@ -141,7 +146,11 @@ def diagnose(
         raise IdentificationError(
             f'{names}: a fit is singular ({error}); are all values of a plausible size?'
         ) from None
-    warnings = [warning for record in records for warning in model.extrapolation(record)]
+    warnings = [
+        warning
+        for record in records
+        for warning in (*suspicions(record), *model.extrapolation(record))
+    ]
     if not is_whole:
         warnings.append(part_searched(records, part))
     return replace(result, warnings=(*result.warnings, *warnings))
@@ -195,7 +204,7 @@ def _diagnosed(
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
     plays, wide = refits(simulator, given)
-    _check_related(rows, plays)
+    _check_related(simulator, given, plays)
     # 3. lines and noise of what it leaves
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = _noise(floor, faults.quantum, rows.m, abs(model.scaling.Y))
@@ -280,6 +289,7 @@ def _diagnosed(
         records=rows.names,
         blocks=int(rows.fold.size),
         warnings=(
+            *part_judged(rows),
             *warnings_of(model, refined, findings, floor, bent),
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
@@ -341,17 +351,26 @@ def _noise(floor: NoiseFloor, quantum: float, m: int, span: float) -> tuple[floa
     return square(floor.at(m) or 0.0, m), single
 
 
-def _check_related(rows: Rows, base: Fitted) -> None:
+def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
     """Refuse displacement that does not follow the voltage: no effect is missing, the stage is."""
+    rows = simulator.rows
     swing = max(float(np.ptp(run.u)) for run in rows.runs)
-    moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
     # where the voltage only trembles all else may well be larger
-    if swing > criteria.TREMBLES and base.mean_square > criteria.UNRELATED * moved:
+    if swing <= criteria.TREMBLES:
+        return
+    names = ', '.join(rows.names)
+    x, known = (centred(y, rows.of_record) for y in (rows.x, simulator.run(given)))
+    moved = float(np.mean(x**2))
+    if base.mean_square > criteria.UNRELATED * moved:
         raise IdentificationError(
-            f'{", ".join(rows.names)}: the displacement does not follow the voltage: a hysteresis '
-            'accounts for only '
-            f'{max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it was '
-            'not fitted to; is the sensor connected, and do both columns come from one stage?'
+            f'{names}: the displacement does not follow the voltage: a hysteresis accounts for '
+            f'only {max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it '
+            'was not fitted to; is the sensor connected, and do both columns come from one stage?'
+        )
+    if float(x @ known) < -criteria.REVERSED * np.linalg.norm(x) * np.linalg.norm(known):
+        raise IdentificationError(
+            f'{names}: the displacement runs against that of the model: is a sign reversed, or '
+            'does the record come from another stage?'
         )
 
 

@@ -11,13 +11,17 @@ import numpy as np
 from piezo_ident.diagnosis.criteria import TUNED
 from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Added
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
 
-__all__ = ['left_over', 'part_searched', 'sentence', 'warnings_of']
+__all__ = ['left_over', 'part_judged', 'part_searched', 'sentence', 'warnings_of']
+
+#: share of the data that needs no word about the rest
+NEARLY_ALL = 0.9
 
 
 def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
@@ -29,6 +33,10 @@ def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
         )
     if findings.left < smallest:
         return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
+    if findings.keeps_given:
+        return 'a refit of the hysteresis takes it here, which need not last or hold elsewhere'
+    if findings.verdict == 'none':
+        return 'no effect is claimed for what differs from one part of the data to another'
     if not findings.effects:
         return 'structure that no candidate of the catalogue accounts for'
     return 'structure that the effects added do not account for'
@@ -42,6 +50,19 @@ def part_searched(records: Sequence[Record], part: Sequence[Record]) -> str:
         f'{n:,} of {of:,} samples were searched and fitted, the first {seconds:.4g} s of '
         f'{whole:.4g} s (--most-samples)'
     )
+
+
+def part_judged(rows: Rows) -> list[str]:
+    """Return how much of the data was judged, where that is not nearly all."""
+    runs = zip(rows.runs, rows.keep, strict=True)
+    seconds = sum(rows.m * int(keep.sum()) / run.piece.sample_rate for run, keep in runs)
+    whole = sum(run.piece.n / run.piece.sample_rate for run in rows.runs)
+    if seconds >= NEARLY_ALL * whole:
+        return []
+    return [
+        f'{seconds:.3g} of {whole:.3g} s were judged: the rest follows from no known start, or '
+        'holds faults; let a record begin at rest at the lowest voltage'
+    ]
 
 
 def warnings_of(
@@ -143,13 +164,23 @@ def sentence(
             )
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'
-        if findings.keeps_given:
+        if findings.keeps_given and findings.group:
             why = ', most of it by a gain that is not that of its identification'
+        elif findings.keeps_given:
+            why = (
+                f': a refit of the hysteresis leaves {refit:.3g} % of these data, but does not '
+                'hold on motion held out'
+            )
         elif smallest is None:
             why = f', unexplained: {rest.description}'
         text = f'The model misses {rest.rms_percent:.2g} % of stroke{why}{tail}.'
     elif smallest is None:
         text = f'{rest.description}{tail}.'
+    elif rest.rms_percent >= smallest:
+        text = (
+            f'No effect shows: the {rest.rms_percent:.2g} % of stroke that are left differ from '
+        )
+        text += f'one part of the data to another{tail}.'
     else:
         text = 'No effect is missing that these data could show; the smallest would be '
         text += f'{smallest:.2g} % of stroke{tail}.'

@@ -75,7 +75,7 @@ class Findings:
     keeps_given: bool = False
 
     def unsettled(self, left: float) -> Findings:
-        """Return that what a refit of H would take need not last."""
+        """Return that what a refit of H would take need not last, or hold on other motion."""
         return replace(self, verdict='unexplained', left=left, keeps_given=True)
 
     def refitted(self, left: float) -> Findings:

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from diagnosis_examples import measured as example_record
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
-from piezo_ident.diagnosis import diagnose, DiagnosisSettings, search
+from piezo_ident.diagnosis import base_refit, diagnose, DiagnosisSettings, search
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
@@ -37,6 +37,7 @@ from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program, slow_model
 import pytest
@@ -252,6 +253,17 @@ def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
     assert max(unseen_errors(result, unseen)) < 0.1
 
 
+def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(truths, monkeypatch):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    bent = Record((replace(piece, y=piece.y * (1.05 - 0.05 * piece.y / piece.y.max())),), 'bent')
+    monkeypatch.setattr(base_refit, 'refit_holds', lambda *_: False)
+    result = diagnose(model, bent, FEW)
+    assert (result.verdict, result.effects, result.group) == ('unexplained', (), None)
+    assert 'does not hold on motion held out' in result.sentence
+    assert result.model is model and result.after.overall == result.before.overall > 0.2
+
+
 def test_another_gain_is_no_other_hysteresis(truths):
     model, record, _ = measured(None, 0.0, 2)
     (piece,) = record.pieces
@@ -404,6 +416,26 @@ def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
     unplugged = Record((replace(piece, y=noise),), 'unplugged')
     with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
         diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
+
+
+def test_displacement_that_runs_against_the_model_is_refused(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    turned = Record((replace(piece, y=-piece.y),), 'turned')
+    with pytest.raises(IdentificationError, match=r'turned: .* runs against .* a sign reversed'):
+        diagnose(model, turned, FEW)
+
+
+def test_columns_that_may_be_swapped_are_said(truths):
+    model, record, _ = measured(None, 0.0, 1)
+    (piece,) = record.pieces
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(piece.n)
+    y = 5e-6 * np.round(piece.v * 40.0) / 40.0
+    y[np.arange(piece.n) % 2000 < 1000] = 0.0
+    swapped = Record((replace(piece, v=piece.v + noise, y=piece.y.mean() + y),), 'swapped')
+    assert suspicions(swapped)
+    found = diagnose(model, swapped, FEW)
+    assert set(suspicions(swapped)) <= set(found.warnings)
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,13 @@
 
 """The rules of a verdict, on made-up errors of blocks: what is separated, and what is kept."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
-from piezo_ident.diagnosis.messages import sentence
+from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
 from piezo_ident.diagnosis.search import takes
@@ -66,6 +67,26 @@ def test_a_refit_that_is_not_kept_is_said():
     findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
     said = sentence(findings, errors, rest, 0.05, True)
     assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
+
+
+def test_what_scatters_beyond_the_limit_is_not_called_smaller():
+    errors = tuple(Errors(0.15, {}, {}) for _ in range(3))
+    findings = Findings('none', 0.0, (), None, 0.07)
+    rest = findings.unexplained(left_over(findings, 0.05, 9.0))
+    said = sentence(findings, errors, rest, 0.05, True)
+    assert '0.07 % of stroke that are left differ from one part' in said
+    assert 'no effect is claimed' in rest.description
+    small = replace(findings, left=0.03)
+    rest = small.unexplained(left_over(small, 0.05, 9.0))
+    assert 'the smallest would be 0.05 %' in sentence(small, errors, rest, 0.05, True)
+
+
+def test_how_much_was_judged_is_said():
+    run = SimpleNamespace(piece=SimpleNamespace(n=1000, sample_rate=100.0))
+    keep = np.arange(200) >= 120
+    (said,) = part_judged(SimpleNamespace(m=5, runs=(run,), keep=(keep,)))
+    assert said.startswith('4 of 10 s were judged')
+    assert part_judged(SimpleNamespace(m=5, runs=(run,), keep=(keep | True,))) == []
 
 
 def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
