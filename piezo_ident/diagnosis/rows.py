@@ -37,6 +37,8 @@ Integers = NDArray[np.int64]
 
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
+#: fewest rows that can be cut into blocks
+FEWEST = 500
 #: blocks altogether, about, and how many sets of them are held out in turn
 BLOCKS, FOLDS = 80, 5
 #: whole stretches of one kind that are held out in turn, at most
@@ -234,10 +236,11 @@ def make_rows(
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
     keep = tuple(np.all(known[: known.size // m * m].reshape(-1, m), axis=1) for known in use)
     kept = sum(int(k.sum()) for k in keep)
-    if kept < 500:
+    if kept < FEWEST:
         raise IdentificationError(
-            f'{", ".join(names)}: {samples} samples follow from a known start; give a longer '
-            'record that drives the stage over its range'
+            f'{", ".join(names)}: {samples} samples follow from a known start, and '
+            f'{FEWEST * m} are needed; give a longer record that begins at rest at the lowest '
+            'voltage, or drives the stage over its whole range'
         )
     longest = max(1, kept // BLOCKS)
     blocks: list[Integers] = []

@@ -227,9 +227,11 @@ def prepare(records: Sequence[Record]) -> Prepared:
         parts = bridged(record)
         gaps, filled = sum(p.gaps for p in parts), sum(p.filled for p in parts)
         if gaps:
+            lost = sum(p.filled / p.piece.sample_rate for p in parts)
             faults.append(
-                f'{record.name}: {gaps} short gaps ({filled} samples) were bridged by straight '
-                'lines; neither they nor the moment after each were fitted or judged'
+                f'{record.name}: gaps were bridged by straight lines, {gaps} with {filled} '
+                f'samples or {lost:.2g} s; neither they nor the moment after each were fitted or '
+                'judged'
             )
     faults += [said for record in records for said in suspicions(record)]
     return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
