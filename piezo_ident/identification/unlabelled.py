@@ -389,7 +389,7 @@ def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Exc
     # what G is worth counts where it is fast, what it costs where the record goes on
     if error(joint.G, delay) <= (1.0 + WORSE) * error(unit, Delay(0)) + joint.gain:
         return joint
-    reason = 'G errs more than the hysteresis alone on the part that chooses; add steps or noise'
+    reason = 'with dynamics the model errs more on data held out than without; add steps or noise'
     return replace(
         joint,
         G=unit,

@@ -69,9 +69,9 @@ def _of_fit(result: Identification) -> list[str]:
     delay, dynamics, fit = result.delay, result.dynamics, result.hysteresis
     warnings = []
     if delay.agree is False and delay.step is not None:
-        followed = {'steps': 'the steps were', 'scan': 'the loss was'}
+        followed = {'steps': 'the steps were', 'scan': 'the fit was'}
         warnings.append(
-            f'steps say a delay of {delay.step.samples} samples, the ARX loss says {delay.scan}; '
+            f'steps say a delay of {delay.step.samples} samples, the ARX fit says {delay.scan}; '
             f'{followed.get(delay.source, "a free run over the noise was")} followed'
         )
     measured, modelled = dynamics.slope_measured, dynamics.slope_model

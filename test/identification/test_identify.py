@@ -102,7 +102,7 @@ def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
     result = identify(short(noise=2e-5), QUICK)
     assert (result.delay.step.samples, result.delay.scan) == (7, 3)
     assert (result.delay.samples, result.delay.source) == (3, 'scan')
-    said = 'steps say a delay of 7 samples, the ARX loss says 3; the loss was followed'
+    said = 'steps say a delay of 7 samples, the ARX fit says 3; the fit was followed'
     assert said in result.warnings
     assert max(sine_errors(PAPER.model, result.model)) < 0.1
 
