@@ -92,10 +92,22 @@ def test_bars_are_the_errors_of_the_diagnosis():
     assert widths[::n] == [e.overall for e in (result.before, result.refit, result.after)]
 
 
-def test_a_held_out_end_is_marked(unlabelled):
-    runs = piece_runs(unlabelled.model, unlabelled.records, unlabelled.memories)
-    drawn = {p.name: p.figure for p in draw_identification(unlabelled, runs).pictures}
-    assert len(drawn['overview_1'].axes[1].patches) == 1
+def drawn_of(result):
+    runs = piece_runs(result.model, result.records, result.memories)
+    return {p.name: p for p in draw_identification(result, runs).pictures}
+
+
+def test_a_model_fitted_to_all_is_not_drawn_as_if_a_part_were_held_out(unlabelled, identified):
+    overview = drawn_of(unlabelled)['overview_1']
+    error = number(unlabelled.error('held out'))
+    assert f'held out before that was missed by {error} %' in overview.caption
+    assert f'held out before: {error} %' in overview.figure.axes[1].get_title('right')
+    assert not overview.figure.axes[1].patches
+    # the swarm is not run again, and three steps leave out what they hold out
+    swarm = replace(unlabelled, hysteresis=replace(unlabelled.hysteresis, solver='swarm'))
+    for result in (swarm, identified):
+        overview = drawn_of(result)['overview_1']
+        assert 'held out' not in overview.caption + overview.figure.axes[1].get_title('right')
 
 
 def test_without_a_refinement_nothing_is_drawn_as_refined():

@@ -133,8 +133,8 @@ def record_figure(record: Record) -> Figure:
     return fig
 
 
-def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
-    """Draw voltage, displacement and error of a piece, its end from a sample on as held out."""
+def overview_figure(run: PieceRun, remark: str = '') -> Figure:
+    """Draw voltage, displacement and error of a piece, with a remark on its model."""
     piece, t = run.piece, run.piece.t
     fig = style.figure(5.0)
     axes = fig.subplots(3, 1, sharex=True, gridspec_kw={'height_ratios': [1, 1.7, 1.4]})
@@ -142,13 +142,9 @@ def overview_figure(run: PieceRun, held_out_from: int | None = None) -> Figure:
     style.line(axes[1], t, 1e6 * piece.y, COLOURS['under'], 'measured', linewidth=3.0)
     style.line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
     unit, scale = _draw_error(axes[2], t, piece.y - run.y_hat, piece.y - run.y_static, 0.8)
-    if held_out_from is not None:
-        for each in axes:
-            label = 'held out' if each is axes[1] else None
-            first, colour = t[held_out_from], COLOURS['held out']
-            each.axvspan(first, t[-1], color=colour, zorder=0, label=label)
     tidy(axes[0], '', 'voltage / V')
     tidy(axes[1], '', 'displacement / µm')
+    style.note(axes[1], remark)
     tidy(axes[2], 'time / s', f'error / {unit}')
     _name_segments(axes[0], run)
     style.percent_axis(axes[2], scale * float(np.ptp(piece.y)))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from piezo_ident.identification.results import Identification
+from piezo_ident.identification.results import Identification, rms_percent
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.figures.delay_and_dynamics import (
@@ -24,6 +24,7 @@ from piezo_ident.report.figures.free_run import (
     sines_figure,
 )
 from piezo_ident.report.figures.style import draw_each, Drawn, Wanted
+from piezo_ident.report.table import number
 
 __all__ = ['draw_identification']
 
@@ -59,6 +60,7 @@ def draw_identification(
             'where it errs by less than 10 %, and G(z) z^-d of the model.'
         )
     response += ' Where the two part, G lacks something. Dotted: modes of G.'
+    refitted = _refitted(identification)
     wanted: list[Wanted] = [
         (
             'sines',
@@ -76,18 +78,33 @@ def draw_identification(
             'segments',
             'Segments',
             'Free run and its error; that of the hysteresis alone is drawn where both can be read '
-            'on one scale. Percentages are of the stroke of the whole record.',
+            'on one scale. Percentages are of the stroke of the whole record'
+            + (
+                '; those fitted and held out are of the model before H was fitted to all, the '
+                'curves of the final one.'
+                if refitted
+                else '.'
+            ),
             lambda: segments_figure(runs, errors),
         ),
     ]
     by_width = sorted(range(len(runs)), key=lambda i: -float(np.ptp(runs[i].piece.v)))
-    for number, i in enumerate(sorted(by_width[:OVERVIEWS]), 1):
+    for k, i in enumerate(sorted(by_width[:OVERVIEWS]), 1):
+        caption = 'Each column of a long trace shows its smallest and largest sample.'
+        remark = ''
+        if runs[i].record in refitted:
+            error = f'{number(refitted[runs[i].record])} %'
+            caption += (
+                ' In the end the weights of H were fitted to all of the record: the error drawn '
+                f'is no test. What was held out before that was missed by {error} of stroke.'
+            )
+            remark = f'H fitted to all of it; error of what was held out before: {error}'
         wanted.append(
             (
-                f'overview_{number}',
+                f'overview_{k}',
                 f'Whole record: {runs[i].record}',
-                'Each column of a long trace shows its smallest and largest sample.',
-                partial(overview_figure, runs[i], _held_out_from(identification, runs[i])),
+                caption,
+                partial(overview_figure, runs[i], remark),
             )
         )
     wanted += [
@@ -114,13 +131,18 @@ def draw_identification(
     return draw_each(wanted, tick)
 
 
-def _held_out_from(identification: Identification, run: PieceRun) -> int | None:
-    """Return the first held-out sample of a piece whose end was held out, None otherwise."""
-    if identification.dynamics.table is not None:
-        return None
-    rows = [row for row in identification.errors if row.record == run.record]
-    fitted = sum(row.n for row in rows if row.data in ('fitted', 'selection'))
-    # of several pieces only one is fitted, and the rows do not name it
-    if fitted == 0 or sum(row.n for row in rows) != run.piece.n:
-        return None
-    return fitted if fitted < run.piece.n else None
+def _refitted(identification: Identification) -> dict[str, float]:
+    """Return the error that was held out of each record to all of which H was fitted then."""
+    # with segments there is a table of orders; what the swarm found is not fitted again
+    if (
+        identification.dynamics.table is not None
+        or identification.hysteresis.solver != 'least_squares'
+    ):
+        return {}
+    rows = identification.errors
+    names = dict.fromkeys(row.record for row in rows if row.data == 'fitted')
+    held = {
+        name: [row for row in rows if row.record == name and row.data == 'held out' and row.driven]
+        for name in names
+    }
+    return {name: rms_percent(rows) for name, rows in held.items() if rows}
