@@ -110,6 +110,27 @@ def test_a_model_fitted_to_all_is_not_drawn_as_if_a_part_were_held_out(unlabelle
         assert 'held out' not in overview.caption + overview.figure.axes[1].get_title('right')
 
 
+def test_what_decides_about_the_delay_is_said(identified):
+    def delay(**changes):
+        return drawn_of(replace(identified, delay=replace(identified.delay, **changes)))['delay']
+
+    step = identified.delay.step
+    k = int(np.flatnonzero(step.lag == 1)[0])
+    response = step.response.copy()
+    response[k] = -np.sign(response[-1]) * 3.0 * step.threshold
+    found = delay(step=replace(step, response=response))
+    assert 'together with the next one' in found.caption
+    assert 'free run' not in found.caption
+    # above the threshold, but no beginning of the response
+    assert 1.0 in lines_of(found.figure)['other direction'][:, 0]
+    assert 'noise threshold' in found.figure.axes[0].get_legend_handles_labels()[1]
+    scan = identified.delay.samples + 4
+    assert 'differ: a free run decided' in delay(scan=scan).caption
+    other = delay(samples=identified.delay.samples + 2)
+    assert 'A free run decided for another delay' in other.caption
+    assert f'steps: {step.samples}' in lines_of(other.figure)
+
+
 def test_without_a_refinement_nothing_is_drawn_as_refined():
     (given,), (refined,) = example('unexplained').residuals, example('named').residuals
     assert len(residual_figure(given).axes) == 2

@@ -92,12 +92,21 @@ def _draw_step(
     level = 1e9 * step.threshold
     floor = 0.02 * level
     lag, y = step.lag[near], np.maximum(1e9 * np.abs(step.response[near]), floor)
-    axes.axhspan(floor, level, color=COLOURS['band'], zorder=1, linewidth=0)
-    axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2)
+    band: dict[str, Any] = {'color': COLOURS['band'], 'zorder': 1, 'linewidth': 0}
+    axes.axhspan(floor, level, label='noise threshold', **band)
+    axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2, label=f'used: {d}')
+    if step.samples not in (None, d):
+        dashed: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
+        axes.axvline(step.samples, label=f'steps: {step.samples}', **dashed)
     if modelled is not None:
         y_hat = np.maximum(1e9 * np.abs(modelled[near]), floor)
         axes.plot(lag, y_hat, color=COLOURS['model'], linewidth=1.2, label='model')
-    axes.plot(lag, y, 'o', color=COLOURS['measured'], markersize=2.8, label='measured')
+    # what moves the other way first is no beginning of the response
+    back = step.response[near] * step.response[step.lag >= 0].sum() < 0.0
+    dots: dict[str, Any] = {'color': COLOURS['measured'], 'markersize': 2.8}
+    axes.plot(lag[~back], y[~back], 'o', label='measured', **dots)
+    if back.any():
+        axes.plot(lag[back], y[back], 'o', fillstyle='none', label='other direction', **dots)
     axes.margins(x=0.03)
     axes.set_yscale('log')
     top = float(y.max(initial=0.0))
@@ -108,10 +117,7 @@ def _draw_step(
     title = f'{steps}; d = {_time(d / rate)}'
     tidy(axes, 'samples after the step', '|response| / nm V$^{-1}$', title)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    at: dict[str, Any] = {'xycoords': ('axes fraction', 'data'), 'textcoords': 'offset points'}
-    at |= {'xytext': (-2, -3), 'ha': 'right', 'va': 'top', 'fontsize': style.SMALL}
-    axes.annotate('noise threshold', (1.0, level), **at)
-    style.legend(axes, loc='center right')
+    style.legend(axes, loc='lower right', handlelength=1.2)
 
 
 def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: int) -> None:
@@ -186,8 +192,8 @@ def response_figure(identification: Identification) -> Figure:
     axes[1].set_xscale('log')
     style.plain_log(axes[1].xaxis, low, top)
     axes[1].set_xlim(0.95 * low, 1.05 * top)
-    style.legend(axes[0], loc='lower left')
     _name_modes(axes, identification, low, top)
+    style.legend(axes[0], loc='lower left')
     fig.align_ylabels(axes)
     return fig
 
@@ -209,6 +215,8 @@ def _name_modes(
                 each.axvline(
                     mode.frequency, color=COLOURS['mark'], linewidth=0.8, linestyle=':', zorder=1
                 )
+            # one name for all
+            axes[0].lines[-1].set_label('_' if named else 'modes of G')
             text = f'{mode.frequency:.0f} Hz'
             style.name_above(axes[0], text, mode.frequency, 0.0, color=COLOURS['mark'])
             named.append(place)

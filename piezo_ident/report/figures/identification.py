@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from piezo_ident.identification.results import Identification, rms_percent
+from piezo_ident.identification.results import DelayResult, Identification, rms_percent
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.figures.delay_and_dynamics import (
@@ -59,7 +59,7 @@ def draw_identification(
             'Measured on all fast motion (Welch) from the voltage behind H to the displacement, '
             'where it errs by less than 10 %, and G(z) z^-d of the model.'
         )
-    response += ' Where the two part, G lacks something. Dotted: modes of G.'
+    response += ' Where the two part, G lacks something.'
     refitted = _refitted(identification)
     wanted: list[Wanted] = [
         (
@@ -111,8 +111,7 @@ def draw_identification(
         (
             'delay',
             'Delay',
-            'The delay is the first sample at which the averaged response leaves its noise. Also: '
-            'the loss of least squares at each delay.',
+            _of_delay(identification.delay),
             lambda: delay_figure(identification, runs),
         ),
         (
@@ -146,3 +145,22 @@ def _refitted(identification: Identification) -> dict[str, float]:
         for name in names
     }
     return {name: rms_percent(rows) for name, rows in held.items() if rows}
+
+
+def _of_delay(delay: DelayResult) -> str:
+    """Return what decides about the delay, for the pictures that are drawn."""
+    parts = []
+    step = delay.step
+    if step is not None and step.repeats:
+        parts.append(
+            'Steps tell the first sample that exceeds the noise threshold together with the next '
+            'one, both in the direction in which the averaged response goes on.'
+        )
+    if delay.loss is not None:
+        parts.append('The loss of least squares, where it tells, rises behind the delay.')
+    told = {step.samples if step is not None else None, delay.scan} - {None}
+    if delay.samples in told and delay.agree is False:
+        parts.append('The two differ: a free run decided which is used.')
+    elif told and delay.samples not in told:
+        parts.append('A free run decided for another delay, which is used.')
+    return ' '.join(parts)
