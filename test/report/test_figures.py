@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from itertools import combinations, pairwise
+import re
 
 from diagnosis_examples import example, HOSTILE
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -129,6 +130,41 @@ def test_what_decides_about_the_delay_is_said(identified):
     other = delay(samples=identified.delay.samples + 2)
     assert 'A free run decided for another delay' in other.caption
     assert f'steps: {step.samples}' in lines_of(other.figure)
+
+
+def test_a_signature_tells_how_much_flatter_it_became():
+    figure = {p.name: p.figure for p in draw_diagnosis(example('named')).pictures}['signature']
+    sizes = re.findall(
+        r'rms of the curves: (\S+) → (\S+) [µnp]m', figure.axes[0].get_title('right')
+    )
+    ((before, after),) = sizes
+    assert float(after) < float(before)
+
+
+def test_captions_of_a_diagnosis_name_only_what_is_drawn():
+    result = example('named')
+    bare = tuple(replace(r, piece=replace(r.piece, segments=())) for r in result.residuals)
+    for each, shaded in ((result, True), (replace(result, residuals=bare), False)):
+        pictures = {p.name: p for p in draw_diagnosis(each).pictures}
+        residual, spectrum = pictures['residual_1'], pictures['spectrum']
+        assert bool(residual.figure.axes[0].patches) is shaded
+        assert ('shaded' in residual.caption) is shaded
+        assert 'lines' not in lines_of(spectrum.figure)
+        assert 'lines' not in spectrum.caption
+    (r,) = result.residuals
+    hum = r.after + 50e-9 * np.sin(2.0 * np.pi * 50.0 * r.piece.t)
+    figure = residual_spectrum_figure(analyse([ResidualPart(r.record, r.piece, hum, r.sound)]))
+    assert 'lines' in lines_of(figure)
+
+
+def test_every_cut_of_a_residual_is_said():
+    (residual,) = example('named').residuals
+    after = residual.after.copy()
+    k = int(np.flatnonzero(residual.sound)[100])
+    after[k] = 20.0 * np.abs(after).max()
+    titles = [a.get_title('right') for a in residual_figure(replace(residual, after=after)).axes]
+    largest = f'largest {1e9 * after[k]:.3g} nm'
+    assert any('times enlarged' in text and largest in text for text in titles), titles
 
 
 def test_without_a_refinement_nothing_is_drawn_as_refined():

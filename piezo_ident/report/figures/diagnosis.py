@@ -21,6 +21,7 @@ from piezo_ident.report.figures.residual import (
     residual_figure,
     residual_spectrum_figure,
     STATES,
+    UNSHADED,
 )
 from piezo_ident.report.figures.style import NothingToDraw, tidy
 from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
@@ -50,12 +51,14 @@ def draw_diagnosis(
         ),
     ]
     for i, residual in enumerate(worst_pieces(diagnosis), 1):
+        shaded = any(s.kind not in UNSHADED for s in residual.piece.segments)
         wanted.append(
             (
                 f'residual_{i}',
                 f'Residual: {residual.record}',
-                'Measured minus predicted, free run, both on one scale; segments are shaded in '
-                'turn. Each column of a long trace shows its smallest and largest sample.',
+                'Measured minus predicted, free run, on one scale where nothing else is said'
+                + ('; segments are shaded in turn.' if shaded else '.')
+                + ' Each column of a long trace shows its smallest and largest sample.',
                 partial(residual_figure, residual),
             )
         )
@@ -67,13 +70,13 @@ def draw_diagnosis(
             'What the residual depends on',
             f'{what} Mean over the voltage, its rate, and the time since a step '
             '(there multiplied by the size of the step), with two standard '
-            'deviations; the share of variance is held out. What is left should be flat.',
+            'deviations. What is left should be flat.',
             lambda: residual_dependence_figure(*analyses()),
         ),
         (
             'spectrum',
             'Spectrum of the residual',
-            f'{what} Amplitude spectral density of the longest stretch; green: lines.',
+            f'{what} Amplitude spectral density of the longest stretch.',
             lambda: residual_spectrum_figure(*analyses()),
         ),
         (

@@ -21,6 +21,7 @@ from scipy import signal
 
 __all__ = [
     'STATES',
+    'UNSHADED',
     'differ',
     'residual_coherence_figure',
     'residual_dependence_figure',
@@ -36,7 +37,8 @@ STATES = (
 )
 #: names of segments that have room above a picture
 NAMES = 24
-#: two segments side by side
+#: kinds of segments that are not shaded, and the shades of two side by side
+UNSHADED = ('idle', 'ramp')
 TINTS = ('#E9EEF3', '#F4F0E6')
 #: so many times smaller, the rest is drawn once more on a scale of its own
 ENLARGED = 4.0
@@ -71,7 +73,7 @@ def residual_figure(residual: Residual) -> Figure:
         raise NothingToDraw(f'{residual.record}: no sample counts')
     piece, stroke = residual.piece, float(np.ptp(residual.piece.y))
     e = {name: getattr(residual, name)[residual.sound] for name, _, _ in STATES}
-    limit, largest = style.axis_limit(np.concatenate(list(e.values())))
+    limit, _ = style.axis_limit(np.concatenate(list(e.values())))
     rows: list[tuple[tuple[str, ...], float, str]] = [(('given', 'before'), limit, '')]
     last = 'before'
     if differ([residual]):
@@ -89,6 +91,8 @@ def residual_figure(residual: Residual) -> Figure:
     _shade(list(axes), piece)
     for ax, (names, end, remark) in zip(axes[1:], rows, strict=True):
         unit, scale = style.length_unit(end)
+        largest = max(float(np.abs(e[name]).max()) for name in names)
+        cut = f'axis cut; largest {scale * largest:.3g} {unit}' if largest > end else ''
         for name, label, colour in STATES:
             if name in names:
                 _trace(ax, residual, name, scale, colour, label)
@@ -96,9 +100,7 @@ def residual_figure(residual: Residual) -> Figure:
         tidy(ax, 'time / s' if ax is axes[-1] else '', f'residual / {unit}')
         style.percent_axis(ax, scale * stroke)
         style.legend_above(ax)
-        style.note(ax, remark)
-    if largest > limit:
-        style.note(axes[1], f'axis cut; largest {1e6 * largest:.3g} µm')
+        style.note(ax, '; '.join(filter(None, (remark, cut))))
     axes[0].margins(x=0.005)
     fig.align_ylabels(list(axes))
     return fig
@@ -117,7 +119,7 @@ def _trace(
 
 def _shade(axes: Sequence[Axes], piece: Piece) -> None:
     """Shade the segments that drive the stage, and name the longest that have room for it."""
-    driven = [s for s in piece.segments if s.kind not in ('idle', 'ramp')]
+    driven = [s for s in piece.segments if s.kind not in UNSHADED]
     for i, s in enumerate(driven):
         first, last = piece.t[s.start], piece.t[s.stop - 1] + piece.dt
         for each in axes:
@@ -186,6 +188,8 @@ def residual_spectrum_figure(
     for each in before.lines:
         for order, found in [(1, each), *each.harmonics]:
             _mark_line(axes, found.frequency, found.amplitude, order)
+    if before.lines:
+        axes.plot([], [], color=style.GREEN, linewidth=0.8, linestyle=':', label='lines')
     tidy(axes, 'frequency / Hz', 'residual / nm Hz$^{-1/2}$')
     axes.set_xlim(first, last)
     # room for the names of the lines
@@ -224,16 +228,17 @@ def residual_dependence_figure(
     rows = -(-len(names) // 2)
     fig = style.figure(2.7 * rows)
     grid = fig.subplots(rows, min(2, len(names)), squeeze=False)
-    sizes = [np.abs(c.mean).max(initial=0.0) for name in names for c in _curves(before, name)]
-    unit, scale = style.length_unit(float(max(sizes)))
+    means = [np.abs(c.mean).max(initial=0.0) for name in names for c in _curves(before, name)]
+    unit, scale = style.length_unit(float(max(means)))
     for axes, name in zip(grid.ravel(), names, strict=False):
-        shares = []
+        sizes = []
         for analysis, colour, label in _both(before, after):
             curves = _curves(analysis, name)
             for curve in curves:
                 _draw_curve(axes, curve, scale, colour, label if after is not None else '')
             if curves:
-                shares.append(f'{100.0 * curves[0].share:.0f} %')
+                mean = np.concatenate([curve.mean for curve in curves])
+                sizes.append(f'{scale * float(np.sqrt(np.mean(mean**2))):.2g}')
         axes.axhline(0.0, color=style.ZERO, linewidth=0.6, zorder=1)
         tidy(axes, AXES[name], f'mean residual / {unit}')
         if name.startswith('time'):
@@ -242,9 +247,8 @@ def residual_dependence_figure(
             style.plain_log(axes.xaxis, low, high, 1.7)
         elif name == 'dv/dt':
             _signed_log(axes, _curves(before, name))
-        # means over lg t, in which a decade counts as much as any other
-        what = 'the means' if name == 'time since the step' else 'the variance'
-        style.note(axes, f'explains {" → ".join(shares)} of {what}')
+        # a share would be one of another residual before and after
+        style.note(axes, f'rms of the curves: {" → ".join(sizes)} {unit}')
     free = grid.ravel()[len(names) :]
     for axes in free:
         axes.set_axis_off()
