@@ -141,6 +141,7 @@ cli = Verbs(
             {'Stage and program': options.SIMULATE, 'Output': options.OUTPUT},
             'simulate record.npz',
             'simulate --config paper --program validation --seed 2 validation.csv',
+            'simulate --sample-rate 2000 --limits 0 100 --voltage-only excitation.csv',
         ),
         Verb(
             'identify',

@@ -225,6 +225,12 @@ SIMULATE = [
     ),
     _option('--seed', _whole, 'N', "Of the sensor noise (default: the stage's own)."),
     _option('--sample-rate', float, 'HZ', "Sampling rate (default: the stage's own)."),
+    _option(
+        *('--limits', float, 'LO HI', "Scale the program to these [V] (default: the program's)."),
+        nargs=2,
+        callback=_limits,
+    ),
+    _flag('--voltage-only', 'Write the columns t and v, which drive a real stage.'),
 ]
 
 #: fields of `Settings`

@@ -14,11 +14,14 @@ from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_s
 from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import temporary_output
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program
+from piezo_ident.excitation.scaled import scaled
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
+from piezo_ident.record.record import Piece, Record
 
 __all__ = ['convert_command', 'simulate_command']
 
@@ -26,7 +29,7 @@ __all__ = ['convert_command', 'simulate_command']
 def simulate_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident simulate``."""
     out: Path = args.out
-    _check_record_output(args)
+    _check_record_output(args, voltage_only=args.voltage_only)
     files = {}
     for kind, name in (('stage', args.config), ('program', args.program)):
         check_link(Path(name))
@@ -36,32 +39,46 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     stage, program = load_stage(files['stage']), Program.load(files['program'])
     rate = stage.sample_rate if args.sample_rate is None else args.sample_rate
     is_static = isinstance(stage, SimulatedStage) and stage.model.is_static
-    if not is_static and rate != stage.sample_rate:
+    if not (is_static or args.voltage_only) and rate != stage.sample_rate:
         raise ConfigError(
             f'{files["stage"]}: the stage holds for {stage.sample_rate:g} Hz, not for '
             f'{rate:g} Hz; leave out --sample-rate'
         )
     seed = stage.seed if args.seed is None else args.seed
+    if args.limits is not None:
+        program = scaled(program, args.limits, rate)
     sequence, *others = build_axes(program, len(stage.axes), rate)
     rng = np.random.default_rng(seed)
-    if isinstance(stage, SimulatedStage):
+    if args.voltage_only:
+        channels = {f'v_{axis}': q.v for axis, q in zip(stage.axes[1:], others, strict=True)}
+        unknown = np.full(sequence.n, np.nan)
+        piece = Piece(sequence.v, unknown, rate, segments=sequence.segments, channels=channels)
+        record = Record((piece,), out.name)
+    elif isinstance(stage, SimulatedStage):
         record = stage.play(sequence, rng, name=out.name)
     else:
         record = stage.play((sequence, *others), rng, name=out.name)
     data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
     is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
+    losses: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     with deferred_interrupts():
-        losses = record_io.write(
-            record,
-            out,
-            overwrite=args.overwrite,
-            storage=args.storage,
-            custom_data=data if is_bag else None,
-        )
-    console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, seed {seed}')
+        if args.voltage_only:
+            _write_voltage(piece, out)
+        else:
+            losses = record_io.write(
+                record,
+                out,
+                overwrite=args.overwrite,
+                storage=args.storage,
+                custom_data=data if is_bag else None,
+            )
+    content = 'the voltage alone' if args.voltage_only else f'seed {seed}'
+    console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, {content}')
     console.say(sequence.describe())
     print_faults(record, losses, console)
-    warnings = stage.model.extrapolation(record) if isinstance(stage, SimulatedStage) else ()
+    if isinstance(stage, SimulatedStage) and not args.voltage_only:
+        warnings = stage.model.extrapolation(record)
     for warning in warnings:
         console.say(f'warning: {warning}')
     console.result(
@@ -85,6 +102,16 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
     console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
-def _check_record_output(args: SimpleNamespace) -> None:
-    check_suffix(args.out, (*record_io.WRITERS, *BAG_FILES, ''), 'a record')
+def _write_voltage(piece: Piece, path: Path) -> None:
+    # no segments: they are those of the command, and the file is no record
+    columns = {'t': piece.t, 'v': piece.v, **piece.channels}
+    with temporary_output(path, overwrite=True) as target, target.open('xb') as file:
+        record_io.WRITERS[path.suffix.lower()](file, lambda: iter([columns]), (), ())
+
+
+def _check_record_output(args: SimpleNamespace, *, voltage_only: bool = False) -> None:
+    suffixes = tuple(record_io.WRITERS)
+    if voltage_only:
+        check_suffix(args.out, suffixes, 'a voltage')
+    check_suffix(args.out, (*suffixes, *BAG_FILES, ''), 'a record')
     check_file(args.out, overwrite=args.overwrite, folder_too=True)

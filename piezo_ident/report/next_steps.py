@@ -13,6 +13,7 @@ import shlex
 from piezo_ident.diagnosis.next_experiment import next_experiment
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report.refined import changes
 from piezo_ident.report.table import listed, number
@@ -88,7 +89,8 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
     times = math.inf if not floor else errors.percent / floor
     missing = [what for what, _ in result.not_identified]
     if missing:
-        yield _experiment(f'{listed(missing)}: not identified', 'identification', prompt)
+        reason = f'{listed(missing)}: not identified'
+        yield _experiment(reason, 'identification', result.model, prompt)
     if result.settings.thresholds is not None and times > ENOUGH:
         others = {row.record for row in result.errors if row.data == 'validation'}
         names = [record.name for record in result.records if record.name not in others]
@@ -100,7 +102,8 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
             ),
         )
     if not is_validated:
-        yield _experiment('no motion but that of these records was tested', 'validation', prompt)
+        reason = 'no motion but that of these records was tested'
+        yield _experiment(reason, 'validation', result.model, prompt)
     if is_validated and times <= ENOUGH:
         yield _use(f'the error is {number(times, 2)} times the sensor noise', prompt, prompt.model)
         return
@@ -121,7 +124,8 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
     if result.verdict != 'none' or result.untestable:
         experiment = next_experiment(result, records)
     if experiment is not None:
-        yield _experiment(experiment.reason, PROGRAMS[experiment.kind], prompt)
+        program = PROGRAMS[experiment.kind]
+        yield _experiment(experiment.reason, program, result.given, prompt)
         yield Step(
             'diagnose again, with that record',
             prompt.command('diagnose', prompt.given, *prompt.files(result.records), OTHER),
@@ -135,11 +139,20 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
         )
 
 
-def _experiment(reason: str, program: str, prompt: Prompt) -> Step:
+def _experiment(reason: str, program: str, model: StageModel, prompt: Prompt) -> Step:
+    low, high = model.scaling.range
+    # noise at the ends of a measured voltage would ask an amplifier for what it does not give;
+    # what is rounded is less than what counts as extrapolation
+    digits = -math.floor(math.log10(1.5e-3 * (high - low)))
+    ends = [f'{round(end, digits) + 0.0:.12g}' for end in (low, high)]
     return Step(
         f'{reason}; drive the stage with the voltage (columns t and v) that this command makes, '
         'and record it',
-        prompt.command('simulate', '--program', program, 'excitation.csv', reads=False),
+        prompt.command(
+            *('simulate', '--program', program, '--sample-rate', f'{model.sample_rate:.12g}'),
+            *('--limits', *ends, '--voltage-only', 'excitation.csv'),
+            reads=False,
+        ),
     )
 
 

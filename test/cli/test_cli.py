@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import pty
+import shlex
 import signal
 import subprocess
 import sys
@@ -101,6 +102,32 @@ def test_simulate_json(capsys, tmp_path, made):
     assert data['seed'] == 7
     assert data['samples'] == pi.read(tmp_path / 'r.npz').n
     assert {'noise', 'triangle', 'step'} <= set(data['labels'])
+
+
+def test_the_voltage_that_is_asked_for_next_fits_the_model(capsys, tmp_path, made, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = load(made / 'model.yaml')
+    model = replace(model, scaling=replace(model.scaling, V=100.0, range=(-10.0, 90.0)))
+    model.save('wide.yaml')
+    files = ['--config', 'wide.yaml', '--program', made / 'program.yaml', '--limits', -10, 90]
+    succeed(capsys, 'simulate', *files, 'record.npz')
+    text = succeed(capsys, 'identify', 'record.npz', *FAST, '--model', 'model.yaml')
+    (line,) = (x for x in text.splitlines() if 'excitation.csv' in x)
+    succeed(capsys, *shlex.split(line)[1:])
+    table = np.genfromtxt('excitation.csv', delimiter=',', names=True)
+    assert table.dtype.names == ('t', 'v')
+    assert (table['v'].min(), table['v'].max()) == pytest.approx((-10.0, 90.0), abs=0.1)
+    # neither another rate nor a voltage outside the range
+    assert 'warning' not in succeed(capsys, 'predict', 'model.yaml', 'excitation.csv')
+
+
+def test_voltages_of_several_axes_go_into_one_file(capsys, tmp_path):
+    out = tmp_path / 'both.npz'
+    argv = ['simulate', '--config', 'two_axes', '--program', 'two_axes', '--voltage-only', out]
+    data = json.loads(succeed(capsys, *argv, '--json'))
+    table = np.load(out)
+    assert table.files == ['t', 'v', 'v_b']
+    assert table['v_b'].size == data['samples']
 
 
 def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made):

@@ -73,6 +73,8 @@ COMMANDS = (
     ('identify T/slow.csv --voltage-limits 0 8', 'slow.csv', 'check the limits'),
     ('identify T/slow.csv --voltage-limits 8 0', '--voltage-limits'),
     ('simulate --sample-rate 1000 T/r.csv', 'stage_paper.yaml', 'leave out --sample-rate'),
+    ('simulate --limits 9 0 T/r.csv', '--limits', 'the lower one first'),
+    ('simulate --voltage-only T/bag', 'T/bag', '.csv'),
     # options of bags, for tables
     ('identify R --namespace other', 'is for bags', 'record.npz'),
     ('predict M R --voltage-topic v', 'is for bags', 'record.npz'),

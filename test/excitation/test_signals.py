@@ -14,6 +14,7 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as ex
 from piezo_ident.excitation.catalogue import SIGNALS
 from piezo_ident.excitation.program import parse_program, Program
+from piezo_ident.excitation.scaled import scaled
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import KINDS
 import pytest
@@ -325,6 +326,26 @@ def test_limits_of_the_caller_only_narrow():
         p.build(1000, limits=(1, 9))
     # a signal that follows the range follows the narrower one
     assert program({'signal': 'triangle'}).build(1000, limits=(0, 6)).v.max() == 6.0
+
+
+@pytest.mark.parametrize('name', CONFIG)
+def test_a_scaled_program_is_the_same_motion_over_another_range(name):
+    one = config(name).build(FS)
+    other = scaled(config(name), (-20.0, 120.0), FS).build()
+    assert [s.n for s in other.segments] == [s.n for s in one.segments]
+    # a level may be in a label
+    assert [s.kind for s in other.segments] == [s.kind for s in one.segments]
+    assert_allclose(other.v, -20.0 + 14.0 * one.v, atol=1e-6)
+    # what a slow rate cannot carry is left out
+    slow = scaled(config(name), (0.0, 100.0), 500.0).build()
+    assert slow.duration == pytest.approx(one.duration, rel=0.1)
+    assert (slow.v.min(), slow.v.max()) == pytest.approx((0.0, 10.0 * one.v.max()), rel=0.02)
+
+
+def test_a_signal_with_voltages_of_its_own_is_not_scaled():
+    p = program({'signal': 'triangle', 'preset': 'paper'})
+    with pytest.raises(ConfigError, match='paper cannot be scaled'):
+        scaled(p, (0.0, 100.0), FS)
 
 
 HEAD = 'limits: [0, 10]\nsegments: [{signal: idle, duration: 1}]\n'

@@ -30,12 +30,26 @@ def commands(result, prompt=NAMED):
 def test_a_motion_that_was_not_fitted_comes_first(identified, unlabelled):
     result = replace(identified, errors=[e for e in identified.errors if e.data != 'validation'])
     *_, excitation, diagnose = commands(result)
-    assert excitation == 'piezo_ident simulate --program validation excitation.csv'
+    # what drives this stage: at the rate of its model, over all of its range, and no answer
+    drive = '--sample-rate 20000 --limits 0 10 --voltage-only excitation.csv'
+    assert excitation == f'piezo_ident simulate --program validation {drive}'
     assert diagnose.startswith('piezo_ident diagnose new.yaml other.csv --model refined.yaml')
     # as the records were read
     assert diagnose.endswith('--voltage-limits 0 9')
     missing = replace(unlabelled, not_identified=(('delay', 'no steps'),))
-    assert commands(missing)[0] == 'piezo_ident simulate --program identification excitation.csv'
+    assert commands(missing)[0] == f'piezo_ident simulate --program identification {drive}'
+
+
+@pytest.mark.parametrize(
+    ('measured', 'asked'),
+    [((-0.0021, 99.987), '0 100'), ((-20.013, 120.02), '-20 120'), ((0.0, 0.4996), '0 0.4996')],
+)
+def test_noise_at_the_ends_of_the_range_is_not_asked_for(identified, measured, asked):
+    scaling = replace(identified.model.scaling, range=measured)
+    model = replace(identified.model, sample_rate=2000.0, scaling=scaling)
+    errors = [e for e in identified.errors if e.data != 'validation']
+    *_, line, _ = commands(replace(identified, model=model, errors=errors))
+    assert f'--sample-rate 2000 --limits {asked} --voltage-only' in line
 
 
 def test_the_error_on_validation_decides(identified):

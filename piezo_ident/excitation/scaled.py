@@ -1,0 +1,76 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A program for a stage of another voltage range and another sampling rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.excitation.catalogue import Option, SIGNALS
+from piezo_ident.excitation.program import Program
+
+__all__ = ['scaled']
+
+#: highest frequency over the sampling rate; noise ends at 1.2 times its cutoff
+HIGHEST = 0.4
+
+
+def scaled(program: Program, limits: tuple[float, float], sample_rate: float) -> Program:
+    """
+    Return a program between other limits, as long as before.
+
+    Parameters
+    ----------
+    program : Program
+    limits : tuple of float
+        Lowest and highest voltage [V]; levels are shifted and scaled, sizes and speeds scaled.
+    sample_rate : float
+        [Hz]; frequencies above 0.4 times it are lowered to that.
+
+    Raises
+    ------
+    ConfigError
+        When a signal has voltages of its own.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> v = scaled(pi.Program.load('validation'), (-20, 120), 2000).build().v
+    >>> float(v.min()), float(v.max())
+    (-20.0, 120.0)
+    """
+    (low, high), lowest = limits, program.limits[0]
+    factor = (high - low) / (program.limits[1] - lowest)
+
+    def fit(option: Option, x: Any) -> Any:
+        if isinstance(x, list):
+            return [fit(option, each) for each in x]
+        if x is None or option.unit not in ('V', 'V/s', 'Hz'):
+            return x
+        if option.unit == 'Hz':
+            return min(x, HIGHEST * sample_rate)
+        # a size has no zero that could be shifted
+        return factor * x if option.positive else low + factor * (x - lowest)
+
+    entries = []
+    for entry in program.entries:
+        if entry.options.get('preset') == 'paper':
+            raise ConfigError(
+                f'{program.name}: preset: paper cannot be scaled; give peaks, base and slope'
+            )
+        known = SIGNALS[entry.signal].options
+        options = {key: fit(known[key], x) for key, x in entry.options.items()}
+        entries.append(replace(entry, options=MappingProxyType(options)))
+    return replace(
+        program,
+        entries=tuple(entries),
+        limits=(low, high),
+        sample_rate=sample_rate,
+        # rounding must not lead out of the limits
+        rest=min(max(low + factor * (program.rest - lowest), low), high),
+        slew=factor * program.slew,
+    )
