@@ -339,7 +339,8 @@ def _creeping(model: StageModel, v0: float) -> list[str]:
     if not only.effects:
         return []
     rise = np.linspace(low, v0, round(RISE * rate))
-    left = only.stream().reset(v0) - only.simulate(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
+    risen = only.stream().process(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
+    left = only.stream().reset(v0) - risen
     if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
         return []
     told = f'{CREEPS}: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'

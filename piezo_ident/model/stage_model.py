@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import os
 from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
+import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -246,7 +247,7 @@ class StageModel:
         start: ArrayLike | None = None,
     ) -> NDArray[np.float64]:
         """
-        Return the displacement that a voltage causes, in free run.
+        Return the displacement that a voltage causes, in free run; warn outside the range.
 
         Parameters
         ----------
@@ -274,9 +275,8 @@ class StageModel:
         --------
         >>> import piezo_ident as pi
         >>> model = pi.SimulatedStage.load('paper').model
-        >>> y = model.simulate([0.0] * 3 + [10.0] * 997)
-        >>> (1e6 * y[[0, 999]]).round(1).tolist()
-        [0.0, 71.3]
+        >>> f'{1e6 * model.simulate([0.0] * 3 + [10.0] * 997)[-1]:.1f} um'
+        '71.3 um'
         """
         try:
             x = np.asarray(v, dtype=np.float64)
@@ -287,6 +287,8 @@ class StageModel:
         if not x.size:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
+        for warning in self.extrapolation(Record((piece,), 'simulate')):
+            warnings.warn(warning, stacklevel=2)
         return self.stream(start).follow(piece)
 
     def inverse(self, wanted: ArrayLike, **options: Any) -> Inverse:
@@ -383,12 +385,12 @@ class StageModel:
     def extrapolation(self, record: Record) -> tuple[str, ...]:
         """Return a warning when the voltage differs from that of the identification."""
         low, high = self.scaling.range
-        slack = 1e-3 * (high - low)
-        outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
         least, most = record.voltage_range
         identified = f'the identified range {low:g} .. {high:g} V'
         reach = f'{record.name}: the voltage spans {least:g} .. {most:g} V'
-        if outside:
+        slack = 1e-3 * (high - low)
+        if least < low - slack or most > high + slack:
+            outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
             return (
                 f'{reach}; {outside / record.n:.1%} of the samples lie outside {identified}, '
                 'where the prediction is an extrapolation',

@@ -113,6 +113,18 @@ def test_leaving_the_identified_range_warns_with_numbers():
     assert '12 V' in warning
 
 
+def test_simulate_says_what_a_free_run_says_of_the_voltage(recwarn):
+    PAPER.simulate(np.linspace(0, 10, 100))
+    # an inverse judges its own voltage
+    PAPER.inverse(np.full(100, 30e-6))
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r'25.0% .* outside the identified range') as told:
+        PAPER.simulate([0, 5, 10, 12e3])
+    # the line of the caller
+    assert told[0].filename == __file__
+    assert len(told) == 1
+
+
 def test_millivolts_are_taken_for_what_they_are():
     (warning,) = free_run(PAPER, record([0, 5e-3, 10e-3])).warnings
     assert 'mine: ' in warning
