@@ -103,7 +103,8 @@ def print_errors(run: FreeRun, console: Console) -> None:
 
             console.say(
                 f'  {"":16s} {e.percent_without_offset:8.3g} % after removing a mean of '
-                f'{length(e.offset)}: the sensor was set to zero elsewhere'
+                f'{length(e.offset)}'
+                + (': the sensor was set to zero elsewhere' if e.only_offset else '')
             )
     console.say(f'  % of stroke = {FORMULA}; fit = 100 (1 - |y - y_hat| / |y - mean y|)')
     for warning in run.warnings:

@@ -24,7 +24,7 @@ from piezo_ident.model.initial_memory import (
     forgotten,
     start_memory,
 )
-from piezo_ident.model.metrics import nrmse_fit, percent
+from piezo_ident.model.metrics import BLOCK, nrmse_fit, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
@@ -40,9 +40,6 @@ __all__ = [
 ]
 
 Vector = NDArray[np.float64]
-
-#: samples per block, so that temporaries stay small beside a long record
-BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -74,6 +71,11 @@ class FreeRunErrors:
     def mostly_offset(self) -> bool:
         """Whether subtracting the offset at least halves the error."""
         return self.percent_without_offset <= 0.5 * self.percent and self.percent > 0.0
+
+    @property
+    def only_offset(self) -> bool:
+        """Whether what is left without the offset is less than a tenth of the error."""
+        return self.percent_without_offset < 0.1 * self.percent
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,6 +185,9 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
             'estimated from their early part'
         )
+    pairs = ((piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True))
+    if runs_against(pairs, model.scaling.Y):
+        warnings.append(f'{record.name}: {REVERSED}')
     return FreeRun(
         record=record,
         pieces=tuple(predicted),

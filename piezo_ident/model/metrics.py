@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,18 +18,29 @@ if TYPE_CHECKING:
 
 __all__ = [
     'FORMULA',
+    'REVERSED',
     'expected_error',
     'fit_percent',
     'nrmse_fit',
     'percent',
     'percent_of_stroke',
+    'runs_against',
     'strokes',
 ]
 
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
+#: what to say where `runs_against`
+REVERSED = 'the displacement runs against the model: is a sign reversed, or are columns exchanged?'
+#: correlation below which that is no matter of a poor model
+AGAINST = -0.5
+#: share of the span of a model below which a record does not move
+STILL = 0.02
 
 Vector = NDArray[np.float64]
+
+#: samples per block, so that temporaries stay small beside a long record
+BLOCK = 1 << 20
 
 
 def percent(rms: float, stroke: float) -> float:
@@ -81,6 +93,29 @@ def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
             of.setdefault(record, []).append(y)
     ranges = {record: robust_range(pieces) for record, pieces in of.items()}
     return {record: high - low for record, (low, high) in ranges.items()}
+
+
+def runs_against(parts: Iterable[tuple[Vector, Vector]], span: float) -> bool:
+    """
+    Return whether measured and predicted displacement move in opposite directions.
+
+    Parameters
+    ----------
+    parts : iterable of (ndarray, ndarray)
+        Measured and predicted displacement of each piece; each may have a zero of its own.
+    span : float
+        Displacement of the model over its range, same unit; a record that moves by little says
+        nothing.
+    """
+    yy = pp = yp = reach = 0.0
+    for y, y_hat in parts:
+        y_mean, mean = float(y.mean()), float(y_hat.mean())
+        # in blocks, for the sake of memory
+        for i in range(0, y.size, BLOCK):
+            dy, dp = y[i : i + BLOCK] - y_mean, y_hat[i : i + BLOCK] - mean
+            yy, pp, yp = yy + float(dy @ dy), pp + float(dp @ dp), yp + float(dy @ dp)
+        reach = max(reach, float(np.ptp(y_hat)))
+    return reach > STILL * abs(span) and yp < AGAINST * math.sqrt(yy * pp)
 
 
 def nrmse_fit(error: float, spread: float) -> float:

@@ -216,6 +216,21 @@ def test_predict_tells_an_offset_from_a_bad_model(capsys, tmp_path, made):
     plain = succeed(capsys, 'predict', made / 'model.yaml', made / 'sine.csv')
     assert 'after removing' not in plain
     assert 'set to zero' not in plain
+    assert 'runs against' not in plain
+
+
+def test_predict_asks_after_a_reversed_sign(capsys, tmp_path, made):
+    piece = pi.read(made / 'sine.csv').pieces[0]
+    pi.write(Record((replace(piece, y=-40e-6 - piece.y),)), tmp_path / 'reversed.npz')
+    argv = ['predict', made / 'model.yaml', tmp_path / 'reversed.npz']
+    text = succeed(capsys, *argv)
+    assert 'runs against the model: is a sign reversed' in text
+    # more than half of the error is a mean, but the zero is where it was
+    assert 'after removing a mean of' in text
+    assert 'set to zero' not in text
+    assert any(
+        'runs against' in x for x in json.loads(succeed(capsys, *argv, '--json'))['warnings']
+    )
 
 
 def test_identify_without_model_writes_nothing(capsys, tmp_path, made, monkeypatch):

@@ -9,7 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 from paper_stage import PAPER
-from piezo_ident.model.metrics import expected_error, fit_percent, percent_of_stroke
+from piezo_ident.model.metrics import (
+    expected_error,
+    fit_percent,
+    percent_of_stroke,
+    runs_against,
+)
 import pytest
 
 Y = np.array([0.0, 1.0, 2.0, 4.0])
@@ -46,6 +51,21 @@ def test_percentages_do_not_depend_on_the_unit(scale, shift, errors):
     one, two = (Y, Y + e), (scale * (Y + shift), scale * (Y + e + shift))
     assert percent_of_stroke(*two) == pytest.approx(percent_of_stroke(*one), rel=1e-6, abs=1e-9)
     assert fit_percent(*two) == pytest.approx(fit_percent(*one), rel=1e-6, abs=1e-6)
+
+
+def test_a_reversed_sign_is_told_from_a_poor_model():
+    y_hat = np.sin(np.arange(2000) / 50)
+    noise = np.random.default_rng(1).standard_normal(2000)
+    assert runs_against([(7.0 - y_hat + 0.3 * noise, y_hat)], 2.0)
+    # each piece from a zero of its own
+    assert runs_against([(9.0 - y_hat, y_hat), (-9.0 - y_hat, y_hat)], 2.0)
+    assert not runs_against([(7.0 + y_hat + 0.3 * noise, y_hat)], 2.0)
+    # late by a quarter of a period and more, a wrong reading, rest
+    assert not runs_against([(np.sin(np.arange(2000) / 50 - 2.0), y_hat)], 2.0)
+    assert not runs_against([(noise, y_hat)], 2.0)
+    assert not runs_against([(-y_hat, y_hat)], 200.0)
+    assert not runs_against([(0.0 * y_hat, y_hat)], 2.0)
+    assert not runs_against([], 2.0)
 
 
 def of(**identification):
