@@ -50,6 +50,7 @@ from piezo_ident.diagnosis.verdict import (
 )
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
+from piezo_ident.model.metrics import REVERSED
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Record, records_of
@@ -367,11 +368,8 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
             f'only {max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it '
             'was not fitted to; is the sensor connected, and do both columns come from one stage?'
         )
-    if float(x @ known) < -criteria.REVERSED * np.linalg.norm(x) * np.linalg.norm(known):
-        raise IdentificationError(
-            f'{names}: the displacement runs against that of the model: is a sign reversed, or '
-            'does the record come from another stage?'
-        )
+    if float(x @ known) < -criteria.AGAINST * np.linalg.norm(x) * np.linalg.norm(known):
+        raise IdentificationError(f'{names}: {REVERSED}')
 
 
 # -- the result ----------------------------------------------------------------------------------
