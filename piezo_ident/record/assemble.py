@@ -38,6 +38,8 @@ PIECES = 10_000
 MANY = 10
 #: a stretch of fewer samples has no sampling rate
 MIN_PIECE = 2
+#: pieces of fewer samples may tell a rate of their own; so many such rates come from no clock
+FEW, MOST_RATES = 32, 3
 #: strokes of piezo stages [m]; anything else is the wrong unit
 STROKE = (1e-9, 10e-3)
 #: spans of a voltage [V]; the squares of others leave what a float64 can hold
@@ -260,10 +262,7 @@ def _pieces(
         marks = np.union1d(starts, torn).astype(np.int64)
         parts.extend(itertools.pairwise([*marks.tolist(), end]))
     if len(parts) > MANY and t.size < MANY * len(parts):
-        raise DataError(
-            f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); '
-            'write t with more decimals, or resample on a uniform grid'
-        )
+        raise _not_uniform(t, parts, name)
     if len(parts) > PIECES:
         raise DataError(
             f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
@@ -275,8 +274,21 @@ def _pieces(
     if short:
         met.append(Fault('lone_sample', at_times(t[[p[0] for p in short]]), len(short), 'dropped'))
     clocks = _clocks(t, parts, resolution, name, sample_rate, met)
+    rates: dict[bool, set[float]] = {True: set(), False: set()}
+    for (start, stop), clock in zip(parts, clocks, strict=True):
+        rates[stop - start < FEW].add(clock.sample_rate)
+    if len(rates[True] - rates[False]) > MOST_RATES:
+        raise _not_uniform(t, parts, name)
     _report_breaks(table, epochs, parts, clocks, met)
     return tuple(_piece(table, p, c) for p, c in zip(parts, clocks, strict=True))
+
+
+def _not_uniform(t: NDArray[np.float64], parts: list[tuple[int, int]], name: str) -> DataError:
+    return DataError(
+        f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); if '
+        'the samples came at one rate and none is missing, name it, as in --rate 20e3, and t is '
+        'not read; else write t with more decimals, or resample on a uniform grid'
+    )
 
 
 def _clocks(

@@ -19,6 +19,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.record.scatter import residual_of, scatters, without_scatter
 
 __all__ = [
     'JUMP_BACK',
@@ -134,7 +135,7 @@ def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
 
     Returns (start, stop) of each stretch in order; a stretch may be a single sample.
     """
-    cuts = np.flatnonzero(_breaks(t)) + 1
+    cuts = without_scatter(t, np.flatnonzero(_breaks(t)) + 1)
     bounds = [0, *cuts.tolist(), t.size]
     todo = list(itertools.pairwise(bounds))[::-1]
     if cuts.size > t.size // _SHORT + 10:
@@ -199,13 +200,13 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     dt = (t[-1] - t[0]) / (n - 1)
     # rounding to a few decimals can hide a missing sample from a look at neighbours only
     wide = _wide(t, 1.5 * dt)
-    if wide:
+    if wide and not scatters(t):
         return wide
     low, high = rate_bounds(t, _rounding(resolution, dt))
     if low <= high:
         return []
-    residual = _residual(t)
-    if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT:
+    residual = residual_of(t)
+    if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT or scatters(t):
         return []
     # a change of rate is a kink, a jump of the clock a step: both peak where the cut belongs
     step = np.diff(t)
@@ -215,7 +216,7 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     if not _SHORT <= k <= n - _SHORT:
         return []
     rms = float(np.std(residual))
-    parts = sorted(float(np.std(_residual(part))) for part in (t[:k], t[k:]))
+    parts = sorted(float(np.std(residual_of(part))) for part in (t[:k], t[k:]))
     # behind a true cut one side at least is clean; jitter does not get smaller by cutting
     return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
 
@@ -243,7 +244,7 @@ def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) ->
     low, high = rate_bounds(t, _rounding(resolution, dt))
     jitter, start = 0.0, float(t[0])
     if low > high:
-        residual = _residual(t)
+        residual = residual_of(t)
         deviation = float(np.abs(residual).max())
         jitter, start = deviation / dt, float(t[0] - residual[0])
         slack = 2 * deviation / float(t[-1] - t[0])
@@ -302,15 +303,6 @@ def rate_bounds(t: Vector, half: Callable[[Vector], Vector]) -> tuple[float, flo
         if inside.any():
             high = min(high, float(np.min(k[inside] / (elapsed - error)[inside])))
     return low, high
-
-
-def _residual(t: Vector) -> Vector:
-    """Return what a least-squares line leaves of the stamps [s]."""
-    k = np.arange(t.size) - 0.5 * (t.size - 1)
-    x = t - t[0]
-    x -= x.mean()
-    residual: Vector = x - k * (np.dot(k, x) / np.dot(k, k))
-    return residual
 
 
 def nice_rates(low: float, high: float) -> Iterator[float]:

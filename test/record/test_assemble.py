@@ -188,6 +188,51 @@ def test_jitter_is_reported():
     assert record.pieces[0].sample_rate == pytest.approx(RATE, rel=1e-4)
 
 
+def scattered(n: int, by: float) -> list[np.ndarray]:
+    t, v, y = columns(n)
+    return [t + np.random.default_rng(2).uniform(-by, by, n) / RATE, v, y]
+
+
+@pytest.mark.parametrize('by', [0.1, 0.15, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize('n', [200, 5000])
+def test_stamps_that_scatter_about_one_clock_are_uniform(n, by):
+    record = read(scattered(n, by))
+    assert sizes(record) == [n]
+    assert record.pieces[0].sample_rate == RATE
+    (fault,) = record.faults
+    assert fault.name == 'timing_jitter'
+    assert float(fault.where.split()[2]) == pytest.approx(by, rel=0.1)
+
+
+def test_some_late_stamps_are_no_breaks():
+    t, v, y = columns(2000)
+    t[[50, 51, 700, 1500]] += 0.4 / RATE
+    record = read([t, v, y])
+    assert (sizes(record), faults(record)) == ([2000], {'timing_jitter': 1})
+
+
+@pytest.mark.parametrize('by', [0.15, 0.3])
+def test_lost_samples_and_gaps_show_among_stamps_that_scatter(by):
+    lost = [500, 900, *range(2000, 2030)]
+    record = read([np.delete(x, lost) for x in scattered(5000, by)])
+    assert sizes(record) == [500, 399, 1099, 2970]
+    assert {p.sample_rate for p in record} == {RATE}
+    assert faults(record) == {'timing_jitter': 4, 'gap': 3}
+
+
+def test_regular_losses_are_no_scatter():
+    with pytest.raises(DataError, match='not uniformly sampled'):
+        read([np.delete(x, np.s_[::4]) for x in columns(1000, rate=3000.0)])
+
+
+def test_no_rates_are_made_of_jitter():
+    # two rates, both with jitter
+    first, late = scattered(5000, 0.2), scattered(5000, 0.2)
+    late[0] = first[0][-1] + 4 * (late[0] - late[0][0] + 1 / RATE)
+    with pytest.raises(DataError, match=r'not uniformly sampled.* --rate 20e3'):
+        read(rows(first, late))
+
+
 def test_not_finite_channel_splits():
     x = np.ones(500)
     x[0], x[499] = np.nan, np.nan
