@@ -159,7 +159,8 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     responses, heights = step_responses(pieces, before, after)
     lag = np.arange(-before, after)
     n = heights.size
-    if n == 0:
+    # two samples and a line through them tell no noise
+    if n == 0 or before < 3:
         empty = np.zeros(before + after)
         return StepDelay(None, float('inf'), 0, float('nan'), float('nan'), lag, empty)
     # the noise of a response in m/V falls with its height, so weights go with the square of it

@@ -36,6 +36,11 @@ def test_known_delays_without_noise(d):
     assert found.std == pytest.approx(12**-0.5)
 
 
+@pytest.mark.filterwarnings('error')
+def test_two_samples_ahead_of_a_step_tell_no_noise():
+    assert delay_from_steps([steps(2)], before=2).samples is None
+
+
 @pytest.mark.parametrize('noise', [1e-5, 1e-4, 5e-4])
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('gain', [75e-7, -75e-7])
