@@ -9,10 +9,11 @@ from collections.abc import Mapping
 import csv
 from dataclasses import dataclass
 import math
+from numbers import Real
 import re
 import unicodedata
 
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, expect
 
 __all__ = ['UNITS', 'ReadOptions', 'parse_columns', 'plain_unit']
 
@@ -86,6 +87,8 @@ class ReadOptions:
                     f'{known[-1]}'
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)
+        if self.rate is not None:
+            expect(self.rate, Real, 'rate', 'give the samples a second, as in 20e3')
         if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
             raise DataError(f'a rate of {self.rate:g} Hz; give the samples a second, as in 20e3')
         for role, name in self.named.items():

@@ -259,6 +259,7 @@ def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
         ({'columns': {'t': 'a', 'v': 'b', 'y': 'c'}, 'rate': 5e3}, ['--rate', 'drop one']),
         ({'columns': {'t': 'a', 'v': 'b', 'y': 'c'}}, ['113 m', '--displacement-unit um or nm']),
         ({'columns': 't=a,v=b,y=c', 'rate': -1.0}, ['a rate of -1 Hz']),
+        ({'rate': '5e3'}, ['rate: expected Real, got str', 'as in 20e3']),
         ({'time_unit': 'h'}, ["unknown time unit 'h'", 'ms']),
     ],
 )
