@@ -39,7 +39,7 @@ class Layout:
     Separator, names of the columns, and number of lines above the rows.
 
     `names` is empty where no line names the columns; `numbers` are those that stand alone behind
-    a name above the table; `empty` are the places of columns that hold nothing in the first row.
+    a name above the table; `empty` are the places of columns that hold nothing in the first rows.
     """
 
     separator: str | None
@@ -145,8 +145,9 @@ def _above(
         if found:
             name = f'{found["name"]} [{found["unit"]}]' if found['unit'] else found['name']
             numbers[name] = float(found['value'].replace(',', '.'))
-    # a column that is empty, as LabVIEW writes time that it does not know
-    empty = tuple(j for j, cell in enumerate(row[:need]) if not cell)
+    # a column that is empty, as LabVIEW writes time that it does not know; not a cell that is
+    some = [cells_of(line, separator) for line in lines[first : first + 100]]
+    empty = tuple(j for j in range(need) if not any(''.join(cells[j : j + 1]) for cells in some))
     return Layout(separator, tuple(names), first, numbers, empty, len(row))
 
 

@@ -29,6 +29,8 @@ __all__ = ['read_text', 'write_csv']
 
 #: lines in which the table begins
 HEAD = 1000
+#: what programs write where there is no number, in lower case
+MISSING = ('', 'na', 'n/a', '#na', '#n/a')
 _POINTS = (
     'these look like decimal commas: save it with decimal points, or with semicolons between '
     'the columns'
@@ -101,19 +103,24 @@ def _rows(
     names: list[str] = []
     starts: list[int] = []
     n, line = 0, layout.above
-    commas: Any = None
+    # the slow ways last: cells without a number, decimal commas, comments between the rows
+    ways: list[Any] = [None, *(dict.fromkeys(number, way) for way in (_with_point, _with_comma))]
+    held: list[str] = []
     while chunk := _whole_rows(lines):
-        if any(map(str.strip, chunk)):
-            # the slow ways last: comments between the rows, and decimal commas
-            slow: Any = dict.fromkeys(number, _with_comma)
-            for rows, converters in ((chunk, commas), (chunk, slow), (None, None), (None, slow)):
+        # rows of empty cells below the last one are none
+        chunk = held + chunk
+        end = len(chunk)
+        while end and not chunk[end - 1].strip(f' \t\r\n{layout.separator or ""}'):
+            end -= 1
+        chunk, held = chunk[:end], chunk[end:]
+        if chunk:
+            for rows, way in itertools.product((chunk, None), ways):
                 try:
                     part = np.loadtxt(
-                        rows or _without_comments(chunk), dtype, converters=converters, **options
+                        rows or _without_comments(chunk), dtype, converters=way, **options
                     )
                 except ValueError:
                     continue
-                commas = converters
                 break
             else:
                 raise _culprit(_without_comments(chunk), line + 1, layout, wanted, path)
@@ -134,10 +141,16 @@ def _without_comments(lines: Iterable[str]) -> list[str]:
     return ['\n' if line.lstrip().startswith(COMMENT) else line for line in lines]
 
 
+def _with_point(text: str) -> float:
+    if '_' in text:
+        raise ValueError  # no number
+    return np.nan if text.strip().lower() in MISSING else float(text)
+
+
 def _with_comma(text: str) -> float:
     if '.' in text or '_' in text:
         raise ValueError  # commas between thousands, or no number
-    return float(text.replace(',', '.'))
+    return _with_point(text.replace(',', '.'))
 
 
 def _whole_rows(lines: Iterator[str]) -> list[str]:
@@ -177,7 +190,12 @@ def _culprit(
         for name, place in wanted.items():
             text = row[place].strip()
             title = layout.names[place] if layout.names else name
+            if text.lower() in MISSING:
+                continue
             if not is_number(text):
+                below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]
+                if number == layout.above + 1 and below and not any(map(is_number, below)):
+                    return _all_text(f'{path}: column {title}', text, name)
                 return DataError(
                     f'{at}, column {title}: {text[:40]!r} is no number; mend or delete the line'
                 )
@@ -188,6 +206,15 @@ def _culprit(
                     'and points above it; save it with one of them'
                 )
     return DataError(f'{path}: unreadable rows from line {line}; save it again')
+
+
+def _all_text(column: str, text: str, name: str) -> DataError:
+    way = '--rate 20e3' if name == 't' else f'--columns {name}=NAME'
+    cure = 'give the sampling rate instead' if name == 't' else 'name another column'
+    return DataError(
+        f'{column} holds text, {text[:40]!r}, no numbers; {cure}, as in {way}',
+        options=way if name == 't' else '',
+    )
 
 
 def _torn_at_commas(row: list[str], width: int, wanted: dict[str, int]) -> bool:

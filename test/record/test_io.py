@@ -229,7 +229,13 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('t,v\n0,1\n', ['y missing', 'add a column named y']),
         ('t,v,y,v\n0,1,2,3\n', ['column v stands there twice']),
         ('t,v,y\n0,1,2\n\n1,oops,3\n', ['line 4, column v', "'oops'"]),
-        ('t,v,y\n0,1,2\n1,,3\n', ['line 3, column v', "''"]),
+        ('t,v,y\n0,1,2\n1,,3\n', ['1 of 2 samples are NaN']),
+        ('t,v,y\n0,1,2\n1,NAN1,3\n', ['line 3, column v', "'NAN1'"]),
+        (
+            'time,v,y\n' + ''.join(f'2024-04-13 10:00:00.00{k}000,{k},{k}\n' for k in range(9)),
+            ["column time holds text, '2024-04-13 10:00:00.000000'", 'as in --rate 20e3'],
+        ),
+        ('t,v,y\n0,low,2\n1,high,3\n', ["column v holds text, 'low'", '--columns v=NAME']),
         ('t,v,y\n0,1,2\n1,1_000,3\n', ['line 3, column v', "'1_000'"]),
         ('t,v,y\n0,1,2\n1,2\n', ['line 3 has 2 columns, the header has 3; mend']),
         ('t,v,y\n0,0,1,5,2,25e-6\n', ['line 2 has 6 columns', 'decimal commas', 'points']),
@@ -250,6 +256,23 @@ def test_bad_csv(tmp_path, text, words):
     path = tmp_path / 'r.csv'
     path.write_bytes(text.encode('latin-1'))
     refuse(path, *words)
+
+
+@pytest.mark.parametrize('cell', ['', 'NA', '#N/A'])
+@pytest.mark.parametrize('row', [0, 150])
+@pytest.mark.parametrize('form', ['{},{},{}', '{};{};{}', '{}\t{}\t{}', '{}\t {}\t{}'])
+def test_cells_without_a_number_are_left_out(tmp_path, cell, row, form):
+    path = tmp_path / 'r.csv'
+    columns = [['time_s', *[k / 1000 for k in range(300)]]]
+    columns += [[name, *[1.5 * (k % 10) for k in range(300)]] for name in ('voltage', 'y_um')]
+    columns[2][row + 1] = cell
+    text = ''.join(form.format(*cells) + '\n' for cells in zip(*columns, strict=True))
+    text += 2 * (form.format('', '', '') + '\n')
+    for written in (text, text.replace('.', ',')) if ',' not in form else (text,):
+        path.write_text(written)
+        got = pi.read(path)
+        assert [(f.name, f.count) for f in got.faults][1:] == [('not_finite', 1)]
+        assert got.n == 299
 
 
 @pytest.mark.parametrize(
