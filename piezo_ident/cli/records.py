@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 #: faults that are told when a record has been read
-TOLD = ('columns', 'slow_sampling', 'large_stroke', 'high_voltage')
+TOLD = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
 #: what a folder is searched for: .txt and .dat are often something else

@@ -46,7 +46,7 @@ SHEETS = ('.xlsx', '.xls', '.ods')
 _WRITTEN = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 _READ = f'a bag folder, .mcap, .db3, {", ".join(READERS)}'
 #: sampling rates [Hz] at which time in another unit than seconds is likelier
-SLOW = 50.0
+SLOW, FAST = 50.0, 1e6
 #: strokes [m] and spans of a voltage [V] at which another unit is likelier
 LARGE_STROKE, HIGH_VOLTAGE = 1e-3, 2e3
 
@@ -134,7 +134,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
             *(Fault('ignored_column', repr(c), 1, 'not read') for c in table.ignored),
         ],
     ).renamed(path.name)
-    return replace(record, faults=(*record.faults, *_doubts(record, table)))
+    return replace(record, faults=(*record.faults, *_doubts(record, table, options)))
 
 
 def _factor(table: RecordTable, role: str) -> float:
@@ -143,13 +143,20 @@ def _factor(table: RecordTable, role: str) -> float:
     return units.get(table.units.get(role, ''), 1.0)
 
 
-def _doubts(record: Record, table: RecordTable) -> Iterator[Fault]:
-    """Say where another unit is likelier than the one that nobody named."""
-    rate = min(piece.sample_rate for piece in record)
-    if rate <= SLOW and table.rate is None and 't' not in table.units:
-        where = f'sampled at {rate:.6g} Hz with t in seconds'
-        cure = 'if t counts milliseconds, add --time-unit ms'
-        yield Fault('slow_sampling', where, 1, cure)
+def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
+    """Say where another unit is likelier than the one that nobody named, or a header names."""
+    if table.rate is None and options.time_unit is None:
+        unit = table.units.get('t', 's')
+        rates = [piece.sample_rate for piece in record]
+        finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
+        for kind, rate, is_odd, other in (
+            ('slow', min(rates), min(rates) <= SLOW, finer),
+            ('fast', max(rates), max(rates) > FAST, '' if unit == 's' else 's'),
+        ):
+            if is_odd:
+                where = f'sampled at {rate:.6g} Hz with t in {unit}, unusual for a stage'
+                cure = 'is the time unit right?' + (other and f' else add --time-unit {other}')
+                yield Fault(f'{kind}_sampling', where, 1, cure)
     if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:
         where = f'a stroke of {1e3 * record.stroke:.3g} mm with y in metres'
         cure = 'if y counts micrometres, add --displacement-unit um'

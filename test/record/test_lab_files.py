@@ -312,6 +312,24 @@ def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
     assert (named.pieces[0].sample_rate, named.faults) == (RATE, ())
 
 
+@pytest.mark.parametrize(
+    ('header', 'rate', 'kind', 'cure'),
+    [
+        ('time_s', 2.0, 'slow', '--time-unit ms'),
+        ('t [ms]', 0.002, 'slow', '--time-unit us'),
+        ('time_s', 2e6, 'fast', 'is the time unit right?'),
+        ('time_ms', 5e3, 'fast', '--time-unit s'),
+    ],
+)
+def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, cure):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'{header},voltage,position_um\n{rows(K / rate, V, UM)}')
+    doubts = {f.name: f.action for f in pi.read(path).faults}
+    assert cure in doubts[f'{kind}_sampling']
+    assert main(['convert', str(path), str(tmp_path / 'o.npz')]) == 0
+    assert cure in capsys.readouterr().err
+
+
 def test_time_that_is_rounded_is_not_guessed_where_two_rates_fit(tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text('t,v,y\n' + rows(np.round(K / 4967.3, 3), V, 1e-6 * UM))
