@@ -69,13 +69,14 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    # little more than what means nothing is worth no other start
-    done = noise + 2.0 * simulator.rows.square(criteria.INDISTINCT)
+    done = noise + simulator.rows.square(criteria.INDISTINCT)
     least = least_gain(simulator.rows, noise)
     for i in range(len(fitted.state.effects)):
-        others = _afresh(simulator, fitted, i, lines, least, tick)
-        while fitted.mean_square >= done and (fresh := next(others, None)):
-            fitted = min(fitted, fresh, key=lambda f: f.mean_square)
+        if fitted.mean_square < done:
+            break
+        for fresh in _afresh(simulator, fitted, i, lines, least, tick):
+            if fresh.mean_square < fitted.mean_square:
+                fitted = fresh
     for _ in range(criteria.POLISHING):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=least, tick=tick)
