@@ -14,12 +14,11 @@ from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, naming, print_faults, read_all
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output
 from piezo_ident.control.inverse import invert
 from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.io import WRITERS
+from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 
 __all__ = ['invert_command']
@@ -52,8 +51,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
     with deferred_interrupts():
         if args.out is not None:
             columns = {'t': piece.start_time + drive.t, 'v': drive.v}
-            with temporary_output(args.out, overwrite=True) as target, target.open('xb') as file:
-                WRITERS[args.out.suffix.lower()](file, lambda: iter([columns]), (), ())
+            write_columns(args.out, lambda: iter([columns]))
         if args.plot is not None:
             from piezo_ident.report import save_plot
 

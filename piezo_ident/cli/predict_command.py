@@ -16,11 +16,10 @@ from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.common.files import temporary_output
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.record.io import WRITERS
+from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Record
 from piezo_ident.record.tables import blocks_of
 
@@ -82,8 +81,7 @@ def _write_prediction(record: Record, pieces: Sequence[NDArray[np.float64]], pat
         for block in blocks():
             yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
 
-    with temporary_output(path, overwrite=True) as target, target.open('xb') as file:
-        WRITERS[path.suffix.lower()](file, columns, (), ())
+    write_columns(path, columns)
 
 
 def print_errors(run: FreeRun, console: Console) -> None:

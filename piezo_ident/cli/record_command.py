@@ -14,7 +14,6 @@ from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_s
 from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.common.files import temporary_output
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program
 from piezo_ident.excitation.scaled import scaled
@@ -64,7 +63,9 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     warnings: tuple[str, ...] = ()
     with deferred_interrupts():
         if args.voltage_only:
-            _write_voltage(piece, out)
+            # no segments: they are those of the command, and the file is no record
+            columns = {'t': piece.t, 'v': piece.v, **piece.channels}
+            record_io.write_columns(out, lambda: iter([columns]))
         else:
             losses = record_io.write(
                 record,
@@ -100,13 +101,6 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
     )
     print_faults(record, losses, console)
     console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
-
-
-def _write_voltage(piece: Piece, path: Path) -> None:
-    # no segments: they are those of the command, and the file is no record
-    columns = {'t': piece.t, 'v': piece.v, **piece.channels}
-    with temporary_output(path, overwrite=True) as target, target.open('xb') as file:
-        record_io.WRITERS[path.suffix.lower()](file, lambda: iter([columns]), (), ())
 
 
 def _check_record_output(args: SimpleNamespace, *, voltage_only: bool = False) -> None:

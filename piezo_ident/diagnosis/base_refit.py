@@ -138,11 +138,12 @@ def with_refit(
         # a little another G is no finding
         selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
-    gain = float(np.mean(e * e)) - refit.mean_square
+    before = float(np.mean(e * e))
+    gain = before - refit.mean_square
     # noise moved the weights when they were identified, too
     is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
     if is_large and gain >= refit.mean_square - noise:
-        unsettled = findings.unsettled(rows.percent(float(np.mean(e * e)) - noise))
+        unsettled = findings.unsettled(rows.percent(before - noise))
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs
             return unsettled

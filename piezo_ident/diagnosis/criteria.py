@@ -60,8 +60,8 @@ SWALLOWED = 1e-4
 SHOWS = (0.4, 3.0)
 #: share of the variance beyond which the displacement does not follow the voltage
 UNRELATED = 0.99
-#: correlation with the model, reversed, from which no change of the stage can be the cause
-AGAINST = 0.9
+#: correlation with the model below which no change of the stage can be the cause
+AGAINST = -0.9
 #: share to which the rms of the noise is known
 NOISE_KNOWN = 0.1
 #: share of samples with a fault up to which they are left out; beyond it little else is there

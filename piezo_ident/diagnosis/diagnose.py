@@ -50,7 +50,7 @@ from piezo_ident.diagnosis.verdict import (
 )
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.results import Progress, silent
-from piezo_ident.model.metrics import REVERSED
+from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Record, records_of
@@ -360,15 +360,16 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
     if swing <= criteria.TREMBLES:
         return
     names = ', '.join(rows.names)
-    x, known = (centred(y, rows.of_record) for y in (rows.x, simulator.run(given)))
-    moved = float(np.mean(x**2))
+    moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
     if base.mean_square > criteria.UNRELATED * moved:
         raise IdentificationError(
             f'{names}: the displacement does not follow the voltage: a hysteresis accounts for '
             f'only {max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it '
             'was not fitted to; is the sensor connected, and do both columns come from one stage?'
         )
-    if float(x @ known) < -criteria.AGAINST * np.linalg.norm(x) * np.linalg.norm(known):
+    known, of_each = simulator.run(given), (rows.of_record == k for k in np.unique(rows.of_record))
+    # that the voltage moves is known here
+    if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, criteria.AGAINST):
         raise IdentificationError(f'{names}: {REVERSED}')
 
 

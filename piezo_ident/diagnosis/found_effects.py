@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import numpy as np
+from piezo_ident.diagnosis.cross_validation import normal_equations, summed
 from piezo_ident.diagnosis.forward_selection import Selected
-from piezo_ident.diagnosis.joint_fit import Fitted, standard_deviations
+from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FoundEffect, FoundParameter
 from piezo_ident.diagnosis.rows import Rows
 
@@ -25,7 +26,7 @@ def found_effects(
     """
     if not selected.taken:
         return ()
-    std = standard_deviations(rows, last)
+    std = _standard_deviations(rows, last)
     steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
     levels = [base.mean_square, *steps, selected.fitted.mean_square]
     found = []
@@ -54,6 +55,35 @@ def found_effects(
             )
         )
     return tuple(found)
+
+
+def _standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, str, int], float]:
+    """
+    Return the standard deviations of the free parameters, in the record that has most rows.
+
+    The sandwich estimator over blocks, each one observation.  Keys are the effect's place, the
+    parameter's name, and the place in a vector (0 for a number).
+    """
+    M = fitted.J
+    size = np.linalg.norm(M, axis=0)
+    equations = normal_equations(rows, M, fitted.e[:, None])
+    # the given H is no observation, but it holds what these leave open
+    A = summed(equations, fitted.pull)[0] / np.outer(size, size)
+    A[np.diag_indices_from(A)] += 1e-10
+    gradients = equations.b[:, :, 0] / size
+    inverse = np.linalg.pinv(A, hermitian=True)
+    covariance = inverse @ (gradients.T @ gradients) @ inverse
+    deviation = np.full(fitted.free.size, np.nan)
+    deviation[fitted.free] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
+    first = fitted.free.size - len(fitted.parameters)
+    known = {}
+    for j, parameter in enumerate(fitted.parameters, start=first):
+        if np.isfinite(deviation[j]) and parameter.record in (None, rows.longest):
+            # of a logarithm, so relative
+            factor = abs(parameter.get(fitted.state)) if parameter.logarithmic else 1.0
+            key = (parameter.effect, parameter.name, parameter.index or 0)
+            known[key] = float(deviation[j]) * factor
+    return known
 
 
 def _plain(value: object) -> float | str | tuple[float, ...]:

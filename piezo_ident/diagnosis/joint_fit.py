@@ -21,11 +21,9 @@ from piezo_ident.diagnosis.cross_validation import (
     block_products,
     held_out_errors,
     held_out_residual,
-    normal_equations,
     NormalEquations,
     Pull,
     right_sides,
-    summed,
     with_columns,
 )
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
@@ -41,7 +39,6 @@ __all__ = [
     'fit_base',
     'fit_jointly',
     'offset_columns',
-    'standard_deviations',
 ]
 
 Array = NDArray[np.float64]
@@ -265,35 +262,6 @@ def _firm(prior: Array, moving: Array) -> Array:
     firm = prior.copy()
     firm[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
     return firm
-
-
-def standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, str, int], float]:
-    """
-    Return the standard deviations of the free parameters, in the record that has most rows.
-
-    The sandwich estimator over blocks, each one observation.  Keys are the effect's place, the
-    parameter's name, and the place in a vector (0 for a number).
-    """
-    M = fitted.J
-    size = np.linalg.norm(M, axis=0)
-    equations = normal_equations(rows, M, fitted.e[:, None])
-    # the given H is no observation, but it holds what these leave open
-    A = summed(equations, fitted.pull)[0] / np.outer(size, size)
-    A[np.diag_indices_from(A)] += 1e-10
-    gradients = equations.b[:, :, 0] / size
-    inverse = np.linalg.pinv(A, hermitian=True)
-    covariance = inverse @ (gradients.T @ gradients) @ inverse
-    deviation = np.full(fitted.free.size, np.nan)
-    deviation[fitted.free] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
-    first = fitted.free.size - len(fitted.parameters)
-    known = {}
-    for j, parameter in enumerate(fitted.parameters, start=first):
-        if np.isfinite(deviation[j]) and parameter.record in (None, rows.longest):
-            # of a logarithm, so relative
-            factor = abs(parameter.get(fitted.state)) if parameter.logarithmic else 1.0
-            key = (parameter.effect, parameter.name, parameter.index or 0)
-            known[key] = float(deviation[j]) * factor
-    return known
 
 
 def offset_columns(rows: Rows) -> Array:

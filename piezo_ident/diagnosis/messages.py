@@ -177,10 +177,8 @@ def sentence(
     elif smallest is None:
         text = f'{rest.description}{tail}.'
     elif rest.rms_percent >= smallest:
-        text = (
-            f'No effect shows: the {rest.rms_percent:.2g} % of stroke that are left differ from '
-        )
-        text += f'one part of the data to another{tail}.'
+        text = f'No effect shows: the {rest.rms_percent:.2g} % of stroke that are left differ '
+        text += f'from one part of the data to another{tail}.'
     else:
         text = 'No effect is missing that these data could show; the smallest would be '
         text += f'{smallest:.2g} % of stroke{tail}.'

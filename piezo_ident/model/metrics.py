@@ -95,7 +95,9 @@ def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
     return {record: high - low for record, (low, high) in ranges.items()}
 
 
-def runs_against(parts: Iterable[tuple[Vector, Vector]], span: float) -> bool:
+def runs_against(
+    parts: Iterable[tuple[Vector, Vector]], span: float, below: float = AGAINST
+) -> bool:
     """
     Return whether measured and predicted displacement move in opposite directions.
 
@@ -106,6 +108,8 @@ def runs_against(parts: Iterable[tuple[Vector, Vector]], span: float) -> bool:
     span : float
         Displacement of the model over its range, same unit; a record that moves by little says
         nothing.
+    below : float
+        Correlation from which they do.
     """
     yy = pp = yp = reach = 0.0
     for y, y_hat in parts:
@@ -115,7 +119,7 @@ def runs_against(parts: Iterable[tuple[Vector, Vector]], span: float) -> bool:
             dy, dp = y[i : i + BLOCK] - y_mean, y_hat[i : i + BLOCK] - mean
             yy, pp, yp = yy + float(dy @ dy), pp + float(dp @ dp), yp + float(dy @ dp)
         reach = max(reach, float(np.ptp(y_hat)))
-    return reach > STILL * abs(span) and yp < AGAINST * math.sqrt(yy * pp)
+    return reach > STILL * abs(span) and yp < below * math.sqrt(yy * pp)
 
 
 def nrmse_fit(error: float, spread: float) -> float:

@@ -26,7 +26,7 @@ from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.tables import Blocks, blocks_of, labels_of, write_mat, write_npz
 from piezo_ident.record.text_table import read_text, write_csv
 
-__all__ = ['READERS', 'WRITERS', 'read', 'write']
+__all__ = ['READERS', 'WRITERS', 'read', 'write', 'write_columns']
 
 READERS: Mapping[str, Callable[[Path, ReadOptions], RecordTable]] = {
     **dict.fromkeys(('.csv', '.txt', '.tsv', '.dat', '.lvm', '.asc'), read_text),
@@ -229,10 +229,22 @@ def write(
             custom_data=custom_data,
         )
     else:
-        with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
-            WRITERS[suffix](file, blocks_of(record), *labels_of(record))
+        write_columns(path, blocks_of(record), *labels_of(record), overwrite=overwrite)
     notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
     return notes + _losses(record)
+
+
+def write_columns(
+    path: Path,
+    blocks: Blocks,
+    labels: Sequence[str] = (),
+    starts: Sequence[int] = (),
+    *,
+    overwrite: bool = True,
+) -> None:
+    """Write blocks of columns, with the labels of their segments, to a file of `WRITERS`."""
+    with temporary_output(path, overwrite=overwrite) as target, target.open('xb') as file:
+        WRITERS[path.suffix.lower()](file, blocks, labels, starts)
 
 
 def _check_labels(record: Record, path: Path) -> None:
