@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from piezo_ident.residual.beyond_drive import without_drive
 from piezo_ident.residual.reversals import TURN, turns_of
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, true_runs
 from scipy import fft, signal
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
 
 __all__ = ['FAINT', 'FEWEST', 'Series', 'Spectrum', 'series_of']
@@ -32,6 +33,8 @@ LOCKED, ROUNDING = 16.0, 1e-12
 FAINT = 0.15
 #: a median of exponential variables is worth this share of a mean as an estimate of their scale
 MEDIAN_WORTH = 0.48
+#: points of the grid on either side that a spline of the transform stands on, too
+WIDER = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +227,24 @@ class Spectrum:
         placed[offset : offset + head] = x[:head]
         placed[: x.size - head] = x[head:]
         return cls(s, np.asarray(fft.rfft(placed))[: f.size], *_noise_around(s, f))
+
+    def between(
+        self, f: Array, near: NDArray[np.int64]
+    ) -> Callable[[Array], NDArray[np.complex128]]:
+        """
+        Return the transform as a function of any frequency [Hz] among some of the grid f.
+
+        Seen from the middle of its stretch it is smooth: a spline of fifth degree errs by 1e-5 of
+        its maximum where the stretch is the whole search, and by far less where it is a part.
+        """
+        s = self.series
+        # some more points, since a spline is worse at its ends
+        wider = slice(max(int(near[0]) - WIDER, 0), int(near[-1]) + WIDER + 1)
+        grid = f[wider]
+        middle = 0.5 * (s.x.size - 1) / s.rate
+        turn = np.exp(2j * np.pi * grid * (s.offset / s.rate + middle))
+        smooth = make_interp_spline(grid, self.values[wider] * turn, k=5)
+        return lambda at: np.asarray(smooth(at) * np.exp(-2j * np.pi * at * (s.t + middle)))
 
 
 def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:

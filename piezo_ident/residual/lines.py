@@ -214,41 +214,41 @@ class _Search:
         frequency.  Stretches far apart agree at many frequencies nearly as well, which are closer
         to each other than the grid is fine.
         """
+        near = self._near(best)
+        transforms = [s.between(self._f, near) for s in self._spectra]
 
-        def gain(frequency: float) -> float:
-            fits = [self._fit(frequency, name, best) for name in self.records]
-            return sum(abs(a) ** 2 * information for a, information in fits)
+        def gain(f: Array) -> Array:
+            return self._gains(f, [transform(f) for transform in transforms], best)
 
-        def summit(k: int) -> float:
-            centre = float(self._f[k])
-            for width in (0.5 * step, 0.1 * step):
-                left, middle, right = (gain(centre + d) for d in (-width, 0.0, width))
-                bend = left - 2.0 * middle + right
-                if bend < 0.0:
-                    centre += float(np.clip(0.5 * width * (left - right) / bend, -width, width))
-            return centre
+        centres, step = self._f[near], float(self._f[1])
+        gains = gain(centres)
+        centres = centres[(gains == maximum_filter1d(gains, 3)) & (gains > LOBE * gains.max())]
+        for width in (0.5 * step, 0.1 * step):
+            left, middle, right = (gain(centres + d) for d in (-width, 0.0, width))
+            bend = left - 2.0 * middle + right
+            move = 0.5 * width * (left - right) / np.where(bend < 0.0, bend, -np.inf)
+            centres = centres + np.clip(move, -width, width)
+        return float(centres[np.argmax(gain(centres))])
 
-        step = float(self._f[1])
-        near, gains = self._gains_near(best)
-        tops = near[(gains == maximum_filter1d(gains, 3)) & (gains > LOBE * gains.max())]
-        return max(map(summit, tops), key=gain)
-
-    def _gains_near(self, best: int) -> tuple[NDArray[np.int64], Array]:
-        """Return the indices of the frequencies around one, and the gains there."""
+    def _near(self, best: int) -> NDArray[np.int64]:
+        """Return the indices of the frequencies among which a line seen at one may be."""
         power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
         series = self._spectra[int(np.argmax(power))].series
         reach = round(3.0 * series.rate / series.x.size / float(self._f[1]))
-        near = np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
-        gains = np.zeros(near.size)
+        return np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
+
+    def _gains(self, f: Array, values: Sequence[NDArray[np.complex128]], best: int) -> Array:
+        """Return what a sine at f takes off the weighted squares, from the transforms there."""
+        gains = np.zeros(f.size)
         for name in self.records:
-            top, information = np.zeros(near.size, np.complex128), np.zeros(near.size)
-            for s in self._spectra:
+            top, information = np.zeros(f.size, np.complex128), np.zeros(f.size)
+            for s, value in zip(self._spectra, values, strict=True):
                 if s.series.record == name:
-                    response = s.series.gain(self._f[near]) * (0.5 * s.series.window.sum())
-                    top += np.conj(response) * s.values[near] / s.noise[best]
+                    response = s.series.gain(f) * (0.5 * s.series.window.sum())
+                    top += np.conj(response) * value / s.noise[best]
                     information += np.abs(response) ** 2 / s.noise[best]
             gains += np.abs(top) ** 2 / np.maximum(information, np.finfo(float).tiny)
-        return near, gains
+        return gains
 
     def sine(self, frequency: float, record: str, best: int) -> tuple[float, float]:
         """Return amplitude and phase of A sin(2 pi f t + phase)."""

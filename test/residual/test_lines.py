@@ -8,9 +8,11 @@ from functools import cache
 import numpy as np
 from piezo_ident.record.record import Piece
 from piezo_ident.residual import all_stretches, find_lines, ResidualPart, without_lines
+from piezo_ident.residual.line_spectrum import Series, series_of, Spectrum
 import pytest
 from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
 from residual_stages import drives, foreign
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 DRIVES = drives()
@@ -159,3 +161,54 @@ def test_two_rests_far_apart_agree_on_one_frequency(hertz):
     e[moving] += 3e-8 * rng.standard_normal(n.size)
     line, *_ = search(ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)).lines
     assert line.frequency == pytest.approx(hertz, abs=0.002)
+
+
+def transform(s: Series, hertz: np.ndarray) -> np.ndarray:
+    """Return the windowed transform at any frequencies [Hz], sample by sample."""
+    t = s.t + np.arange(s.x.size) / s.rate
+    return np.exp(-2j * np.pi * np.outer(hertz, t)) @ (s.window * s.x)
+
+
+@pytest.mark.parametrize('n', [4000, 400], ids=['whole', 'tenth'])
+@pytest.mark.parametrize('offset', [0, 987_654], ids=['at_zero', 'later'])
+def test_the_transform_between_points_of_the_grid(n, offset):
+    rng = np.random.default_rng(12)
+    # a slow drift far stronger than the line
+    x = np.sin(2 * np.pi * 50.03 * np.arange(n) / RATE) + 1e4 * np.linspace(-1, 1, n) ** 2
+    x += 0.1 * rng.standard_normal(n)
+    # the grid counts whole samples, the stretch begins between two
+    s = Series('r', (offset + 0.4) / RATE, x, np.hanning(n), 0.0, offset, 1, RATE)
+    size = 10_000
+    f = np.arange(4000) * RATE / size
+    near = np.arange(220, 280)
+    hertz = rng.uniform(f[near[0]], f[near[-1]], 200)
+    found = Spectrum.of(s, f, size).between(f, near)(hertz)
+    # a part of the search is sampled the more finely
+    largest = 0.25 * n
+    assert found == pytest.approx(transform(s, hertz), abs=(2e-5 if n == 4000 else 1e-8) * largest)
+
+
+def test_the_frequency_is_that_of_the_largest_gain_at_the_full_rate():
+    rng = np.random.default_rng(13)
+    n, apart = 4000, 60.0123
+    parts = []
+    for start in (0.0, apart):
+        t = start + np.arange(n) / RATE
+        e = 1e-9 * rng.standard_normal(n) + 1e-8 * np.sin(2 * np.pi * 50.03 * t + 1.0)
+        parts.append(ResidualPart('r', Piece(np.zeros(n), e, RATE, start), e))
+    (line,) = search(*parts).lines
+    series, *_ = series_of(parts, all_stretches(parts))
+    assert len(series) == 2
+    noise = [Spectrum.of(s, np.array([50.0]), 10_000).noise[0] for s in series]
+
+    def gain(hertz: float | np.ndarray) -> np.ndarray:
+        # equal windows know equally much
+        seen = [transform(s, np.atleast_1d(hertz)) for s in series]
+        return np.abs(seen[0] / noise[0] + seen[1] / noise[1]) ** 2
+
+    grid = np.arange(49.9, 50.1, 1e-3)
+    top = grid[np.argmax(gain(grid))]
+    best = minimize_scalar(lambda f: -gain(f)[0], (top - 1e-3, top, top + 1e-3), tol=1e-10)
+    assert best.x == pytest.approx(50.03, abs=0.001)
+    # the resolution is 1 / 62 s
+    assert line.frequency == pytest.approx(best.x, abs=1e-5)
