@@ -18,7 +18,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import HARM, STANDARD_ERRORS
+from piezo_ident.diagnosis.criteria import HARM, OF_SHAPE, STANDARD_ERRORS
 from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     'standard_errors',
     'summed',
     'taken_by_gain',
+    'takes_shape',
     'with_columns',
 ]
 
@@ -244,3 +245,18 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
         return False
     change = np.bincount(rows.group, transfer - before, len(rows.labels))
     return bool(change[change > 0.0].sum() <= -HARM * change.sum())
+
+
+def takes_shape(rows: Rows, given: Array, held_out: Array, noise: float) -> bool:
+    """
+    Return whether a refit of H predicts the path within blocks better, not only their means.
+
+    Where loops move on with every round, a refit learns where they were.  In this record that
+    holds for the blocks between, too, and in the next one loops are elsewhere; their shape is
+    the same.
+
+    `given` is the residual of the model as given and `held_out` the one of a refit to other
+    blocks, shape (n,); `noise` is the mean square of the noise of a row.
+    """
+    before, after = (float(np.mean(centred(e, rows.block) ** 2)) for e in (given, held_out))
+    return before - after >= OF_SHAPE * max(before - noise, 0.0)

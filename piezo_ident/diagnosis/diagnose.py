@@ -256,7 +256,7 @@ def _diagnosed(
         )
     )
     overall = before.overall, after.overall
-    refined = refine(simulator, given, last, findings, overall)
+    refined = refine(simulator, given, last, findings, noise, overall)
     if refined.is_given:
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)

@@ -160,7 +160,8 @@ def sentence(
             text = (
                 'the hysteresis of the model is not that of these data: a refit lowers the error '
                 f'on held-out data from {before:.3g} to {refit:.3g} % of stroke. It errs more on '
-                'the whole record or on other motion, so the model stays as given.'
+                'the whole record or on other motion, or knows where loops were and not what they '
+                'look like, so the model stays as given.'
             )
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'

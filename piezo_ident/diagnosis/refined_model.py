@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
+from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain, takes_shape
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
@@ -54,12 +54,14 @@ def refine(
     given: State,
     fitted: Fitted,
     findings: Findings,
+    noise: float,
     errors: tuple[float, float],
 ) -> Refined:
     """
     Return the model that the user gets, from a refit with what was found.
 
-    `errors` are those of the model as given and of the refit, which the file will tell.
+    `noise` is the mean square of the noise of a row; `errors` are those of the model as given and
+    of the refit, which the file will tell.
     """
     rows, model = simulator.rows, simulator.model
     e = rows.x - simulator.run(given)
@@ -67,7 +69,10 @@ def refine(
     metres = shifts * model.scaling.Y
     if findings.keeps_given or (
         not findings.effects
-        and (not _is_worth(rows, fitted, e) or _harms_the_whole(simulator, given, fitted.state))
+        and (
+            not _is_worth(rows, fitted, e, noise)
+            or _harms_the_whole(simulator, given, fitted.state)
+        )
     ):
         return Refined(model, given, metres, is_given=True)
     if fitted.transfer.sum() > (1.0 - criteria.WORTH_REFIT) ** 2 * (e @ e):
@@ -135,10 +140,14 @@ def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     return by_gain <= criteria.ADDED * (before - after) and refit_holds(rows, e, fitted.transfer)
 
 
-def _is_worth(rows: Rows, refit: Fitted, e: Array) -> bool:
+def _is_worth(rows: Rows, refit: Fitted, e: Array, noise: float) -> bool:
     """Return whether a refit of H alone errs clearly less than the given model, which leaves e."""
     least = (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
-    return refit.mean_square <= least and refit_holds(rows, e, refit.transfer)
+    return (
+        refit.mean_square <= least
+        and refit_holds(rows, e, refit.transfer)
+        and takes_shape(rows, e, refit.held_out_residual(rows), noise)
+    )
 
 
 def _harms_the_whole(simulator: Simulator, given: State, fitted: State) -> bool:

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from diagnosis_examples import measured as example_record
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
-from piezo_ident.diagnosis import base_refit, diagnose, DiagnosisSettings, search
+from piezo_ident.diagnosis import base_refit, diagnose, DiagnosisSettings, refined_model, search
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
@@ -253,15 +253,32 @@ def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
     assert max(unseen_errors(result, unseen)) < 0.1
 
 
-def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(truths, monkeypatch):
+def with_another_h():
+    """Return the model of a stage, and a record of it whose displacement is bent."""
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
-    bent = Record((replace(piece, y=piece.y * (1.05 - 0.05 * piece.y / piece.y.max())),), 'bent')
+    bent = replace(piece, y=piece.y * (1.05 - 0.05 * piece.y / piece.y.max()))
+    return model, Record((bent,), 'bent')
+
+
+def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(truths, monkeypatch):
+    model, bent = with_another_h()
     monkeypatch.setattr(base_refit, 'refit_holds', lambda *_: False)
     result = diagnose(model, bent, FEW)
     assert (result.verdict, result.effects, result.group) == ('unexplained', (), None)
     assert 'does not hold on motion held out' in result.sentence
     assert result.model is model and result.after.overall == result.before.overall > 0.2
+
+
+@pytest.mark.parametrize('takes', [True, False])
+def test_a_refit_that_knows_only_where_loops_were_is_not_kept(truths, monkeypatch, takes):
+    model, bent = with_another_h()
+    if not takes:
+        monkeypatch.setattr(refined_model, 'takes_shape', lambda *_: False)
+    result = diagnose(model, bent, FEW)
+    assert result.verdict == 'refitted'
+    assert (result.model is not model) == takes
+    assert ('where loops were' in result.sentence) != takes
 
 
 def test_another_gain_is_no_other_hysteresis(truths):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
-from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors
+from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors, takes_shape
 from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
@@ -508,6 +508,16 @@ def test_a_refit_holds_where_it_helps_all_kinds_by_more_than_a_shift_or_one_bloc
     one_block = residual(rows)
     one_block[rows.block == 11] *= 20.0
     assert not refit_holds(rows, one_block, np.bincount(rows.block, residual(rows) ** 2))
+
+
+def test_a_refit_that_knows_where_loops_were_must_know_their_shape_too(rows):
+    shape, places = residual(rows), 0.003 * np.sin(7.0 * rows.block)
+    # most of the error goes, on kinds of motion left out as well
+    assert refit_holds(rows, shape + places, np.bincount(rows.block, (0.9 * shape) ** 2))
+    assert not takes_shape(rows, shape + places, 0.9 * shape, 0.0)
+    assert takes_shape(rows, shape + places, 0.8 * shape, 0.0)
+    # what noise leaves is no shape
+    assert takes_shape(rows, shape + places, 0.9 * shape, 0.5e-6)
 
 
 # -- what would part them ----------------------------------------------------------------------
