@@ -117,8 +117,8 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     seen = keep & (search.information() * _rms(parts) ** 2 > np.log(bins / SIGNIFICANT))
     tested = tuple((float(f[a]), float(f[b - 1])) for a, b in true_runs(seen))
     found: list[Line] = []
+    score, gain = search.score()
     for _ in range(2 * LINES):
-        score, gain = search.score()
         # strong lines are significant at their neighbours, too; the strongest is where it is
         significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
@@ -130,11 +130,13 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
         if amplitude >= negligible and search.is_steady(frequency, best):
             found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
+            score, gain = search.score()
             crowd = _crowd(found)
             if crowd:
                 found = [line for line in found if line not in crowd]
                 keep &= np.abs(f - frequency) > BESIDE * frequency
-        keep &= np.abs(f - frequency) > 2.0 / longest
+        # what was refined may lie some bins away from what stood out
+        keep &= np.minimum(np.abs(f - frequency), np.abs(f - f[best])) > 2.0 / longest
     return LineSearch(_grouped(found, 2.0 / longest), searched, tested)
 
 
