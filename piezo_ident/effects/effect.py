@@ -322,6 +322,15 @@ class Effect:
         """
         return None
 
+    def slopes(self, block: Block) -> Mapping[str, NDArray[np.float64]]:
+        """
+        Return the derivatives of what `process` makes of a block, by numbers that know them.
+
+        From rest and without a step of the effect itself; each of shape (n,).  By default none:
+        they are then taken by differences.
+        """
+        return {}
+
     def number(self, name: str) -> float:
         """Return a scalar parameter."""
         return float(self.values[name])

@@ -12,10 +12,14 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator, LANES
-from piezo_ident.operators.kernels import curve, held
+from piezo_ident.operators.kernels import curve, curve_slope, held
 
 __all__ = ['RateDependentHysteresis']
 
+#: relative step of the low-pass of the speed, for the slope of the power
+NEAR = 1e-5
+#: speed that counts as none [spans/s]
+STANDS = 1e-30
 #: speed below which the slope of its power is taken at it [spans/s]
 SLOW = 1e-3
 
@@ -59,6 +63,76 @@ def _widened(
                 f, g = memory[i] - low_v, still[i] - low_v
                 w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f) - curve(c, i, g)
         out[k] = w
+
+
+@kernel
+def _slopes(
+    v: NDArray[np.float64],
+    r: NDArray[np.float64],
+    q: NDArray[np.float64],
+    low_v: float,
+    c: NDArray[np.float64],
+    power: NDArray[np.float64],
+    bends: NDArray[np.float64],
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
+    memory: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
+    # bends, shape (j, n): slopes of the power; rows of out: gain, stretch, lead, lead_stretch, j
+    n_r, n_j = r.size, bends.shape[0]
+    by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
+    edge, moves, side = np.empty(n_r), np.empty(n_r), np.empty(n_r)
+    by_power = np.zeros((n_j, n_r))
+    for k in range(v.size):
+        x = v[k]
+        more = gain * power[k]
+        wide = 1.0 + stretch * power[k]
+        ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
+        for i in range(n_r):
+            width = r[i] * wide + more
+            low = x - (width if width > 0.0 else 0.0)
+            high = x + r[i] * ahead_wide + ahead
+            f = memory[i]
+            # where the edges cross, the lower one counts
+            new = held(f, low, low if high < low else high)
+            moves[i] = 1.0 if new != f else 0.0
+            side[i] = -1.0 if new == low else 1.0
+            memory[i] = new
+        for i in range(n_r):
+            width = r[i] * wide + more
+            lower = -1.0 if width > 0.0 else 0.0
+            by_low[i] += moves[i] * ((0.5 - 0.5 * side[i]) * lower * power[k] - by_low[i])
+            by_high[i] += moves[i] * ((0.5 + 0.5 * side[i]) * power[k] - by_high[i])
+        for i in range(n_r):
+            width = r[i] * wide + more
+            lower = -gain - stretch * r[i] if width > 0.0 else 0.0
+            upper = lead + lead_stretch * r[i]
+            edge[i] = lower if side[i] < 0.0 else upper
+        for i in range(n_r):
+            weight[i] = q[i]
+        if c.shape[0]:
+            for i in range(n_r):
+                weight[i] += c[3, i] * (x - low_v) + curve_slope(c, i, memory[i] - low_v)
+        g, s, h, t = 0.0, 0.0, 0.0, 0.0
+        for i in range(n_r):
+            one, two = weight[i] * by_low[i], weight[i] * by_high[i]
+            g += one
+            s += one * r[i]
+            h += two
+            t += two * r[i]
+        out[0, k], out[1, k], out[2, k], out[3, k] = g, s, h, t
+        for j in range(n_j):
+            bend, total = bends[j, k], 0.0
+            for i in range(n_r):
+                new = by_power[j, i]
+                new += moves[i] * (edge[i] * bend - new)
+                by_power[j, i] = new
+                total += weight[i] * new
+            out[4 + j, k] = total
 
 
 @kernel
@@ -188,6 +262,19 @@ class RateDependentHysteresis(Effect):
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
 
+    def slopes(self, block: Block) -> dict[str, NDArray[np.float64]]:
+        """Return the derivatives by all numbers, of one pass; see `Effect.slopes`."""
+        v = np.ascontiguousarray(block.x)
+        r, q, *_, low, c = self.hysteresis.for_kernel
+        power, bends = self._bent_power(v)
+        amplitudes = ('gain', 'stretch', 'lead', 'lead_stretch')
+        shape = ('exponent', 'levelling', 'cutoff')
+        out = np.empty((len(amplitudes) + len(bends), v.size))
+        gain, stretch, lead, lead_stretch = map(self.number, amplitudes)
+        memory = self._memory.copy()
+        _slopes(v, r, q, low, c, power, bends, gain, stretch, lead, lead_stretch, memory, out)
+        return dict(zip((*amplitudes, *shape), out, strict=True))
+
     def c_code(self) -> CCode:
         """Return the effect in C."""
         h = self.hysteresis
@@ -263,6 +350,27 @@ class RateDependentHysteresis(Effect):
         near = np.maximum(np.abs(speed) / levelled, SLOW) ** (exponent - 1.0)
         slope = exponent * near * np.sign(speed) / levelled**2
         return (np.abs(speed) / levelled) ** exponent, slope
+
+    def _bent_power(
+        self, v: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return `_power`, and its slopes with exponent, levelling and cutoff, shape (3, n)."""
+        exponent, levelling, cutoff = map(self.number, ('exponent', 'levelling', 'cutoff'))
+        near = float(np.exp(-2 * np.pi * cutoff * (1.0 + NEAR) / self.sample_rate))
+        speed, other = (
+            np.abs(_low_pass(v, pole, self.sample_rate, self._speed.copy()))
+            for pole in (self.pole, near)
+        )
+        levelled = 1.0 + levelling * speed
+        base = np.maximum(speed / levelled, STANDS)
+        power = base**exponent
+        slope = exponent * power / (base * levelled**2)
+        bends = [
+            power * np.log(base),
+            -exponent * power * base,
+            slope * (other - speed) / (NEAR * cutoff),
+        ]
+        return power, np.stack(bends)
 
     def _power(self, v: NDArray[np.float64], state: NDArray[np.float64]) -> NDArray[np.float64]:
         power = np.abs(_low_pass(v, self.pole, self.sample_rate, state))

@@ -29,6 +29,7 @@ from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 __all__ = [
     'cascade',
     'curve',
+    'curve_slope',
     'dynamics',
     'held',
     'hysteresis',
@@ -92,6 +93,13 @@ def curve(c: NDArray[np.float64], i: int, t: float) -> float:
     t = held(t, 0.0, c[4, i])
     bent: float = t * t * (c[0, i] + t * (c[1, i] + t * c[2, i]))
     return bent
+
+
+@ordered_kernel
+def curve_slope(c: NDArray[np.float64], i: int, t: float) -> float:
+    """Return the slope of `curve`."""
+    slope: float = t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
+    return slope if 0.0 < t < c[4, i] else 0.0
 
 
 @kernel

@@ -154,6 +154,33 @@ def test_rate_dependence_of_a_wide_hysteresis_moves_its_curves_too():
     assert_allclose(got, w, atol=1e-13)
 
 
+@pytest.mark.parametrize('is_wide', [False, True])
+def test_rate_dependence_knows_its_derivatives(is_wide):
+    r = np.array([0.1, 0.4])
+    bends = (0.1, [[0.2, -0.1], [0.1, 0.3]], [0.1, -0.1]) if is_wide else ()
+    h = Hysteresis(r, [0.3, 0.2], -0.2, 1.0, *bends)
+    effect = find_effect('rate_dependent_hysteresis')
+    numbers = ('gain', 'exponent', 'levelling', 'cutoff', 'stretch', 'lead', 'lead_stretch')
+    values = dict(zip(numbers, (1e-4, 0.8, 0.01, 500.0, 2e-3, 2e-5, -5e-5), strict=True))
+    k = np.arange(1500)
+    u = 0.5 - 0.45 * np.cos(0.013 * k) + 0.05 * np.sin(0.11 * k)
+    block = Block(k / FS, u, u)
+
+    def at_rest(**changed):
+        operator = effect(FS, effect.check({**values, **changed}), h, HysteresisOperator(h))
+        operator.reset(u[0], u[0])
+        return operator
+
+    slopes = at_rest().slopes(block)
+    assert set(slopes) == set(values)
+    for name, value in values.items():
+        near = 1e-6 * abs(value)
+        up, down = (at_rest(**{name: value + d}).process(block).x for d in (near, -near))
+        difference = (up - down) / (2.0 * near)
+        # a play that just leaves an edge, or just does not, is the rest
+        assert np.quantile(np.abs(slopes[name] - difference), 0.98) < 1e-4 * np.ptp(difference)
+
+
 # -- the static curve and the minor loops ------------------------------------------------------
 
 
