@@ -22,7 +22,8 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitt
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred
-from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect

@@ -38,7 +38,8 @@ from piezo_ident.diagnosis.results import (
     Residual,
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, means
-from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import (
     candidates_of,

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD, WIDE_SPREAD
 from piezo_ident.diagnosis.cross_validation import (
-    block_products,
     held_out_errors,
     held_out_residual,
     NormalEquations,
@@ -26,11 +25,12 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
+from piezo_ident.diagnosis.fit_steps import BaseColumns, next_damping, Scale, Step, WORSE
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from scipy.optimize import lsq_linear
 
 __all__ = [
     'BaseColumns',
@@ -43,33 +43,13 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-ITERATIONS, ATTEMPTS, TOLERANCE = 20, 10, 1e-3
-#: first damping, a share of the energy of each column
-DAMPING = 1e-4
+ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
+#: first damping, a share of the energy of each column, and the least
+DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 #: share of what shows a parameter that other kinds of excitation must hold to tell it
 FIRM = 0.01
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class BaseColumns:
-    """
-    Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
-
-    They are those of the law of H behind G, and the offset of each record; the products are those
-    of each block, shape (blocks, p, p), and of all.
-    """
-
-    columns: Array
-    products: Array
-    total: Array
-
-    @classmethod
-    def of(cls, rows: Rows, columns: Array) -> BaseColumns:
-        """Return columns with their products."""
-        products = block_products(rows, columns, columns)
-        return cls(columns, products, products.sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +124,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
-    step = _Step(base, np.empty((rows.n, 0)), rows.x - effects, prior)
+    step = Step(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return replace(state, offsets=theta[m:]).with_coefficients(law, theta[:m]), base
 
@@ -199,33 +179,38 @@ def fit_jointly(
     pull = pull_at and pull_at(state, p)
     for done in range(iterations):
         before = _loss(e, pull)
+        least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
-        step = _Step(base, moving, e, _prior(rows, e, p, state), pull)
-        better = None
-        for _ in range(ATTEMPTS):
+        step = Step(base, moving, e, _prior(rows, e, p, state), pull)
+        better, scale = None, Scale(rows, base, state.coefficients, e)
+        for failed in range(ATTEMPTS):
             tick()
             delta = step.solve(lower, upper, damping)
+            promised = step.gain(delta)
+            if promised < least:
+                break
             try:
-                trial = _moved(state, parameters, delta)
+                factor = scale.of(moving @ delta[p - len(parameters) :])
+                trial = _moved(state, parameters, delta, factor)
                 left = rows.x - simulator.remember(trial)
             except ModelError:
-                damping *= 3.0
+                damping *= WORSE ** (failed + 1)
                 continue
             new = pull_at and pull_at(trial, p)
             after = _loss(left, new)
             if np.isfinite(after) and after < before:
                 better = trial
                 break
-            damping *= 3.0
+            damping *= WORSE ** (failed + 1)
         if better is None:
             break
-        damping = max(damping / 10.0, 1e-9)
+        gain, more = before - after, iterations - 1 - done
+        damping = max(damping * next_damping(gain / promised), LEAST_DAMPING)
         state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
-        gain, more = before - after, iterations - 1 - done
         # a first step tells little of those behind it
         hopeless = done > 0 and after - more * gain > goal * e.size
-        if hopeless or gain < max(TOLERANCE * before, enough * e.size):
+        if hopeless or gain < least:
             break
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
@@ -293,6 +278,10 @@ def _derivatives(
     quick = simulator.filtered(
         [(p.effect, p.name, p.index or 0, s) for p, s in zip(parameters, steps, strict=True)]
     )
+    sloped = simulator.sloped([(p.effect, p.name) for p in parameters])
+    for j, slope in sloped.items():
+        value = parameters[j].get(state)
+        quick[j] = slope * value if parameters[j].logarithmic else slope
     others = [(j, p) for j, p in enumerate(parameters) if j not in quick]
     moved = [
         (p.moved(state, steps[j]), None if p.effect is None else state.effects[p.effect].effect)
@@ -316,57 +305,13 @@ def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[
     return lower, upper
 
 
-def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> State:
+def _moved(
+    state: State, parameters: tuple[FreeParameter, ...], step: Array, scale: float
+) -> State:
     m, k = state.coefficients.size, state.offsets.size
     new = replace(state, offsets=state.offsets + step[m : m + k])
     if state.law is not None:
-        new = new.with_coefficients(state.law, state.coefficients + step[:m])
+        new = new.with_coefficients(state.law, state.coefficients + step[:m] / scale)
     for parameter, delta in zip(parameters, step[m + k :], strict=True):
         new = parameter.moved(new, float(delta))
     return new
-
-
-class _Step:
-    """Normal equations of a step, scaled to columns of length one."""
-
-    def __init__(
-        self,
-        base: BaseColumns,
-        moving: Array,
-        e: Array,
-        prior: Array,
-        pull: Pull | None = None,
-    ) -> None:
-        # one pass over the many columns
-        known = base.columns.T @ np.concatenate([moving.T, e[None]]).T
-        mixed = known[:, :-1]
-        A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
-        b = np.concatenate([known[:, -1], moving.T @ e])
-        if pull is not None:
-            A, b = A + pull.A, b + pull.b
-        size = np.sqrt(np.diag(A))
-        self._size = np.where(size > 0.0, size, 1.0)
-        self._A = A / np.outer(self._size, self._size)
-        self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
-        # a column of zeros stays where it is
-        self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
-        self._b = b / self._size
-
-    def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
-        """Return the bounded step; damping is a share of each column's own energy."""
-        A = self._A.copy()
-        A[np.diag_indices_from(A)] += damping
-        wide = upper > lower
-        x = np.zeros(self._size.size)
-        bounds = ((lower * self._size)[wide], (upper * self._size)[wide])
-        try:
-            L = np.linalg.cholesky(A)
-            # what stays where it is adds nothing to the right-hand side
-            target = np.linalg.solve(L, self._b)
-            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise IdentificationError(
-                f'the joint fit is singular ({error}): its parameters do not follow from these '
-                'data; are all values of a plausible size?'
-            ) from None
-        return np.clip(x / self._size, lower, upper)

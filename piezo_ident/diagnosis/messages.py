@@ -12,7 +12,7 @@ from piezo_ident.diagnosis.criteria import TUNED
 from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import Added
+from piezo_ident.diagnosis.state import Added
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.simulator import State
+from piezo_ident.diagnosis.state import State
 from piezo_ident.effects.trials import number_of
 
 __all__ = ['FreeParameter', 'free_parameters']

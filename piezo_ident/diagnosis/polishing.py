@@ -5,15 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.starts import fit_starts
+from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
 __all__ = ['least_gain', 'polished', 'without_needless']
@@ -93,21 +94,23 @@ def _afresh(
     lines: Sequence[float],
     least: float,
     tick: Callable[[], None],
-) -> Iterator[Fitted]:
-    """Yield fits in which effect i starts again from its best trials."""
+) -> list[Fitted]:
+    """Return fits in which effect i starts again from its best trials."""
     rows, own = simulator.rows, fitted.state.effects[i]
     others = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
     state = replace(fitted.state, effects=others)
     rest = fit_jointly(simulator, state, base_at(simulator, state), iterations=2, tick=tick)
     scored = score_trials(simulator, rest, [own.effect], lines, np.zeros((rows.n, 0)))
     trials = sorted((s for s in scored if s.is_possible), key=lambda s: s.error)
-    for start in trials[: criteria.STARTS]:
-        effects = (*others[:i], started(rows, start), *others[i:])
-        state = replace(rest.state, effects=effects)
-        try:
-            yield fit_jointly(
-                simulator, state, fitted.base, enough=least, goal=fitted.mean_square, tick=tick
-            )
-        except (ModelError, IdentificationError):
-            # the fit that is there already stays
-            continue
+    starts = [
+        replace(rest.state, effects=(*others[:i], started(rows, start), *others[i:]))
+        for start in trials[: criteria.STARTS]
+    ]
+
+    def fit(own: Simulator, state: State, alive: Callable[[], None]) -> Fitted:
+        goal = fitted.mean_square
+        return fit_jointly(own, state, fitted.base, enough=least, goal=goal, tick=alive)
+
+    # where one fails the fit that is there already stays
+    fits = fit_starts(simulator, starts, fit, tick)
+    return [one for one in fits if isinstance(one, Fitted)]

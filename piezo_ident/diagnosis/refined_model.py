@@ -14,7 +14,8 @@ from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain, t
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
-from piezo_ident.diagnosis.simulator import Added, Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,9 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 __all__ = ['RunChain', 'asked_once', 'columns_of', 'effects_around', 'place_of', 'place_of_core']
 
 Array = NDArray[np.float64]
+
+#: factor of a derivative that a link which bends sees as a small change
+SMALL = 1e-6
 
 
 class RunChain:
@@ -55,6 +58,18 @@ class RunChain:
         """Return by how much all rows change with filters of what a link takes in."""
         behind = self.behind(place + 1, m)
         return behind.filtered(sections, self.blocks[place].x, self.rests[place])
+
+    def slopes(self, effect: type[Effect], blocks: Sequence[Block]) -> Mapping[str, Array]:
+        """Return what an effect around H knows of its derivatives, on blocks that were kept."""
+        core = place_of_core(self.operators)
+        around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
+        return around[0].slopes(blocks[core]) if around else {}
+
+    def behind_core(self, slope: Array, blocks: Sequence[Block], m: int) -> Array:
+        """Return the derivative of all rows from that of what comes out of H."""
+        self.blocks = [*blocks]
+        behind = self.behind(place_of_core(self.operators) + 1, m)
+        return behind.rows(SMALL * slope) / SMALL
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:
         """Return by how much all rows differ from a kept chain's, alike but for a link here."""

@@ -14,17 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.fit_steps import BaseColumns
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.polishing import least_gain
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import has_place, shows
-from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.starts import fit_starts
+from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored, started, Tick
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
@@ -174,32 +178,18 @@ def _contenders(
     for i, (effect, states) in enumerate(starts):
         at = 0.5 + 0.5 * i / len(starts)
         alive()
-        fits, failure = [], ''
-        for state in states:
-            # what will not gain a share of the best is hardly one of those fitted to the end
-            goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
-            try:
-                fits.append(
-                    fit_jointly(
-                        simulator,
-                        state,
-                        before.base,
-                        iterations=criteria.FIRST,
-                        goal=goal,
-                        tick=alive,
-                    )
-                )
-                least = min(least, fits[-1].mean_square)
-            except ModelError:
-                # the law cannot run with these parameters
-                continue
-            except IdentificationError as error:
-                failure = f'{effect.name} was not judged: {error}'
+        # what will not gain a share of the best is hardly one of those fitted to the end
+        goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
+        found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
+        fits = [one for one in found if isinstance(one, Fitted)]
+        least = min([least, *(one.mean_square for one in fits)])
+        # of a ModelError: the law cannot run with these parameters
+        failures = [one for one in found if isinstance(one, IdentificationError)]
         if fits:
             contenders.append(min(fits, key=lambda f: f.mean_square))
             beside_wide[effect.name] = min(fits[: criteria.STARTS], key=lambda f: f.mean_square)
-        elif failure:
-            warnings.append(failure)
+        elif failures:
+            warnings.append(f'{effect.name} was not judged: {failures[-1]}')
     contenders.sort(key=lambda c: c.mean_square)
     done = noise + simulator.rows.square(criteria.INDISTINCT)
     gains = [before.mean_square - c.mean_square for c in contenders]
@@ -225,6 +215,13 @@ def _contenders(
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
+
+
+def _begun(
+    base: BaseColumns, goal: float, simulator: Simulator, state: State, tick: Callable[[], None]
+) -> Fitted:
+    """Return a fit after a few steps."""
+    return fit_jointly(simulator, state, base, iterations=criteria.FIRST, goal=goal, tick=tick)
 
 
 def _to_the_end(

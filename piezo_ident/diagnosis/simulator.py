@@ -12,10 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 import os
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,92 +36,20 @@ from piezo_ident.diagnosis.run_chain import (
     place_of_core,
     RunChain,
 )
-from piezo_ident.effects import Effect, find_effect
-from piezo_ident.effects.trials import with_number
+from piezo_ident.diagnosis.state import Added, State
+from piezo_ident.effects import Effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filter_arx
-from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
-__all__ = [
-    'Added',
-    'Simulator',
-    'State',
-]
+__all__ = ['Simulator']
 
 Array = NDArray[np.float64]
 T = TypeVar('T')
 
 #: runs that go side by side at most
 MOST_THREADS = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Added:
-    """
-    An effect in the model under study, with its parameters in each record.
-
-    They are the same in all, unless the effect is driven by time.
-    """
-
-    name: str
-    values: tuple[Mapping[str, Any], ...]
-
-    def __post_init__(self) -> None:
-        frozen = tuple(MappingProxyType(dict(v)) for v in self.values)
-        object.__setattr__(self, 'values', frozen)
-
-    @property
-    def effect(self) -> type[Effect]:
-        """Its class."""
-        return find_effect(self.name)
-
-    def changed(self, record: int | None, name: str, index: int | None, value: float) -> Added:
-        """Return the effect with one number changed, in one record or in all."""
-        return Added(
-            self.name,
-            tuple(
-                with_number(old, name, index, value) if record in (None, k) else old
-                for k, old in enumerate(self.values)
-            ),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """
-    What is fitted: H, the offset of each record, and the effects added.
-
-    Attributes
-    ----------
-    hysteresis : Hysteresis
-    offsets : ndarray, shape (records,)
-        Added to the displacement, normalised.
-    effects : tuple of Added
-    retuning : tuple of float
-        Coefficients of `retuned`, empty where G stays as it is.
-    law : HysteresisLaw or None
-        The family of H; None for an H that is taken as it is.
-    coefficients : ndarray, shape (size,)
-        Those of the law.
-    """
-
-    hysteresis: Hysteresis
-    offsets: Array
-    effects: tuple[Added, ...] = ()
-    retuning: tuple[float, ...] = ()
-    law: HysteresisLaw | None = None
-    coefficients: Array = field(default_factory=lambda: np.empty(0))
-
-    def with_coefficients(self, law: HysteresisLaw, coefficients: Array) -> State:
-        """Return the state with another H of a family."""
-        theta = np.maximum(coefficients, law.lower)
-        return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
-
-    def with_effect(self, added: Added) -> State:
-        """Return the state with one more effect."""
-        return replace(self, effects=(*self.effects, added))
 
 
 class Simulator:
@@ -144,6 +71,13 @@ class Simulator:
         #: holds some signals as long as a run
         self._threads = min(MOST_THREADS, os.cpu_count() or 1)
         self._pool = ThreadPoolExecutor(self._threads)
+        self._copies: list[Simulator] = []
+
+    def copies(self, count: int) -> list[Simulator]:
+        """Return this simulator and others of the same rows, no more than processors."""
+        while len(self._copies) < min(count - 1, self._threads - 1):
+            self._copies.append(Simulator(self.model, self.rows))
+        return [self, *self._copies[: count - 1]]
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
@@ -310,6 +244,32 @@ class Simulator:
             parts = self._of_runs(partial(self._filtered, effect, stacked))
             columns |= dict(zip(sections, self._joined(parts) / steps[:, None], strict=True))
         return columns
+
+    def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
+        """
+        Return derivatives of the rows by those wanted numbers whose effect knows them itself.
+
+        As of `filtered`; each wanted is an effect's place, or None, and the name of a parameter.
+        """
+        kept, runs = self._known(), len(self._sources)
+        columns: dict[int, Array] = {}
+        for i in sorted({i for i, _ in wanted if i is not None}):
+            effect = kept.state.effects[i].effect
+            slopes = self._of_runs(partial(self._slopes, effect))
+            known = [j for j, (own, name) in enumerate(wanted) if own == i and name in slopes[0]]
+            tasks = [(k, slopes[k][wanted[j][1]]) for j in known for k in range(runs)]
+            parts = list(self._pool.map(self._behind_core, tasks))
+            for at, j in enumerate(known):
+                columns[j] = self._joined(parts[at * runs : (at + 1) * runs])
+        return columns
+
+    def _slopes(self, effect: type[Effect], i: int) -> Mapping[str, Array]:
+        kept = self._known()
+        return self._chain(kept.state, i).slopes(effect, kept.chains[i].blocks)
+
+    def _behind_core(self, task: tuple[int, Array]) -> Array:
+        (i, change), kept = task, self._known()
+        return self._chain(kept.state, i).behind_core(change, kept.chains[i].blocks, self.rows.m)
 
     def _filtered(self, effect: type[Effect] | None, sections: Array, i: int) -> Array:
         chain = self._known().chains[i]

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.simulator import Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
 
 __all__ = ['loops', 'toward_given']
 

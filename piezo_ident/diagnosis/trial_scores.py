@@ -25,7 +25,8 @@ from piezo_ident.diagnosis.cross_validation import (
 )
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.simulator import Added, Simulator
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import Added
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means

@@ -12,7 +12,8 @@ from piezo_ident.diagnosis.base_refit import refits
 from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain
 from piezo_ident.diagnosis.rows import centred, make_rows
-from piezo_ident.diagnosis.simulator import Added, Simulator, State
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.toward_given import loops, toward_given
 from piezo_ident.record.record import Record
 from programs import slow_model

@@ -13,7 +13,7 @@ from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
 from piezo_ident.diagnosis.search import takes
-from piezo_ident.diagnosis.simulator import State
+from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
 import pytest

@@ -1,0 +1,133 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The steps of a joint fit: their equations, their damping, and what a step of H is worth.
+
+Gauss-Newton steps with the damping of Levenberg and Marquardt, which follows how much of what a
+step promised came true: D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
+doi:10.1137/0111030.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.cross_validation import block_products, Pull
+from piezo_ident.diagnosis.rows import centred, Rows
+from scipy.optimize import lsq_linear
+
+__all__ = ['WORSE', 'BaseColumns', 'Scale', 'Step', 'next_damping']
+
+Array = NDArray[np.float64]
+
+#: factor of the damping after a step that failed; its square after the next one, and so on
+WORSE = 3.0
+#: shares of what a step promised: above the first damping falls, below the second it grows
+KEPT = (0.75, 0.25)
+#: factors of H beyond which something else is the matter
+SCALES = (0.2, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseColumns:
+    """
+    Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
+
+    They are those of the law of H behind G, and the offset of each record; the products are those
+    of each block, shape (blocks, p, p), and of all.
+    """
+
+    columns: Array
+    products: Array
+    total: Array
+
+    @classmethod
+    def of(cls, rows: Rows, columns: Array) -> BaseColumns:
+        """Return columns with their products."""
+        products = block_products(rows, columns, columns)
+        return cls(columns, products, products.sum(axis=0))
+
+
+class Scale:
+    """
+    How much larger H comes out of the chain than its columns tell.
+
+    What is behind H multiplies it: creep, a gain, the effects that the columns left out.  A step
+    of both is no sum of the two, and without the product a fit creeps along a bent valley.
+    """
+
+    def __init__(self, rows: Rows, base: BaseColumns, coefficients: Array, e: Array) -> None:
+        self._x = centred(rows.x - e, rows.of_record)
+        h = base.columns[:, : coefficients.size] @ coefficients
+        self._h = centred(h, rows.of_record)
+        self._size = float(self._h @ self._h)
+
+    def of(self, change: Array) -> float:
+        """Return the factor once the rows have changed, shape (n,)."""
+        if self._size == 0.0:
+            return 1.0
+        factor = float((self._x + change) @ self._h) / self._size
+        return factor if SCALES[0] < factor < SCALES[1] else 1.0
+
+
+class Step:
+    """Normal equations of a step, scaled to columns of length one."""
+
+    def __init__(
+        self,
+        base: BaseColumns,
+        moving: Array,
+        e: Array,
+        prior: Array,
+        pull: Pull | None = None,
+    ) -> None:
+        # one pass over the many columns
+        known = base.columns.T @ np.concatenate([moving.T, e[None]]).T
+        mixed = known[:, :-1]
+        A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
+        b = np.concatenate([known[:, -1], moving.T @ e])
+        if pull is not None:
+            A, b = A + pull.A, b + pull.b
+        size = np.sqrt(np.diag(A))
+        self._size = np.where(size > 0.0, size, 1.0)
+        self._plain = A / np.outer(self._size, self._size)
+        self._A = self._plain.copy()
+        self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
+        # a column of zeros stays where it is
+        self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
+        self._b = b / self._size
+
+    def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
+        """Return the bounded step; damping is a share of each column's own energy."""
+        A = self._A.copy()
+        A[np.diag_indices_from(A)] += damping
+        wide = upper > lower
+        x = np.zeros(self._size.size)
+        bounds = ((lower * self._size)[wide], (upper * self._size)[wide])
+        try:
+            L = np.linalg.cholesky(A)
+            # what stays where it is adds nothing to the right-hand side
+            target = np.linalg.solve(L, self._b)
+            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise IdentificationError(
+                f'the joint fit is singular ({error}): its parameters do not follow from these '
+                'data; are all values of a plausible size?'
+            ) from None
+        return np.clip(x / self._size, lower, upper)
+
+    def gain(self, delta: Array) -> float:
+        """Return by how much a step lowers the sum of squares, were the model linear."""
+        x = delta * self._size
+        return float(x @ (2.0 * self._b - self._plain @ x))
+
+
+def next_damping(kept: float) -> float:
+    """Return the factor of the damping after a step that kept a share of what it promised."""
+    if kept > KEPT[0]:
+        return 0.1
+    return 1.0 if kept > KEPT[1] else WORSE

@@ -1,0 +1,89 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a joint fit moves: H, offsets, and effects in a model under study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.effects import Effect, find_effect
+from piezo_ident.effects.trials import with_number
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+
+__all__ = ['Added', 'State']
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """
+    An effect in the model under study, with its parameters in each record.
+
+    They are the same in all, unless the effect is driven by time.
+    """
+
+    name: str
+    values: tuple[Mapping[str, Any], ...]
+
+    def __post_init__(self) -> None:
+        frozen = tuple(MappingProxyType(dict(v)) for v in self.values)
+        object.__setattr__(self, 'values', frozen)
+
+    @property
+    def effect(self) -> type[Effect]:
+        """Its class."""
+        return find_effect(self.name)
+
+    def changed(self, record: int | None, name: str, index: int | None, value: float) -> Added:
+        """Return the effect with one number changed, in one record or in all."""
+        return Added(
+            self.name,
+            tuple(
+                with_number(old, name, index, value) if record in (None, k) else old
+                for k, old in enumerate(self.values)
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    What is fitted: H, the offset of each record, and the effects added.
+
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+    offsets : ndarray, shape (records,)
+        Added to the displacement, normalised.
+    effects : tuple of Added
+    retuning : tuple of float
+        Coefficients of `retuned`, empty where G stays as it is.
+    law : HysteresisLaw or None
+        The family of H; None for an H that is taken as it is.
+    coefficients : ndarray, shape (size,)
+        Those of the law.
+    """
+
+    hysteresis: Hysteresis
+    offsets: Array
+    effects: tuple[Added, ...] = ()
+    retuning: tuple[float, ...] = ()
+    law: HysteresisLaw | None = None
+    coefficients: Array = field(default_factory=lambda: np.empty(0))
+
+    def with_coefficients(self, law: HysteresisLaw, coefficients: Array) -> State:
+        """Return the state with another H of a family."""
+        theta = np.maximum(coefficients, law.lower)
+        return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
+
+    def with_effect(self, added: Added) -> State:
+        """Return the state with one more effect."""
+        return replace(self, effects=(*self.effects, added))
