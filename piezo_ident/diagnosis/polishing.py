@@ -13,7 +13,7 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.starts import fit_starts
+from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
@@ -113,4 +113,4 @@ def _afresh(
 
     # where one fails the fit that is there already stays
     fits = fit_starts(simulator, starts, fit, tick)
-    return [one for one in fits if isinstance(one, Fitted)]
+    return [one for one in fits if not isinstance(one, Failure)]

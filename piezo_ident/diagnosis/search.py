@@ -27,7 +27,7 @@ from piezo_ident.diagnosis.polishing import least_gain
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.starts import fit_starts
+from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored, started, Tick
 from piezo_ident.effects import Effect, find_effect
@@ -181,7 +181,7 @@ def _contenders(
         # what will not gain a share of the best is hardly one of those fitted to the end
         goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
         found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
-        fits = [one for one in found if isinstance(one, Fitted)]
+        fits = [one for one in found if not isinstance(one, Failure)]
         least = min([least, *(one.mean_square for one in fits)])
         # of a ModelError: the law cannot run with these parameters
         failures = [one for one in found if isinstance(one, IdentificationError)]

@@ -296,7 +296,9 @@ def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
     )
     before = SimpleNamespace(mean_square=WHOLE, base=None)
     starts = [(SimpleNamespace(name=name), [name]) for name in fits]
-    search._contenders(SimpleNamespace(rows=rows), before, starts, 0.0, lambda _: None)
+    simulator = SimpleNamespace(rows=rows)
+    simulator.copies = lambda _: [simulator]
+    search._contenders(simulator, before, starts, 0.0, lambda _: None)
     assert seen == ended
 
 
