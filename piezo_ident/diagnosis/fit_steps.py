@@ -57,7 +57,8 @@ class Scale:
     How much larger H comes out of the chain than its columns tell.
 
     What is behind H multiplies it: creep, a gain, the effects that the columns left out.  A step
-    of both is no sum of the two, and without the product a fit creeps along a bent valley.
+    of both is no sum of the two, and without the product a fit creeps along a bent valley.  What
+    only adds to the signal counts as a factor, too: that costs steps, and moves no optimum.
     """
 
     def __init__(self, rows: Rows, base: BaseColumns, coefficients: Array, e: Array) -> None:

@@ -33,7 +33,6 @@ from piezo_ident.diagnosis.state import State
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 __all__ = [
-    'BaseColumns',
     'Fitted',
     'base_at',
     'fit_base',
@@ -157,9 +156,9 @@ def fit_jointly(
     """
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
-    A step that lowers the mean square by less than `enough` is the last one, and so is one after
-    which the steps that are left, were they like it, would not reach the mean square `goal` of
-    what is fitted.
+    A step that lowers the mean square by less than `enough` is the last one, and one that promises
+    less is not made.  So is one after which the steps that are left, were they like it, would not
+    reach the mean square `goal` of what is fitted.
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
     `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 

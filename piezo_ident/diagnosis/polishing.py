@@ -107,9 +107,9 @@ def _afresh(
         for start in trials[: criteria.STARTS]
     ]
 
-    def fit(own: Simulator, state: State, alive: Callable[[], None]) -> Fitted:
+    def fit(alone: Simulator, start: State, alive: Callable[[], None]) -> Fitted:
         goal = fitted.mean_square
-        return fit_jointly(own, state, fitted.base, enough=least, goal=goal, tick=alive)
+        return fit_jointly(alone, start, fitted.base, enough=least, goal=goal, tick=alive)
 
     # where one fails the fit that is there already stays
     fits = fit_starts(simulator, starts, fit, tick)

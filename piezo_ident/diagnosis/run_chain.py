@@ -21,7 +21,7 @@ __all__ = ['RunChain', 'asked_once', 'columns_of', 'effects_around', 'place_of',
 
 Array = NDArray[np.float64]
 
-#: factor of a derivative that a link which bends sees as a small change
+#: the largest of a derivative, as the small change that a link which bends sees
 SMALL = 1e-6
 
 
@@ -62,14 +62,16 @@ class RunChain:
     def slopes(self, effect: type[Effect], blocks: Sequence[Block]) -> Mapping[str, Array]:
         """Return what an effect around H knows of its derivatives, on blocks that were kept."""
         core = place_of_core(self.operators)
+        # each adds to what H makes of one input, so that none stands behind another
         around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
         return around[0].slopes(blocks[core]) if around else {}
 
     def behind_core(self, slope: Array, blocks: Sequence[Block], m: int) -> Array:
         """Return the derivative of all rows from that of what comes out of H."""
-        self.blocks = [*blocks]
+        self.blocks = list(blocks)
         behind = self.behind(place_of_core(self.operators) + 1, m)
-        return behind.rows(SMALL * slope) / SMALL
+        small = SMALL / max(float(np.abs(slope).max(initial=0.0)), SMALL**2)
+        return behind.rows(small * slope) / small
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:
         """Return by how much all rows differ from a kept chain's, alike but for a link here."""

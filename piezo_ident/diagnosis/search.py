@@ -183,7 +183,7 @@ def _contenders(
         found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
         fits = [one for one in found if not isinstance(one, Failure)]
         least = min([least, *(one.mean_square for one in fits)])
-        # of a ModelError: the law cannot run with these parameters
+        # a law that cannot run with these parameters is a ModelError, and no warning
         failures = [one for one in found if isinstance(one, IdentificationError)]
         if fits:
             contenders.append(min(fits, key=lambda f: f.mean_square))

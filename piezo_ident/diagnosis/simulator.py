@@ -79,6 +79,12 @@ class Simulator:
             self._copies.append(Simulator(self.model, self.rows))
         return [self, *self._copies[: count - 1]]
 
+    def forget(self) -> None:
+        """Give back the room of what is kept from the run before."""
+        self._kept = None
+        for answer in self._answers:
+            answer.clear()
+
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the effects as in one record."""
         settings = [EffectSetting(a.name, a.values[record]) for a in state.effects]
@@ -255,6 +261,8 @@ class Simulator:
         columns: dict[int, Array] = {}
         for i in sorted({i for i, _ in wanted if i is not None}):
             effect = kept.state.effects[i].effect
+            if effect.slot != 'hysteresis':
+                continue
             slopes = self._of_runs(partial(self._slopes, effect))
             known = [j for j, (own, name) in enumerate(wanted) if own == i and name in slopes[0]]
             tasks = [(k, slopes[k][wanted[j][1]]) for j in known for k in range(runs)]

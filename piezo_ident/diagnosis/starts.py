@@ -16,7 +16,7 @@ from piezo_ident.diagnosis.state import State
 
 __all__ = ['Failure', 'fit_starts']
 
-#: what ends a fit, and no other
+#: what fails one start, and leaves the others going
 Failure = ModelError | IdentificationError
 
 #: how often a caller is asked whether to go on [s]
@@ -49,6 +49,9 @@ def fit_starts(
                 found.append(fit(copies[k], state, alive))
             except (ModelError, IdentificationError) as error:
                 found.append(error)
+            except BaseException:
+                stopped.set()
+                raise
         return found
 
     with ThreadPoolExecutor(len(copies)) as pool:
@@ -60,5 +63,13 @@ def fit_starts(
         except BaseException:
             stopped.set()
             raise
-        shares = [future.result() for future in futures]
+        finally:
+            wait(futures)
+            for copy in copies[1:]:
+                copy.forget()
+    # the one that stopped the others says why
+    errors = [future.exception() for future in futures]
+    for error in sorted(filter(None, errors), key=lambda error: isinstance(error, Cancelled)):
+        raise error
+    shares = [future.result() for future in futures]
     return [shares[i % len(copies)][i // len(copies)] for i in range(len(states))]

@@ -324,10 +324,10 @@ class Effect:
 
     def slopes(self, block: Block) -> Mapping[str, NDArray[np.float64]]:
         """
-        Return the derivatives of what `process` makes of a block, by numbers that know them.
+        Return the derivatives of what `process` would make of a block, by names of parameters.
 
-        From rest and without a step of the effect itself; each of shape (n,).  By default none:
-        they are then taken by differences.
+        From the memory as it is, which stays; each of shape (n,).  For effects around H, and
+        parameters that are single numbers.  By default none: they are taken by differences.
         """
         return {}
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.kernel import alive, kernel
+from piezo_ident.common.kernel import alive, kernel, STILL
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
@@ -18,8 +18,6 @@ __all__ = ['RateDependentHysteresis']
 
 #: relative step of the low-pass of the speed, for the slope of the power
 NEAR = 1e-5
-#: speed that counts as none [spans/s]
-STANDS = 1e-30
 #: speed below which the slope of its power is taken at it [spans/s]
 SLOW = 1e-3
 
@@ -362,7 +360,7 @@ class RateDependentHysteresis(Effect):
             for pole in (self.pole, near)
         )
         levelled = 1.0 + levelling * speed
-        base = np.maximum(speed / levelled, STANDS)
+        base = np.maximum(speed / levelled, STILL)
         power = base**exponent
         slope = exponent * power / (base * levelled**2)
         bends = [
