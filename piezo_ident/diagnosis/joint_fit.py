@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
-from piezo_ident.diagnosis.fit_steps import BaseColumns, next_damping, Scale, Step, WORSE
+from piezo_ident.diagnosis.fit_steps import BaseColumns, next_damping, Step, WORSE
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -181,7 +181,7 @@ def fit_jointly(
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
         step = Step(base, moving, e, _prior(rows, e, p, state), pull)
-        better, scale = None, Scale(rows, base, state.coefficients, e)
+        better = None
         for failed in range(ATTEMPTS):
             tick()
             delta = step.solve(lower, upper, damping)
@@ -189,8 +189,7 @@ def fit_jointly(
             if promised < least:
                 break
             try:
-                factor = scale.of(moving @ delta[p - len(parameters) :])
-                trial = _moved(state, parameters, delta, factor)
+                trial = _moved(state, parameters, delta)
                 left = rows.x - simulator.remember(trial)
             except ModelError:
                 damping *= WORSE ** (failed + 1)
@@ -304,13 +303,11 @@ def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[
     return lower, upper
 
 
-def _moved(
-    state: State, parameters: tuple[FreeParameter, ...], step: Array, scale: float
-) -> State:
+def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> State:
     m, k = state.coefficients.size, state.offsets.size
     new = replace(state, offsets=state.offsets + step[m : m + k])
     if state.law is not None:
-        new = new.with_coefficients(state.law, state.coefficients + step[:m] / scale)
+        new = new.with_coefficients(state.law, state.coefficients + step[:m])
     for parameter, delta in zip(parameters, step[m + k :], strict=True):
         new = parameter.moved(new, float(delta))
     return new
