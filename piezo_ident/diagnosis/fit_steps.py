@@ -20,7 +20,7 @@ from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import Rows
 from scipy.optimize import lsq_linear
 
-__all__ = ['WORSE', 'BaseColumns', 'Step', 'next_damping']
+__all__ = ['WORSE', 'BaseColumns', 'FitStep', 'next_damping']
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class BaseColumns:
         return cls(columns, products, products.sum(axis=0))
 
 
-class Step:
+class FitStep:
     """Normal equations of a step, scaled to columns of length one."""
 
     def __init__(

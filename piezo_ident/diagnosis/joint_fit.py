@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
-from piezo_ident.diagnosis.fit_steps import BaseColumns, next_damping, Step, WORSE
+from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, WORSE
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -123,7 +123,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
-    step = Step(base, np.empty((rows.n, 0)), rows.x - effects, prior)
+    step = FitStep(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return replace(state, offsets=theta[m:]).with_coefficients(law, theta[:m]), base
 
@@ -180,7 +180,7 @@ def fit_jointly(
         before = _loss(e, pull)
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
-        step = Step(base, moving, e, _prior(rows, e, p, state), pull)
+        step = FitStep(base, moving, e, _prior(rows, e, p, state), pull)
         better = None
         for failed in range(ATTEMPTS):
             tick()

@@ -12,7 +12,7 @@ import time
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
 from piezo_ident.diagnosis.base_refit import base_thresholds
-from piezo_ident.diagnosis.fit_steps import BaseColumns, next_damping, Step
+from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping
 from piezo_ident.diagnosis.joint_fit import fit_base
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -47,7 +47,7 @@ def test_a_step_promises_what_a_linear_model_gains():
     rng = np.random.default_rng(3)
     columns, moving, e = rng.normal(size=(300, 4)), rng.normal(size=(300, 2)), rng.normal(size=300)
     one = BaseColumns(columns, np.empty(0), columns.T @ columns)
-    step = Step(one, moving, e, np.zeros(6))
+    step = FitStep(one, moving, e, np.zeros(6))
     for damping in (0.0, 0.1, 3.0):
         delta = step.solve(np.full(6, -np.inf), np.full(6, np.inf), damping)
         left = e - np.column_stack([columns, moving]) @ delta
