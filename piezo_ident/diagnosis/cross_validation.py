@@ -107,16 +107,16 @@ def with_columns(
 ) -> NormalEquations:
     """Return the normal equations of ``[M C]`` from those of M."""
     right = block_products(rows, M, C)
-    lower = block_products(rows, C, np.column_stack([C, E]))
-    c = C.shape[1]
+    lower = block_products(rows, C, C)
     A = np.concatenate(
         [
             np.concatenate([equations.A, right], axis=2),
-            np.concatenate([right.transpose(0, 2, 1), lower[:, :, :c]], axis=2),
+            np.concatenate([right.transpose(0, 2, 1), lower], axis=2),
         ],
         axis=1,
     )
-    return NormalEquations(A, np.concatenate([equations.b, lower[:, :, c:]], axis=1), equations.s)
+    b = np.concatenate([equations.b, block_products(rows, C, E)], axis=1)
+    return NormalEquations(A, b, equations.s)
 
 
 def solve(A: Array, b: Array, prior: Array) -> Array:

@@ -138,8 +138,8 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
     if state.law is None:
         return BaseColumns.of(rows, offsets)
     simulator.remember(state)
-    columns = simulator.columns(state, state.law, WEIGHT_STEP)
-    return BaseColumns.of(rows, np.concatenate([columns, offsets.T]).T)
+    columns = simulator.columns(state, state.law, WEIGHT_STEP, offsets.T)
+    return BaseColumns.of(rows, columns.T)
 
 
 def fit_jointly(

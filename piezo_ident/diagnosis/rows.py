@@ -154,7 +154,7 @@ class Rows:
         """Number of the record that has most rows."""
         return int(np.bincount(self.of_record, minlength=len(self.names)).argmax())
 
-    @property
+    @functools.cached_property
     def edges(self) -> Integers:
         """First row of each block, and the end; shape (blocks + 1,)."""
         starts = np.flatnonzero(np.diff(self.block, prepend=-1))

@@ -131,11 +131,11 @@ class Simulator:
         raw = law.columns(source.x, self.rows.memories[i](law.thresholds), places)
         return np.stack([behind.rows(x, float(x[0])) for x in raw])
 
-    def columns(self, state: State, law: HysteresisLaw, step: float) -> Array:
+    def columns(self, state: State, law: HysteresisLaw, step: float, more: Array) -> Array:
         """
-        Return what the whole chain makes of a step of each coefficient of H; shape (size, n).
+        Return what the whole chain makes of a step of each coefficient of H; shape (size + k, n).
 
-        Of a state that is remembered, divided by the step.
+        Of a state that is remembered, divided by the step; `more`, shape (k, n), stands behind.
         """
         chains = self._known(state).chains
 
@@ -159,7 +159,7 @@ class Simulator:
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
             return np.stack([behind.rows(x, float(x[0])) / step for x in changes])
 
-        return self._of_columns(law.size, of_run)
+        return self._of_columns(law.size, of_run, more)
 
     def bare(self, state: State) -> Array:
         """Return the rows of H, G and the delay alone; shape (n,)."""
@@ -287,21 +287,29 @@ class Simulator:
         """Return what a function of the place of a run gives for each."""
         return list(self._pool.map(function, range(len(self._sources))))
 
-    def _of_columns(self, size: int, function: Callable[[int, range], Array]) -> Array:
-        """Return the columns that a function of a run and of their places gives."""
-        runs = range(len(self._sources))
+    def _of_columns(
+        self, size: int, function: Callable[[int, range], Array], more: Array | None = None
+    ) -> Array:
+        """Return the columns that a function of a run and of their places gives, and more."""
+        keep = self.rows.keep
+        ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
         # all processors share a run alone
-        share = -(-self._threads // len(runs))
-        tasks = [(i, range(k, size, share)) for i in runs for k in range(min(share, size))]
-        whole = [np.empty((size, keep.size)) for keep in self.rows.keep]
+        share = -(-self._threads // len(keep))
+        tasks = [(i, range(k, size, share)) for i in range(len(keep)) for k in range(share)]
+        extra = np.empty((0, self.rows.n)) if more is None else more
+        whole = np.empty((size + extra.shape[0], self.rows.n))
+        whole[size:] = extra
 
         def fill(task: tuple[int, range]) -> None:
             i, places = task
-            whole[i][places] = function(i, places)
+            if places:
+                columns = function(i, places)
+                own = columns if keep[i].all() else columns[:, keep[i]]
+                whole[places, ends[i] : ends[i + 1]] = own
 
         for _ in self._pool.map(fill, tasks):
             pass
-        return self._joined(whole)
+        return whole
 
     def _known(self, state: State | None = None) -> _Kept:
         if self._kept is None or state not in (None, self._kept.state):
