@@ -9,12 +9,36 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import ordered_kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
 __all__ = ['GainDrift']
+
+
+@ordered_kernel
+def _with_gain(
+    x: NDArray[np.float64],
+    t: NDArray[np.float64],
+    at: NDArray[np.int64],
+    knots: NDArray[np.float64],
+    gains: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    # at: the first sample of each knot; the gain between two is a straight line
+    out = np.empty(x.size)
+    for i in range(-1, knots.size):
+        start, stop = at[i] if i >= 0 else 0, at[i + 1] if i + 1 < at.size else x.size
+        knot, gain, slope = knots[max(i, 0)], gains[max(i, 0)], 0.0
+        if 0 <= i < knots.size - 1:
+            slope = (gains[i + 1] - gain) / (knots[i + 1] - knot)
+        # slices, whose indices cannot be negative, let the loop run in vector lanes
+        now, before, after = t[start:stop], x[start:stop], out[start:stop]
+        for k in range(now.size):
+            after[k] = before[k] * (1.0 + (gain + slope * (now[k] - knot)))
+    return out
 
 
 class GainDrift(Effect):
@@ -82,7 +106,8 @@ class GainDrift(Effect):
         time, gain = self.array('time'), self.array('gain')
         if not gain.any():
             return block
-        return block.with_signal(block.x * (1.0 + np.interp(block.t, time, gain)))
+        x, t = (np.ascontiguousarray(signal) for signal in (block.x, block.t))
+        return block.with_signal(_with_gain(x, t, np.searchsorted(t, time), time, gain))
 
     def c_code(self) -> CCode:
         """Return the effect in C."""

@@ -57,10 +57,10 @@ class ThermalDrift(Effect):
     def process(self, block: Block) -> Block:
         """Return the block with the drift added."""
         t = np.maximum(block.t, 0.0)
-        approach = -np.expm1(-t / self.number('time_constant'))
-        return block.with_signal(
-            block.x + self.number('rate') * t + self.number('amplitude') * approach
-        )
+        x = block.x + self.number('rate') * t
+        if self.number('amplitude'):
+            x -= self.number('amplitude') * np.expm1(-t / self.number('time_constant'))
+        return block.with_signal(x)
 
     def c_code(self) -> CCode:
         """Return the effect in C."""
