@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.cross_validation import block_products, Pull
-from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.rows import centred, Rows
 from scipy.optimize import lsq_linear
 
-__all__ = ['WORSE', 'BaseColumns', 'FitStep', 'next_damping']
+__all__ = ['WORSE', 'BaseColumns', 'FitStep', 'Scale', 'next_damping']
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 WORSE = 3.0
 #: shares of what a step promised: above the first damping falls, below the second it grows
 KEPT = (0.75, 0.25)
+#: factors of H beyond which something else is the matter
+SCALES = (0.2, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,28 @@ class BaseColumns:
         """Return columns with their products."""
         products = block_products(rows, columns, columns)
         return cls(columns, products, products.sum(axis=0))
+
+
+class Scale:
+    """
+    How much larger H comes out of the chain than its columns tell.
+
+    What is behind H multiplies it: creep, a gain, the effects that the columns left out.  A step
+    of both is no sum of the two, and without the product a fit creeps along a bent valley.
+    """
+
+    def __init__(self, rows: Rows, base: BaseColumns, coefficients: Array, e: Array) -> None:
+        self._x = centred(rows.x - e, rows.of_record)
+        h = base.columns[:, : coefficients.size] @ coefficients
+        self._h = centred(h, rows.of_record)
+        self._size = float(self._h @ self._h)
+
+    def of(self, change: Array) -> float:
+        """Return the factor once the rows have changed, shape (n,)."""
+        if self._size == 0.0:
+            return 1.0
+        factor = float((self._x + change) @ self._h) / self._size
+        return factor if SCALES[0] < factor < SCALES[1] else 1.0
 
 
 class FitStep:

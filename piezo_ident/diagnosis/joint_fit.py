@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
-from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, WORSE
+from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, Scale, WORSE
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -181,7 +181,7 @@ def fit_jointly(
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
         step = FitStep(base, moving, e, _prior(rows, e, p, state), pull)
-        better = None
+        better, scale = None, Scale(rows, base, state.coefficients, e)
         for failed in range(ATTEMPTS):
             tick()
             delta = step.solve(lower, upper, damping)
@@ -189,7 +189,8 @@ def fit_jointly(
             if promised < least:
                 break
             try:
-                trial = _moved(state, parameters, delta)
+                factor = scale.of(moving @ delta[p - len(parameters) :])
+                trial = _moved(state, parameters, delta, factor)
                 left = rows.x - simulator.remember(trial)
             except ModelError:
                 damping *= WORSE ** (failed + 1)
@@ -303,11 +304,13 @@ def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[
     return lower, upper
 
 
-def _moved(state: State, parameters: tuple[FreeParameter, ...], step: Array) -> State:
+def _moved(
+    state: State, parameters: tuple[FreeParameter, ...], step: Array, scale: float
+) -> State:
     m, k = state.coefficients.size, state.offsets.size
     new = replace(state, offsets=state.offsets + step[m : m + k])
     if state.law is not None:
-        new = new.with_coefficients(state.law, state.coefficients + step[:m])
+        new = new.with_coefficients(state.law, state.coefficients + step[:m] / scale)
     for parameter, delta in zip(parameters, step[m + k :], strict=True):
         new = parameter.moved(new, float(delta))
     return new

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The joint fit: what a step promises, and fits from several starts."""
+"""The joint fit: what a step promises, what multiplies H, and fits from several starts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import time
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
 from piezo_ident.diagnosis.base_refit import base_thresholds
-from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping
-from piezo_ident.diagnosis.joint_fit import fit_base
+from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, Scale
+from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.starts import fit_starts
@@ -32,6 +32,7 @@ def crept(gain: float) -> tuple[Simulator, State, BaseColumns]:
     """Return rows of a stage that creeps within 10 ms, and H fitted without that."""
     model = SimulatedStage.load('paper').model
     t = np.arange(60_000) / RATE
+    # motion so slow that creep is nearly a gain
     v = 5.0 * (1.0 - np.cos(4.0 * np.pi * t) * np.cos(0.7 * t))
     creep = EffectSetting('creep', {'gain': [gain], 'time_constant': [0.01]})
     y = replace(model, effects=(creep,)).simulate(v)
@@ -41,6 +42,17 @@ def crept(gain: float) -> tuple[Simulator, State, BaseColumns]:
     state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), law)
     values = find_effect('creep').check({'gain': [0.0], 'time_constant': [0.01]})
     return simulator, state.with_effect(Added('creep', (values,))), base
+
+
+def test_h_and_what_multiplies_it_move_together(monkeypatch):
+    simulator, state, base = crept(-0.3)
+    together = fit_jointly(simulator, state, base, iterations=6)
+    monkeypatch.setattr(Scale, 'of', lambda *_: 1.0)
+    apart = fit_jointly(simulator, state, base, iterations=6)
+    squares = [float(np.mean(fitted.e**2)) for fitted in (together, apart)]
+    assert squares[0] < 1e-3 * squares[1], squares
+    (gain,) = together.state.effects[0].values[0]['gain']
+    assert abs(gain + 0.3) < 0.002
 
 
 def test_a_step_promises_what_a_linear_model_gains():

@@ -71,6 +71,9 @@ IDENTIFIER = {
     'excitation_limit': 5.0,
     'nice': 0,
 }
+#: creep that ends within the second at rest between two programs: a new model starts from rest,
+#: and what creeps on from earlier motion is not in its records
+CREEP = {'gain': [0.012, 0.012, 0.012], 'time_constant': [0.03, 0.1, 0.3]}
 #: two diagnoses at once, on a machine that does other things [s]
 LONG = 240.0
 
@@ -79,6 +82,8 @@ def stage_with(effect, folder):
     """Write a stage that has one of the effects of the shipped one, and return its path."""
     data = yaml.safe_load(find_config('effects', 'stage').read_text())
     data['effects'] = [e for e in data['effects'] if e['name'] == effect]
+    if effect == 'creep':
+        data['effects'][0]['parameters'] = CREEP
     data |= {'sample_rate': FS, 'dynamics': {'a': [-1.2, 0.5], 'b': [0.13, 0.06]}}
     path = folder / f'{effect}.yaml'
     path.write_text(yaml.safe_dump(data))
@@ -193,7 +198,7 @@ def test_the_residual_falls_when_the_refined_model_is_taken_over(lab, stories, t
     before = rms(residual[starts[-2] : starts[-1]])
     after = rms(play(lab, truth, SWEEPS))
     print(f'{truth}: residual {before:.3f} -> {after:.3f} % of stroke')
-    assert after < 0.5 * before
+    assert after < 0.3 * before
 
 
 def test_save_writes_both_reports(lab, stories, tmp_path):
