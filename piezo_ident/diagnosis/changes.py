@@ -17,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
+from piezo_ident.diagnosis.row_filter import GROUP, LEAST_SAMPLES, RowFilter
 from piezo_ident.operators.chain import Block, Operator
+from piezo_ident.operators.dynamics import DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
 __all__ = ['Behind']
@@ -66,7 +68,7 @@ class Behind:
     ) -> None:
         self._rests, self._blocks, self._m, self._new = rests, blocks, m, new
         self._n = n = blocks[0].x.size // m * m
-        step = max(1, STRETCH // m) * m
+        step = max(1, STRETCH // (GROUP * m)) * GROUP * m
         self._cuts = [slice(a, min(a + step, n)) for a in range(0, n, step)]
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
         if new:
@@ -76,6 +78,7 @@ class Behind:
             for k, (operator, kind) in enumerate(zip(operators, kinds, strict=True))
             if kind != 'passed'
         ]
+        self._to_rows, self._G = _with_G_last(self._links, m)
 
     def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
         """
@@ -92,13 +95,14 @@ class Behind:
         -------
         ndarray, shape (n // m,)
         """
-        self._reset(self._links, rest)
-        means = [
-            block_means(
-                self._passed(self._links, cut, None if change is None else change[cut]), self._m
-            )
-            for cut in self._cuts
-        ]
+        links, m, G = self._to_rows, self._m, self._G
+        rest = self._reset(links, rest)
+        if G is not None:
+            G.reset(rest)
+        means = []
+        for cut in self._cuts:
+            passed = self._passed(links, cut, None if change is None else change[cut])
+            means.append(block_means(passed, m) if G is None else G.process(passed))
         return np.concatenate(means) if means else np.empty(0)
 
     def filtered(self, sections: Array, signal: Array, rest: float) -> Array:
@@ -172,6 +176,19 @@ class Behind:
             change = block.x - self._blocks[k + 1].x[cut]
             block = block.with_signal(change)
         return block.x
+
+
+def _with_G_last(links: Sequence[_Link], m: int) -> tuple[Sequence[_Link], RowFilter | None]:
+    """Return links without G, and G that makes rows, where it may trade places with the last."""
+    last = len(links)
+    while last > 0 and links[last - 1].kind == 'filtered':
+        last -= 1
+    own = [x.operator for x in links[last:]]
+    parts = [one.dynamics for one in own if isinstance(one, DynamicsOperator)]
+    if not parts or m < LEAST_SAMPLES:
+        return links, None
+    others = [x for x in links[last:] if not isinstance(x.operator, DynamicsOperator)]
+    return [*links[:last], *others], RowFilter(parts, m)
 
 
 @kernel

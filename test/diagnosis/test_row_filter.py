@@ -1,0 +1,84 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""G that makes the means of rows in one, against G and means after it."""
+
+from __future__ import annotations
+
+import numpy as np
+from piezo_ident.diagnosis.changes import Behind
+from piezo_ident.diagnosis.row_filter import GROUP, RowFilter
+from piezo_ident.effects import find_effect
+from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.operators.chain import Block
+from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
+from piezo_ident.residual.stretches import block_means
+import pytest
+
+
+def modes() -> Dynamics:
+    """Return a G with so many lightly damped modes that it is run as sections."""
+    poles = 0.9995 * np.exp(2j * np.pi * np.array([0.01, 0.011, 0.03, 0.034, 0.1, 0.12]))
+    a = np.poly(np.concatenate([poles, poles.conj()])).real
+    zeros = 0.999 * np.exp(2j * np.pi * np.array([0.0105, 0.02, 0.032, 0.05, 0.11]))
+    b = np.poly(np.concatenate([zeros, zeros.conj()])).real
+    return Dynamics(a[1:], b * a.sum() / b.sum())
+
+
+PAPER = SimulatedStage.load('paper').model.dynamics
+SYSTEMS = {
+    'paper': PAPER,
+    'second order': Dynamics([-1.2, 0.5], [0.13, 0.06]),
+    'zeros alone': Dynamics([], [0.5, 0.2, 0.1]),
+    'nearly an integrator': Dynamics([-0.999], [0.001]),
+    'sections': modes(),
+}
+
+
+def motion(n: int, start: float = 0.0) -> np.ndarray:
+    """Return a random walk that starts at rest."""
+    walk = 0.01 * np.random.default_rng(7).standard_normal(n).cumsum()
+    return start + walk
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+@pytest.mark.parametrize('m', [3, 4, 7])
+def test_it_is_the_mean_of_what_g_makes(system, m):
+    G, cut = SYSTEMS[system], 50 * GROUP * m
+    x = motion(3 * cut - 2 * m - 1, 0.3)
+    x[0] = 0.3
+    rows = RowFilter([G], m)
+    assert rows.reset(0.3) == pytest.approx(0.3 * G.gain, rel=1e-12)
+    found = np.concatenate([rows.process(part) for part in (x[:cut], x[cut:])])
+    block = Block(t=x, v=x, x=x, channels={})
+    operator = DynamicsOperator(G)
+    operator.reset(0.0, 0.3)
+    whole = operator.process(block).x
+    np.testing.assert_allclose(found, block_means(whole, m), rtol=0, atol=1e-11)
+
+
+def test_many_modes_run_as_sections():
+    assert SYSTEMS['sections'].sections is not None
+
+
+def test_links_that_filter_may_stand_on_either_side_of_g():
+    m, rate = 4, 20_000.0
+    x = motion(30_011)
+    block = Block(t=np.arange(x.size) / rate, v=x, x=x, channels={})
+    creep = find_effect('creep')
+    values = creep.check({'gain': [0.03, -0.01], 'time_constant': [0.02, 0.5]})
+    links = [
+        creep(rate, values, None),
+        DynamicsOperator(PAPER),
+        DynamicsOperator(Dynamics([-0.4], [0.6])),
+        DelayOperator(Delay(3, 0.4)),
+    ]
+    # a change that begins with a step, as one of H at rest does
+    change = motion(x.size, 0.2)
+    found = Behind(links, [0.0] * 5, [block] * 5, m).rows(change, 0.2)
+    rest, passed = 0.2, block.with_signal(change)
+    for link in links:
+        rest = link.reset(0.0, rest)
+        passed = link.process(passed)
+    np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
+    assert np.ptp(found) > 0.1
