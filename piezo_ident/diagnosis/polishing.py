@@ -78,7 +78,7 @@ def polished(
         for fresh in _afresh(simulator, fitted, i, lines, least, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
-    for _ in range(criteria.POLISHING):
+    for _ in range(criteria.POLISHING if fitted.mean_square >= done else 0):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=least, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:

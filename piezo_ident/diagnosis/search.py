@@ -194,17 +194,21 @@ def _contenders(
     done = noise + simulator.rows.square(criteria.INDISTINCT)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
+
+    def to_end(fitted: Fitted, goal: float) -> Fitted:
+        return _to_the_end(simulator, fitted, noise, done, goal, alive)
+
     for i, contender in enumerate(contenders[: criteria.FINAL]):
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
         # one that stays further behind the first is no rival of it
         goal = criteria.FORM_RATIO * contenders[0].mean_square + done if is_shown else np.inf
         try:
-            fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
+            fitted = contenders[i] = to_end(contender, goal)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
-                other = _to_the_end(simulator, other, noise, goal, alive)
+                other = to_end(other, goal)
                 ahead = fitted.mean_square < other.mean_square / criteria.AHEAD
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
@@ -228,16 +232,17 @@ def _to_the_end(
     simulator: Simulator,
     fitted: Fitted,
     noise: float,
+    done: float,
     goal: float,
     tick: Callable[[], None],
 ) -> Fitted:
-    """Return a fit with fresh columns of H, as long as that makes a difference."""
+    """Return a fit with fresh columns of H, as long as that makes a difference above `done`."""
     enough = least_gain(simulator.rows, noise)
     for _ in range(criteria.POLISHING):
         state, before = fitted.state, fitted.mean_square
         base = base_at(simulator, state)
         fitted = fit_jointly(simulator, state, base, enough=enough, goal=goal, tick=tick)
-        if fitted.mean_square > (1.0 - criteria.WORTH_FIT) * before:
+        if fitted.mean_square > (1.0 - criteria.WORTH_FIT) * before or fitted.mean_square < done:
             break
     return fitted
 
