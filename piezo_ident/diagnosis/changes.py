@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import alive, kernel
-from piezo_ident.diagnosis.row_filter import GROUP, LEAST_SAMPLES, RowFilter
+from piezo_ident.diagnosis.row_filter import group_of, RowFilter, serves
 from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DynamicsOperator
 from piezo_ident.residual.stretches import block_means
@@ -68,7 +69,8 @@ class Behind:
     ) -> None:
         self._rests, self._blocks, self._m, self._new = rests, blocks, m, new
         self._n = n = blocks[0].x.size // m * m
-        step = max(1, STRETCH // (GROUP * m)) * GROUP * m
+        group = group_of(m) * m
+        step = max(1, STRETCH // group) * group
         self._cuts = [slice(a, min(a + step, n)) for a in range(0, n, step)]
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
         if new:
@@ -78,7 +80,6 @@ class Behind:
             for k, (operator, kind) in enumerate(zip(operators, kinds, strict=True))
             if kind != 'passed'
         ]
-        self._to_rows, self._G = _with_G_last(self._links, m)
 
     def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
         """
@@ -95,7 +96,7 @@ class Behind:
         -------
         ndarray, shape (n // m,)
         """
-        links, m, G = self._to_rows, self._m, self._G
+        m, (links, G) = self._m, self._to_rows
         rest = self._reset(links, rest)
         if G is not None:
             G.reset(rest)
@@ -150,6 +151,19 @@ class Behind:
                 rows[i, row] = block_means(change, self._m)
         return rows
 
+    @cached_property
+    def _to_rows(self) -> tuple[Sequence[_Link], RowFilter | None]:
+        """Links without G, and G that makes rows, where it may trade places with the last."""
+        links, last = self._links, len(self._links)
+        while last > 0 and links[last - 1].kind == 'filtered':
+            last -= 1
+        own = [link.operator for link in links[last:]]
+        parts = [one.dynamics for one in own if isinstance(one, DynamicsOperator)]
+        if not serves(parts, self._m, self._n):
+            return links, None
+        others = [x for x in links[last:] if not isinstance(x.operator, DynamicsOperator)]
+        return [*links[:last], *others], RowFilter(parts, self._m)
+
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
         """Bring links to rest, and return by how much that behind them changes with `rest`."""
         v0 = float(self._blocks[0].v[0])
@@ -176,19 +190,6 @@ class Behind:
             change = block.x - self._blocks[k + 1].x[cut]
             block = block.with_signal(change)
         return block.x
-
-
-def _with_G_last(links: Sequence[_Link], m: int) -> tuple[Sequence[_Link], RowFilter | None]:
-    """Return links without G, and G that makes rows, where it may trade places with the last."""
-    last = len(links)
-    while last > 0 and links[last - 1].kind == 'filtered':
-        last -= 1
-    own = [x.operator for x in links[last:]]
-    parts = [one.dynamics for one in own if isinstance(one, DynamicsOperator)]
-    if not parts or m < LEAST_SAMPLES:
-        return links, None
-    others = [x for x in links[last:] if not isinstance(x.operator, DynamicsOperator)]
-    return [*links[:last], *others], RowFilter(parts, m)
 
 
 @kernel

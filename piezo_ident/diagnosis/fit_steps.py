@@ -30,6 +30,8 @@ WORSE = 3.0
 KEPT = (0.75, 0.25)
 #: factors of H beyond which something else is the matter
 SCALES = (0.2, 5.0)
+#: share of H that must not be like what only adds to it
+SEEN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,21 +58,28 @@ class Scale:
     """
     How much larger H comes out of the chain than its columns tell.
 
-    What is behind H multiplies it: creep, a gain, the effects that the columns left out.  A step
-    of both is no sum of the two, and without the product a fit creeps along a bent valley.
+    What is behind H multiplies it: creep, a gain, and what the columns left out of both.  A step
+    of both is no sum of the two, and without the product a fit takes many small steps.  What only
+    adds to the signal, the columns `aside` of shape (n, k), is no scale.
     """
 
-    def __init__(self, rows: Rows, base: BaseColumns, coefficients: Array, e: Array) -> None:
+    def __init__(
+        self, rows: Rows, base: BaseColumns, coefficients: Array, e: Array, aside: Array
+    ) -> None:
+        h = centred(base.columns[:, : coefficients.size] @ coefficients, rows.of_record)
+        across = h
+        if aside.shape[1]:
+            C = np.array([centred(column, rows.of_record) for column in aside.T]).T
+            across = h - C @ np.linalg.lstsq(C, h, rcond=None)[0]
         self._x = centred(rows.x - e, rows.of_record)
-        h = base.columns[:, : coefficients.size] @ coefficients
-        self._h = centred(h, rows.of_record)
-        self._size = float(self._h @ self._h)
+        self._across, self._size = across, float(across @ across)
+        self._is_seen = self._size > SEEN * float(h @ h)
 
     def of(self, change: Array) -> float:
         """Return the factor once the rows have changed, shape (n,)."""
-        if self._size == 0.0:
+        if not self._is_seen:
             return 1.0
-        factor = float((self._x + change) @ self._h) / self._size
+        factor = float((self._x + change) @ self._across) / self._size
         return factor if SCALES[0] < factor < SCALES[1] else 1.0
 
 

@@ -181,16 +181,17 @@ def fit_jointly(
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
         step = FitStep(base, moving, e, _prior(rows, e, p, state), pull)
-        better, scale = None, Scale(rows, base, state.coefficients, e)
+        aside = moving[:, [_only_adds(state, number) for number in parameters]]
+        better, scale = None, Scale(rows, base, state.coefficients, e, aside)
         for failed in range(ATTEMPTS):
             tick()
             delta = step.solve(lower, upper, damping)
             promised = step.gain(delta)
             if promised < least:
                 break
+            factor = scale.of(moving @ delta[p - len(parameters) :])
             try:
-                factor = scale.of(moving @ delta[p - len(parameters) :])
-                trial = _moved(state, parameters, delta, factor)
+                trial = _moved(state, parameters, delta, lower, factor)
                 left = rows.x - simulator.remember(trial)
             except ModelError:
                 damping *= WORSE ** (failed + 1)
@@ -304,13 +305,25 @@ def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[
     return lower, upper
 
 
+def _only_adds(state: State, parameter: FreeParameter) -> bool:
+    """Return whether a number belongs to an effect that lets the signal pass as it is."""
+    i = parameter.effect
+    return i is not None and state.effects[i].effect.change == 'passed'
+
+
 def _moved(
-    state: State, parameters: tuple[FreeParameter, ...], step: Array, scale: float
+    state: State,
+    parameters: tuple[FreeParameter, ...],
+    step: Array,
+    lower: Array,
+    factor: float,
 ) -> State:
+    """Return the state after a step, that of H divided by a factor, but for steps to a bound."""
     m, k = state.coefficients.size, state.offsets.size
     new = replace(state, offsets=state.offsets + step[m : m + k])
     if state.law is not None:
-        new = new.with_coefficients(state.law, state.coefficients + step[:m] / scale)
+        of_H = np.where(step[:m] > lower[:m], step[:m] / factor, step[:m])
+        new = new.with_coefficients(state.law, state.coefficients + of_H)
     for parameter, delta in zip(parameters, step[m + k :], strict=True):
         new = parameter.moved(new, float(delta))
     return new

@@ -295,17 +295,18 @@ class Simulator:
         ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
         # all processors share a run alone
         share = -(-self._threads // len(keep))
-        tasks = [(i, range(k, size, share)) for i in range(len(keep)) for k in range(share)]
+        tasks = [
+            (i, range(k, size, share)) for i in range(len(keep)) for k in range(min(share, size))
+        ]
         extra = np.empty((0, self.rows.n)) if more is None else more
         whole = np.empty((size + extra.shape[0], self.rows.n))
         whole[size:] = extra
 
         def fill(task: tuple[int, range]) -> None:
             i, places = task
-            if places:
-                columns = function(i, places)
-                own = columns if keep[i].all() else columns[:, keep[i]]
-                whole[places, ends[i] : ends[i + 1]] = own
+            columns = function(i, places)
+            own = columns if keep[i].all() else columns[:, keep[i]]
+            whole[places, ends[i] : ends[i + 1]] = own
 
         for _ in self._pool.map(fill, tasks):
             pass

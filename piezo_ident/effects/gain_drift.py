@@ -27,8 +27,8 @@ def _with_gain(
     knots: NDArray[np.float64],
     gains: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    # at: the first sample of each knot; the gain between two is a straight line
-    out = np.empty(x.size)
+    # t ascends; at: the first sample of each knot; the gain between two is a straight line
+    out = x.copy()
     for i in range(-1, knots.size):
         start, stop = at[i] if i >= 0 else 0, at[i + 1] if i + 1 < at.size else x.size
         knot, gain, slope = knots[max(i, 0)], gains[max(i, 0)], 0.0

@@ -55,6 +55,23 @@ def test_h_and_what_multiplies_it_move_together(monkeypatch):
     assert abs(gain + 0.3) < 0.002
 
 
+def test_what_only_adds_is_no_scale():
+    model = SimulatedStage.load('paper').model
+    t = np.arange(30_000) / RATE
+    # half a period of slow motion, which a drift of its length is like
+    v = 0.4 + 4.6 * (1.0 - np.cos(2.0 * np.pi * t / 3.0)) + 0.3 * np.sin(40.0 * t)
+    true = {'amplitude': -0.2, 'time_constant': 0.3}
+    y = replace(model, effects=(EffectSetting('thermal_drift', true),)).simulate(v)
+    simulator = Simulator(model, make_rows(model, [Record.from_arrays(v, y, sample_rate=RATE)]))
+    law = HysteresisLaw('plays', base_thresholds(1.0))
+    state, base = fit_base(simulator, State(model.hysteresis, np.zeros(1)), law)
+    start = find_effect('thermal_drift').check({'amplitude': 0.0, 'time_constant': 1.0})
+    fitted = fit_jointly(simulator, state.with_effect(Added('thermal_drift', (start,))), base)
+    found = fitted.state.effects[0].values[0]
+    assert abs(found['amplitude'] + 0.2) < 0.01, found
+    assert abs(found['time_constant'] - 0.3) < 0.02, found
+
+
 def test_a_step_promises_what_a_linear_model_gains():
     rng = np.random.default_rng(3)
     columns, moving, e = rng.normal(size=(300, 4)), rng.normal(size=(300, 2)), rng.normal(size=300)

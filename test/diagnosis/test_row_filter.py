@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.diagnosis.changes import Behind
-from piezo_ident.diagnosis.row_filter import GROUP, RowFilter
+from piezo_ident.diagnosis.row_filter import group_of, RowFilter, serves
 from piezo_ident.effects import find_effect
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.chain import Block
@@ -44,9 +44,8 @@ def motion(n: int, start: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize('system', SYSTEMS)
 @pytest.mark.parametrize('m', [3, 4, 7])
 def test_it_is_the_mean_of_what_g_makes(system, m):
-    G, cut = SYSTEMS[system], 50 * GROUP * m
+    G, cut = SYSTEMS[system], 50 * group_of(m) * m
     x = motion(3 * cut - 2 * m - 1, 0.3)
-    x[0] = 0.3
     rows = RowFilter([G], m)
     assert rows.reset(0.3) == pytest.approx(0.3 * G.gain, rel=1e-12)
     found = np.concatenate([rows.process(part) for part in (x[:cut], x[cut:])])
@@ -58,12 +57,34 @@ def test_it_is_the_mean_of_what_g_makes(system, m):
 
 
 def test_many_modes_run_as_sections():
-    assert SYSTEMS['sections'].sections is not None
+    G = SYSTEMS['sections']
+    assert G.sections is not None
+    assert serves([PAPER, G], 4, 200_000)
+    # a B that begins with zero leaves no sections, and powers of the whole A lose all digits
+    late = Dynamics(G.a, [0.0, *G.b])
+    assert late.sections is None
+    assert not serves([PAPER, late], 4, 200_000)
+
+
+@pytest.mark.parametrize('m, samples', [(2, 200_000), (4, 20_000)])
+def test_short_rows_and_short_runs_are_filtered_as_they_are(m, samples):
+    assert not serves([PAPER], m, samples)
+
+
+@pytest.mark.parametrize('samples', [0, 1, 5, 31, 32, 33])
+def test_a_record_may_be_shorter_than_a_group(samples):
+    x = motion(samples)
+    operator = DynamicsOperator(PAPER)
+    operator.reset(0.0, 0.1)
+    whole = operator.process(Block(t=x, v=x, x=x, channels={})).x
+    rows = RowFilter([PAPER], 4)
+    rows.reset(0.1)
+    np.testing.assert_allclose(rows.process(x), block_means(whole, 4), rtol=0, atol=1e-14)
 
 
 def test_links_that_filter_may_stand_on_either_side_of_g():
     m, rate = 4, 20_000.0
-    x = motion(30_011)
+    x = motion(120_011)
     block = Block(t=np.arange(x.size) / rate, v=x, x=x, channels={})
     creep = find_effect('creep')
     values = creep.check({'gain': [0.03, -0.01], 'time_constant': [0.02, 0.5]})
