@@ -70,7 +70,7 @@ class Scale:
         across = h
         if aside.shape[1]:
             C = np.array([centred(column, rows.of_record) for column in aside.T]).T
-            across = h - C @ np.linalg.lstsq(C, h, rcond=None)[0]
+            across = h - C @ np.linalg.lstsq(C.T @ C, C.T @ h, rcond=None)[0]
         self._x = centred(rows.x - e, rows.of_record)
         self._across, self._size = across, float(across @ across)
         self._is_seen = self._size > SEEN * float(h @ h)

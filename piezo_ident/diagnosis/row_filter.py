@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 #: samples in a row and in a run from which it is quicker than G itself
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000
 #: samples in a group of rows, about
-IN_GROUP = 32
+IN_GROUP = 48
 #: share of the output that eq. (5) may lose by rounding: powers of A lose far more
 LOST = 1e-12
 
