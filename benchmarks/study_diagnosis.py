@@ -210,6 +210,18 @@ def outcome(case: Case, row: Row) -> str:
     return {'partly_explained': 'partly'}.get(row.verdict, row.verdict)
 
 
+def is_told(case: Case, row: Row) -> bool:
+    """
+    Return whether the verdict tells the truth as the second study counts it, and nothing false.
+
+    What stands among the effects is named, however much is left, and the class of a refit is one.
+    """
+    if row.verdict == 'partly_explained':
+        return set(row.found) == set(case.effects)
+    kind = outcome(case, row)
+    return kind in ('exact', 'class') or (kind == 'hidden' and row.verdict == 'refitted')
+
+
 KINDS = ('exact', 'class', 'hidden', 'partly', 'refitted', 'unexplained', 'none', 'wrong')
 NOTE = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
@@ -254,7 +266,10 @@ def single(done: Done) -> str:
     )
     text = markdown('One effect', heads, map(line, EFFECTS))
     text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
-    text += f'no name, and among what may hide in the base model: {hidden}.'
+    text += f'no name, and among what may hide in the base model: {hidden}. '
+    told = sum(is_told(case, row) for case, row in counted)
+    text += 'As the second study counts, where a true name counts however much is left, and with '
+    text += f'the class of a refit: {told} of {len(counted)} ({told / max(len(counted), 1):.0%}).'
     ratios = [
         r.unseen_before / r.unseen_after for _, r in counted if r.verdict in ('named', 'class')
     ]
