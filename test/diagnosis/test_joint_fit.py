@@ -59,7 +59,7 @@ def test_what_only_adds_is_no_scale():
     model = SimulatedStage.load('paper').model
     t = np.arange(30_000) / RATE
     # half a period of slow motion, which a drift of its length is like
-    v = 0.4 + 4.6 * (1.0 - np.cos(2.0 * np.pi * t / 3.0)) + 0.3 * np.sin(40.0 * t)
+    v = 4.8 * (1.0 - np.cos(2.0 * np.pi * t / 3.0)) + 0.15 * (1.0 - np.cos(40.0 * t))
     true = {'amplitude': -0.2, 'time_constant': 0.3}
     y = replace(model, effects=(EffectSetting('thermal_drift', true),)).simulate(v)
     simulator = Simulator(model, make_rows(model, [Record.from_arrays(v, y, sample_rate=RATE)]))
