@@ -162,7 +162,7 @@ def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list
     """
     Return the beginnings of records, in proportion to their lengths, `most` samples together.
 
-    A search holds about 500 bytes a sample.  Creep and hysteresis come out of what was before,
+    A search holds 0.9 to 1.3 kB a sample.  Creep and hysteresis come out of what was before,
     and only a beginning has nothing before it.
     """
     usable = [
