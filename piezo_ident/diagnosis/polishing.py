@@ -17,12 +17,17 @@ from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
-__all__ = ['least_gain', 'polished', 'without_needless']
+__all__ = ['good_enough', 'least_gain', 'polished', 'without_needless']
 
 
 def least_gain(rows: Rows, noise: float) -> float:
     """Return the gain that a step of a fit has to bring, beside a noise; both mean squares."""
     return criteria.OF_LEAST * min(noise, rows.square(criteria.SMALLEST_EFFECT))
+
+
+def good_enough(rows: Rows, noise: float) -> float:
+    """Return below which mean square nothing is left to tell from a noise."""
+    return noise + rows.square(criteria.INDISTINCT)
 
 
 def without_needless(
@@ -70,7 +75,7 @@ def polished(
     An effect that was found before others were in the model took a law that made up for them.
     `noise` is the mean square of the noise of a row.
     """
-    done = noise + simulator.rows.square(criteria.INDISTINCT)
+    done = good_enough(simulator.rows, noise)
     least = least_gain(simulator.rows, noise)
     for i in range(len(fitted.state.effects)):
         if fitted.mean_square < done:
@@ -78,7 +83,9 @@ def polished(
         for fresh in _afresh(simulator, fitted, i, lines, least, tick):
             if fresh.mean_square < fitted.mean_square:
                 fitted = fresh
-    for _ in range(criteria.POLISHING if fitted.mean_square >= done else 0):
+    if fitted.mean_square < done:
+        return fitted
+    for _ in range(criteria.POLISHING):
         state = fitted.state
         fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=least, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:

@@ -23,7 +23,7 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.fit_steps import BaseColumns
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
-from piezo_ident.diagnosis.polishing import least_gain
+from piezo_ident.diagnosis.polishing import good_enough, least_gain
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -191,24 +191,20 @@ def _contenders(
         elif failures:
             warnings.append(f'{effect.name} was not judged: {failures[-1]}')
     contenders.sort(key=lambda c: c.mean_square)
-    done = noise + simulator.rows.square(criteria.INDISTINCT)
+    done = good_enough(simulator.rows, noise)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
-
-    def to_end(fitted: Fitted, goal: float) -> Fitted:
-        return _to_the_end(simulator, fitted, noise, done, goal, alive)
-
     for i, contender in enumerate(contenders[: criteria.FINAL]):
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
         # one that stays further behind the first is no rival of it
         goal = criteria.FORM_RATIO * contenders[0].mean_square + done if is_shown else np.inf
         try:
-            fitted = contenders[i] = to_end(contender, goal)
+            fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
-                other = to_end(other, goal)
+                other = _to_the_end(simulator, other, noise, goal, alive)
                 ahead = fitted.mean_square < other.mean_square / criteria.AHEAD
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
@@ -232,12 +228,11 @@ def _to_the_end(
     simulator: Simulator,
     fitted: Fitted,
     noise: float,
-    done: float,
     goal: float,
     tick: Callable[[], None],
 ) -> Fitted:
-    """Return a fit with fresh columns of H, as long as that makes a difference above `done`."""
-    enough = least_gain(simulator.rows, noise)
+    """Return a fit with fresh columns of H, as long as that makes a difference that shows."""
+    enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)
     for _ in range(criteria.POLISHING):
         state, before = fitted.state, fitted.mean_square
         base = base_at(simulator, state)
