@@ -13,7 +13,7 @@ is one of
 - the law of Bouc and Wen (Wen, J. Eng. Mech. 102 (1976) 249),
 - Duhem's equation in the form of Coleman and Hodgdon (Int. J. Eng. Sci. 24 (1986) 897).
 
-Further laws are in `more_cores`, `collective_cores` and `unseen_cores`.
+Further laws are in `more_cores`, `unseen_cores` and `fresh_cores`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,9 @@ __all__ = [
     'bouc_wen_of',
     'coleman_hodgdon',
     'core_of',
-    'everett_table',
     'law_of',
     'play',
     'preisach',
-    'preisach_step',
     'uneven',
     'unlike_plays',
 ]
@@ -190,35 +188,20 @@ def _everett(a: float, b: float, table: Array, diagonal: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def preisach_step(
-    new: float,
-    x: float,
-    h: float,
-    n: int,
-    extreme: Array,
-    value: Array,
-    table: Array,
-    diagonal: Array,
-) -> tuple[int, float]:
-    """Return how many extremes are left and the output where the input goes from x to new."""
-    if new == x:
-        return n, h
-    n = extremes_left(new, x, h, n, extreme, value)
-    last = extreme[n - 1]
-    if new > last:
-        return n, value[n - 1] + _everett(new, last, table, diagonal)
-    return n, value[n - 1] - _everett(last, new, table, diagonal)
-
-
-@njit(cache=True, nogil=True)
 def _preisach(u: Array, table: Array, diagonal: Array, out: Array) -> None:
     extreme, value = np.empty(DEPTH), np.empty(DEPTH)
     extreme[0], value[0] = 0.0, 0.0
     n, x, h = 1, 0.0, 0.0
     for k in range(u.size):
         new = min(max(u[k], 0.0), 1.0)
-        n, h = preisach_step(new, x, h, n, extreme, value, table, diagonal)
-        x = new
+        if new != x:
+            n = extremes_left(new, x, h, n, extreme, value)
+            last = extreme[n - 1]
+            if new > last:
+                h = value[n - 1] + _everett(new, last, table, diagonal)
+            else:
+                h = value[n - 1] - _everett(last, new, table, diagonal)
+            x = new
         out[k] = h
 
 

@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-from .collective_cores import (
-    frustrated_dipoles,
-    loaded_contacts,
-    moving_preisach,
-    rugged_walls,
-    turning_friction,
-)
 from .cores import bouc_wen, coleman_hodgdon, uneven
+from .fresh_cores import (
+    bounding_lines,
+    energy_balance,
+    limiting_loops,
+    pinned_line,
+)
 from .more_cores import (
     dahl,
     hills,
@@ -41,16 +40,15 @@ LAWS = {
     'skewed-bouc-wen': skewed_bouc_wen,
     'dahl': dahl,
     'turning-curves': turning_curves,
-    'moving-preisach': moving_preisach,
-    'loaded-contacts': loaded_contacts,
-    'turning-friction': turning_friction,
-    'rugged-walls': rugged_walls,
-    'frustrated-dipoles': frustrated_dipoles,
     'back-stresses': back_stresses,
     'growing-domains': growing_domains,
     'phase-fractions': phase_fractions,
     'rotating-grains': rotating_grains,
     'tetragonal-grains': tetragonal_grains,
+    'bounding-lines': bounding_lines,
+    'energy-balance': energy_balance,
+    'limiting-loops': limiting_loops,
+    'pinned-line': pinned_line,
 }
 
 #: how often each is dealt; the laws of 'final' are for judging alone, all others may be looked at
@@ -66,17 +64,16 @@ SETS = {
         'turning-curves',
     ),
     'past': (
-        'moving-preisach',
-        'loaded-contacts',
-        'turning-friction',
-        'rugged-walls',
-        'frustrated-dipoles',
-    ),
-    'final': (
         'back-stresses',
         'growing-domains',
         'phase-fractions',
         'rotating-grains',
         'tetragonal-grains',
+    ),
+    'final': (
+        'bounding-lines',
+        'energy-balance',
+        'limiting-loops',
+        'pinned-line',
     ),
 }
