@@ -353,9 +353,11 @@ class ForwardSelection:
                 self._noise,
                 lambda: self._progress('candidates', 0.95),
             )
-            # an effect that was not fitted to the end leaves something for another one to explain
+            # an effect that was not fitted to the end leaves something for another one to explain;
+            # all but the last were tried beside that
+            newest = len(fitted.state.effects) - 1
             fitted, dropped = without_needless(
-                self._simulator, fitted, self._least, len(shown), last=0
+                self._simulator, fitted, self._least, max(newest, len(shown)), last=0
             )
             for i in dropped:
                 del taken[i]

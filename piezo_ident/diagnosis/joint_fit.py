@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
 #: first damping, a share of the energy of each column, and the least
 DAMPING, LEAST_DAMPING = 1e-4, 1e-9
+#: steps gain less and less, but as a forecast no less than this times the one before
+LEAST_RATIO = 0.5
 #: share of what shows a parameter that other kinds of excitation must hold to tell it
 FIRM = 0.01
 #: finite difference of a weight of H, normalised
@@ -157,8 +159,8 @@ def fit_jointly(
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
     A step that lowers the mean square by less than `enough` is the last one, and one that promises
-    less is not made.  So is one after which the steps that are left, were they like it, would not
-    reach the mean square `goal` of what is fitted.
+    less is not made.  So is one after which the steps that are left, were they like it or falling
+    as they do, would not reach the mean square `goal` of what is fitted.
     `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
     `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
 
@@ -172,7 +174,7 @@ def fit_jointly(
     rows = simulator.rows
     parameters = free_parameters(state, len(rows.names))
     p = base.columns.shape[1] + len(parameters)
-    damping = DAMPING
+    damping, last, settled = DAMPING, 0.0, True
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
     pull = pull_at and pull_at(state, p)
@@ -209,9 +211,12 @@ def fit_jointly(
         state, e, pull = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
         # a first step tells little of those behind it
-        hopeless = done > 0 and after - more * gain > goal * e.size
+        hopeless = done > 0 and after - _to_come(gain, last, more) > goal * e.size
         if hopeless or gain < least:
             break
+        last = gain
+    else:
+        settled = False
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
@@ -228,10 +233,19 @@ def fit_jointly(
         free=free,
         parameters=parameters,
         prior=prior,
-        errors=held_out_errors(equations, rows.fold, prior[free], own)[:, 0],
-        transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
+        errors=held_out_errors(equations, rows.fold, prior[free], own, settled=settled)[:, 0],
+        transfer=held_out_errors(equations, rows.group, firm[free], own, settled=settled)[:, 0],
         pull=own,
     )
+
+
+def _to_come(gain: float, last: float, more: int) -> float:
+    """Return what `more` steps may gain behind one and the `last` one before it."""
+    if gain >= last:
+        return more * gain
+    # a fall that one step shows need not be as steep
+    ratio = max(gain / last, LEAST_RATIO)
+    return gain * min(more, ratio / (1.0 - ratio))
 
 
 def _loss(e: Array, pull: Pull | None) -> float:

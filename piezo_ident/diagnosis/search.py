@@ -170,7 +170,7 @@ def _contenders(
     """Return the candidates that show, fitted jointly, best first, and the fits that failed."""
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
-    at, least = 0.5, before.mean_square
+    at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
 
     def alive() -> None:
         tick(at)
@@ -178,8 +178,11 @@ def _contenders(
     for i, (effect, states) in enumerate(starts):
         at = 0.5 + 0.5 * i / len(starts)
         alive()
-        # what will not gain a share of the best is hardly one of those fitted to the end
+        # what will not gain a share of the best is hardly one of those fitted to the end, and
+        # nothing else is a rival of one that leaves nothing
         goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
+        if least < done:
+            goal = min(goal, criteria.FORM_RATIO * least + done)
         found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
         fits = [one for one in found if not isinstance(one, Failure)]
         least = min([least, *(one.mean_square for one in fits)])
@@ -191,7 +194,6 @@ def _contenders(
         elif failures:
             warnings.append(f'{effect.name} was not judged: {failures[-1]}')
     contenders.sort(key=lambda c: c.mean_square)
-    done = good_enough(simulator.rows, noise)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
     for i, contender in enumerate(contenders[: criteria.FINAL]):
@@ -204,8 +206,10 @@ def _contenders(
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations do not tell which base leads further
+                near = criteria.AHEAD * fitted.mean_square
+                goal = min(goal, near) if is_shown else goal
                 other = _to_the_end(simulator, other, noise, goal, alive)
-                ahead = fitted.mean_square < other.mean_square / criteria.AHEAD
+                ahead = near < other.mean_square
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
         except IdentificationError as error:
