@@ -267,9 +267,16 @@ def single(done: Done) -> str:
     text = markdown('One effect', heads, map(line, EFFECTS))
     text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
     text += f'no name, and among what may hide in the base model: {hidden}. '
-    told = sum(is_told(case, row) for case, row in counted)
-    text += 'As the second study counts, where a true name counts however much is left, and with '
-    text += f'the class of a refit: {told} of {len(counted)} ({told / max(len(counted), 1):.0%}).'
+    stated, told = (
+        f'{n} of {len(counted)} ({n / max(len(counted), 1):.0%})'
+        for n in (
+            sum(set(row.found) == set(case.effects) for case, row in counted),
+            sum(is_told(case, row) for case, row in counted),
+        )
+    )
+    text += 'As the second study counts, where what stands among the effects is named, however '
+    text += f'much is left and whatever is as good: {stated}; with classes, that of a refit '
+    text += f'included: {told}.'
     ratios = [
         r.unseen_before / r.unseen_after for _, r in counted if r.verdict in ('named', 'class')
     ]
