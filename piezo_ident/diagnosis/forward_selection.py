@@ -157,8 +157,16 @@ class ForwardSelection:
         """
         Return whether a G that has changed is the finding, though none of its laws fits.
 
-        What exceeds all that was missed, and all that H misses, is no side effect on G.
+        What exceeds all that was missed, and all that H misses, is no side effect on G, unless
+        something else takes much of what a retuned G leaves: it may have bent G.
         """
+        beside = next((one for one in found.rounds if one.before is retuned), None)
+        if (
+            beside is not None
+            and self._takes(beside, self._explainable(retuned), first=True)
+            and not find_effect(beside.contenders[0].name).in_dynamics
+        ):
+            return False
         explainable = self._explainable(linear.before)
         gain = explainable - self._beyond_noise(retuned)
         size = self._simulator.rows.percent(gain)
