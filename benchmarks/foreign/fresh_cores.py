@@ -245,7 +245,8 @@ def _bounding_lines(
             on = 1.0 if u[k] > last else -1.0
             if on != way:
                 for i in range(bound.size):
-                    first[i] = bound[i] + on * (strain[i] - (last - middle))
+                    # a strain may stand on its line, by rounding
+                    first[i] = max(bound[i] + on * (strain[i] - (last - middle)), EXACT)
                     gone[i] = 0.0
                 way, turn = on, last
             last = u[k]
