@@ -247,6 +247,9 @@ class ForwardSelection:
         if not self._takes(this, left, first=True):
             return found
         least = self._beyond_noise(wide) + self._indistinct
+        if not self._simulator.rows.kinds:
+            # no other kind of motion speaks against the wide H
+            least = self._beyond_noise(wide) / criteria.AHEAD - self._indistinct
         if this.contenders[0].name == 'noncongruent_minor_loops':
             # weights that change with the bias are but another wide law
             least /= criteria.AHEAD

@@ -229,17 +229,27 @@ def test_nothing_is_gained_below_the_noise(rows):
         assert takes(rows, this, before, noise, left, 0.05, first=True) == is_taken
 
 
-@pytest.mark.parametrize(('share', 'is_taken'), [(1.0, True), (0.03, False)])
-def test_what_the_h_of_the_model_does_not_leave_needs_no_effect(
-    rows, monkeypatch, share, is_taken
+@pytest.mark.parametrize(
+    ('share', 'wide_left', 'kinds', 'is_taken'),
+    [
+        (1.0, 0.02, True, True),
+        (0.03, 0.02, True, False),
+        # where no kind of motion is held out, what a wide H does as well needs no effect
+        (1.0, 0.02, False, False),
+        (1.0, 0.05, False, True),
+    ],
+)
+def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
+    rows, monkeypatch, share, wide_left, kinds, is_taken
 ):
     search = object.__new__(forward_selection.ForwardSelection)
-    search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
+    rows = SimpleNamespace(**vars(rows), passes=9.0, kinds=kinds)
+    search._simulator = SimpleNamespace(rows=rows)
     search._noise, search._smallest, search._given, search._most = 0.0, 0.05, np.inf, 4
     search._candidates, search.retuned = [], lambda fitted: fitted
     best = contender('even_nonlinearity', 0.02)
     plays, wide, as_given = (
-        SimpleNamespace(mean_square=part * WHOLE) for part in (1.0, 0.02, share)
+        SimpleNamespace(mean_square=part * WHOLE) for part in (1.0, wide_left, share)
     )
     search._round = lambda fitted: a_round(best)
     monkeypatch.setattr(forward_selection, 'without_needless', lambda s, fitted, *_: (fitted, []))
