@@ -199,7 +199,10 @@ def _model(
     kept = tuple(_elsewhere(added) for added in state.effects)
     model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
     scaling = model.scaling
-    moved = replace(scaling, y0=scaling.y0 + float(state.offsets[k]) * scaling.Y, range=span)
+    # a slow drift and an offset make up for one another: its mean stays when it goes
+    gone = simulator.run(state) - simulator.run(replace(state, effects=kept))
+    offset = float(state.offsets[k]) + float(gone[rows.of_record == k].mean())
+    moved = replace(scaling, y0=scaling.y0 + offset * scaling.Y, range=span)
     provenance = {
         **model.identification,
         'diagnosis': {

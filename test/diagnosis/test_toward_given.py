@@ -10,11 +10,12 @@ import numpy as np
 from piezo_ident.common.errors import Cancelled
 from piezo_ident.diagnosis.base_refit import refits
 from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
-from piezo_ident.diagnosis.refined_model import _at_given_gain
+from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
 from piezo_ident.diagnosis.rows import centred, make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.toward_given import loops, toward_given
+from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.record.record import Record
 from programs import slow_model
 import pytest
@@ -109,3 +110,14 @@ def test_a_gain_that_wanders_is_elsewhere_as_far_as_given(refit):
     state = given.with_coefficients(given.law, theta).with_effect(wanders)
     [added] = _at_given_gain(simulator, given, state).effects
     assert added.values[0]['gain'] == pytest.approx([1.0 / 3.0], rel=1e-6)
+
+
+def test_a_drift_that_is_left_out_takes_its_mean_along(refit):
+    simulator, _, fitted = refit
+    # over at once, so an offset makes up for it
+    drift = Added('thermal_drift', ({'amplitude': -1.0, 'time_constant': 1e-3},))
+    state = replace(fitted.state.with_effect(drift), offsets=np.ones(1))
+    findings = Findings('named', 1.0, ('thermal_drift',), None, 0.0)
+    scaling = simulator.model.scaling
+    refined = _model(simulator, state, findings, scaling.range, ())
+    assert refined.scaling.y0 == pytest.approx(scaling.y0, abs=1e-3 * abs(scaling.Y))
