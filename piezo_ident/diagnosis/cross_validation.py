@@ -158,24 +158,20 @@ def held_out_errors(
     sets: NDArray[np.int64],
     prior: Array,
     pull: Pull | None = None,
-    *,
-    settled: bool = False,
 ) -> Array:
     """
     Return the squares of every block, each predicted from other sets; shape (blocks, k).
 
     Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
-    The pull never is.  Of a fit that has `settled` only the change counts that leaving a set out
-    makes: a step that all blocks promise could not be made.
+    The pull never is.
     """
     A, b = summed(equations, pull)
     errors = equations.s.copy()
-    whole = solve(A, b, prior) if settled else 0.0
     for one in np.unique(sets):
         out = sets == one
         if not out.all():
             A_out, b_out = equations.A[out], equations.b[out]
-            theta = solve(A - A_out.sum(axis=0), b - b_out.sum(axis=0), prior) - whole
+            theta = solve(A - A_out.sum(axis=0), b - b_out.sum(axis=0), prior)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
     return np.maximum(errors, 0.0)
 

@@ -105,6 +105,15 @@ class Fitted:
         """Mean square error of the blocks held out in spread sets, normalised."""
         return float(self.errors.sum() / self.e.size)
 
+    @property
+    def reached(self) -> float:
+        """
+        The same, and no less than what the fit itself leaves.
+
+        With columns of another state, blocks held out promise a step that cannot be made.
+        """
+        return max(self.mean_square, float(self.e @ self.e / self.e.size))
+
     def held_out_residual(self, rows: Rows, sets: NDArray[np.int64] | None = None) -> Array:
         """
         Return the residual of every row, fitted to other blocks; shape (n,), normalised.
@@ -174,7 +183,7 @@ def fit_jointly(
     rows = simulator.rows
     parameters = free_parameters(state, len(rows.names))
     p = base.columns.shape[1] + len(parameters)
-    damping, last, settled = DAMPING, 0.0, True
+    damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
     pull = pull_at and pull_at(state, p)
@@ -215,8 +224,6 @@ def fit_jointly(
         if hopeless or gain < least:
             break
         last = gain
-    else:
-        settled = False
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
@@ -233,8 +240,8 @@ def fit_jointly(
         free=free,
         parameters=parameters,
         prior=prior,
-        errors=held_out_errors(equations, rows.fold, prior[free], own, settled=settled)[:, 0],
-        transfer=held_out_errors(equations, rows.group, firm[free], own, settled=settled)[:, 0],
+        errors=held_out_errors(equations, rows.fold, prior[free], own)[:, 0],
+        transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
         pull=own,
     )
 

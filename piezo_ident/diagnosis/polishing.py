@@ -50,10 +50,10 @@ def without_needless(
             enough=criteria.OF_LEAST * least,
             goal=fitted.mean_square + least,
         )
-        if without.mean_square - fitted.mean_square >= least:
+        if without.reached - fitted.mean_square >= least:
             continue
         without = fit_jointly(simulator, without.state, fitted.base)
-        if without.mean_square - fitted.mean_square >= least:
+        if without.reached - fitted.mean_square >= least:
             continue
         # what the others make up for by values that cannot be, they do not explain
         if all(a.effect.is_plausible(v) for a in without.state.effects for v in a.values):

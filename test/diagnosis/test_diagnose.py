@@ -540,23 +540,6 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
     assert errors[rows.fold == 2].sum() == pytest.approx(left @ left, rel=1e-6)
 
 
-def test_a_fit_that_settled_is_not_credited_with_a_step_it_did_not_make(truths):
-    model, record, _ = measured(None, 0.0, 1)
-    rows = make_rows(model, [record])
-    rng = np.random.default_rng(0)
-    M, e = rng.standard_normal((rows.n, 4)), rng.standard_normal(rows.n)
-    equations = normal_equations(rows, M, (e + M @ np.full(4, 3.0))[:, None])
-    promised = held_out_errors(equations, rows.fold, np.zeros(4)).sum()
-    reached = held_out_errors(equations, rows.fold, np.zeros(4), settled=True).sum()
-    assert promised == pytest.approx(e @ e, rel=0.01)
-    assert reached == pytest.approx(equations.s.sum(), rel=0.01)
-    # where no step is left both say the same
-    left = (e - M @ np.linalg.lstsq(M, e, rcond=None)[0])[:, None]
-    equations = normal_equations(rows, M, left)
-    same = held_out_errors(equations, rows.fold, np.zeros(4), settled=True)
-    np.testing.assert_allclose(same, held_out_errors(equations, rows.fold, np.zeros(4)), rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ('errors', 'missed'),
     [

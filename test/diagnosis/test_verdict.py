@@ -259,9 +259,17 @@ def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
     assert found.fitted is (best if is_taken else wide)
 
 
-@pytest.mark.parametrize(('end', 'dropped'), [(0.101, (0,)), (0.5, ())])
+@pytest.mark.parametrize(
+    ('end', 'reached', 'dropped'),
+    [
+        (0.101, 0.0, (0,)),
+        (0.5, 0.0, ()),
+        # blocks held out promise what the fit did not reach
+        (0.101, 0.5, ()),
+    ],
+)
 def test_what_is_needless_shows_when_the_rest_is_fitted_to_its_end(
-    rows, monkeypatch, end, dropped
+    rows, monkeypatch, end, reached, dropped
 ):
     added = SimpleNamespace(effect=SimpleNamespace(is_plausible=lambda _: True), values=({},))
     state = State(None, np.zeros(1), effects=(added, added))
@@ -269,7 +277,9 @@ def test_what_is_needless_shows_when_the_rest_is_fitted_to_its_end(
     fits = iter([fitted(0.1005 * WHOLE), fitted(end * WHOLE)])
 
     def fit(simulator, state, base, **kwargs):
-        return SimpleNamespace(**(vars(next(fits)) | {'state': state}))
+        own = next(fits)
+        least = max(own.mean_square, reached * WHOLE)
+        return SimpleNamespace(**(vars(own) | {'state': state, 'reached': least}))
 
     monkeypatch.setattr(polishing, 'fit_jointly', fit)
     simulator = SimpleNamespace(rows=rows)
