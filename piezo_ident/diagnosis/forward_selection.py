@@ -160,11 +160,11 @@ class ForwardSelection:
         What exceeds all that was missed, and all that H misses, is no side effect on G, unless
         something else takes much of what a retuned G leaves: it may have bent G.
         """
-        beside = next((one for one in found.rounds if one.before is retuned), None)
+        other = next((one for one in found.rounds if one.before is retuned), None)
         if (
-            beside is not None
-            and self._takes(beside, self._explainable(retuned), first=True)
-            and not find_effect(beside.contenders[0].name).in_dynamics
+            other is not None
+            and self._takes(other, self._explainable(retuned), first=True)
+            and not find_effect(other.contenders[0].name).in_dynamics
         ):
             return False
         explainable = self._explainable(linear.before)
@@ -232,7 +232,8 @@ class ForwardSelection:
         Select one effect that follows the path of the command alone, beside what was found.
 
         A wide H imitates it.  So it has to be nearly all that is left beside a sum of plays, and
-        to leave as little as the wide H does without it (`wide`).  What the H of the model does
+        to leave as little as the wide H does without it (`wide`): clearly less, where no kinds of
+        motion are held out.  What the H of the model does
         not leave beside what was found and a retuned G (`as_given`) needs no effect.
         """
         self._given = min(self._given, as_given.mean_square)
