@@ -74,6 +74,8 @@ NAMED, ADDED = 0.92, 0.5
 #: share that effects must explain together, but for those that show where they alone act: a
 #: hysteresis that does not fit leaves a residual of which any effect explains a part
 TOGETHER = 0.8
+#: ratio of a gain to that of any other candidate from which an effect need not explain so much
+STANDS_OUT = 2.0
 #: share of what earlier effects left that a further one must explain
 FURTHER = 0.6
 #: least gain of an effect, share

@@ -21,7 +21,7 @@ from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
 from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.search import Round, search_round, takes
+from piezo_ident.diagnosis.search import Round, search_round, stands_out, takes
 from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.trial_scores import best_trials
@@ -373,8 +373,11 @@ class ForwardSelection:
             )
             for i in dropped:
                 del taken[i]
-        new = [find_effect(this.contenders[0].name) for this in taken[len(shown) :]]
-        if self._beyond_noise(fitted) > (1.0 - self._wanted(new)) * explainable:
+        new = taken[len(shown) :]
+        wanted = self._wanted([find_effect(this.contenders[0].name) for this in new])
+        if len(new) == 1 and stands_out(self._simulator.rows, new[0]):
+            wanted = min(wanted, criteria.ADDED)
+        if self._beyond_noise(fitted) > (1.0 - wanted) * explainable:
             taken = [*shown]
         self._progress('candidates', 1.0)
         left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}

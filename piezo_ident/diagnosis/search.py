@@ -33,7 +33,7 @@ from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['Round', 'search_round', 'takes']
+__all__ = ['Round', 'search_round', 'stands_out', 'takes']
 
 Array = NDArray[np.float64]
 
@@ -292,6 +292,24 @@ def takes(
         return False
     # what shows where it alone acts has no need of a proof by all kinds of excitation
     return has_place(best.name) or not _harms(rows, this.before, best)
+
+
+def stands_out(rows: Rows, this: Round) -> bool:
+    """
+    Return whether the best contender of a round gains far more than any other candidate.
+
+    A hysteresis that does not fit leaves something of which many effects explain a part, and none
+    much more than the next.  What follows the path of the command, or was tried beside a G that
+    was not retuned, stands out too easily.
+    """
+    before, best = this.before, this.contenders[0]
+    if not before.state.retuning or find_effect(best.name).rate_independent:
+        return False
+    total = float(before.errors.sum())
+    gains = [(total - s.error) / rows.n for name, s in this.best.items() if name != best.name]
+    gains += [before.mean_square - c.mean_square for c in this.contenders[1:]]
+    most = max(gains, default=0.0)
+    return bool(before.mean_square - best.mean_square >= criteria.STANDS_OUT * most)
 
 
 def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:

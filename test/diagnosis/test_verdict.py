@@ -12,7 +12,7 @@ from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors,
 from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Errors, Unexplained
-from piezo_ident.diagnosis.search import takes
+from piezo_ident.diagnosis.search import stands_out, takes
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
@@ -320,6 +320,28 @@ def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
     simulator.copies = lambda _: [simulator]
     search._contenders(simulator, before, starts, 0.0, lambda _: None)
     assert seen == ended
+
+
+@pytest.mark.parametrize(
+    ('name', 'second', 'tried', 'is_retuned', 'is_far'),
+    [
+        ('slew_limit', 0.7, 0.7, True, True),
+        # another gains more than half as much, fitted or by its columns alone
+        ('slew_limit', 0.6, 0.9, True, False),
+        ('slew_limit', 0.9, 0.6, True, False),
+        # beside a G as given any change of it stands out, and beside a wide H what bends it
+        ('changed_dynamics', 0.7, 0.7, False, False),
+        ('sensor_nonlinearity', 0.7, 0.7, True, False),
+    ],
+)
+def test_an_effect_stands_out_where_no_other_gains_half_as_much(
+    rows, name, second, tried, is_retuned, is_far
+):
+    this = a_round(contender(name, 0.3), contender('creep', second))
+    this.before.state.retuning = (0.0,) * 4 if is_retuned else ()
+    for other, left in ((name, 0.4), ('gain_drift', tried)):
+        this.best[other] = SimpleNamespace(error=left * WHOLE * rows.n)
+    assert stands_out(rows, this) == is_far
 
 
 def test_an_effect_that_costs_a_kind_is_not(rows):
