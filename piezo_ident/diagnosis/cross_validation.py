@@ -18,7 +18,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import HARM, OF_SHAPE, STANDARD_ERRORS
+from piezo_ident.diagnosis.criteria import HARM, HARM_OF_REFIT, OF_SHAPE, STANDARD_ERRORS
 from piezo_ident.diagnosis.rows import centred, Rows
 
 __all__ = [
@@ -244,7 +244,9 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     if standard_errors(before - transfer) < STANDARD_ERRORS:
         return False
     change = np.bincount(rows.group, transfer - before, len(rows.labels))
-    return bool(change[change > 0.0].sum() <= -HARM * change.sum())
+    # without labels parts of a record stand for kinds
+    harm = HARM_OF_REFIT if rows.kinds else HARM
+    return bool(change[change > 0.0].sum() <= -harm * change.sum())
 
 
 def takes_shape(rows: Rows, given: Array, held_out: Array, noise: float) -> bool:
