@@ -306,12 +306,10 @@ def _missed(model: StageModel) -> float:
     """Return what the model missed at its identification, % of stroke, or 0: of fast motion."""
     errors = model.identification.get('errors')
     known = errors if isinstance(errors, Mapping) else {}
-    # a file without that tells the error of all motion at least; without labels, and so without a
-    # part that selects, fast motion was judged next to what was fitted
-    keys = ('fast_motion',) if 'selection' in known else ('fast_motion', 'held_out')
-    own = [known[key] for key in keys if key in known]
-    told = own if 'fast_motion' in known else known.values()
-    return max((float(x) for x in told if isinstance(x, int | float)), default=0.0)
+    if 'fast_motion' in known:
+        known = {'fast_motion': known['fast_motion']}
+    # a file without that tells the error of all motion at least
+    return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
