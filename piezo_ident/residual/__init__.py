@@ -9,7 +9,6 @@ from piezo_ident.residual.dependence import Curve
 from piezo_ident.residual.faults import FaultSearch, find_faults
 from piezo_ident.residual.lines import find_lines, Line, LineSearch, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.repeatable import Repeatability, repeatability
 from piezo_ident.residual.stretches import all_stretches, ResidualPart, Stretch, stretches_of
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     'Line',
     'LineSearch',
     'NoiseFloor',
-    'Repeatability',
     'ResidualAnalysis',
     'ResidualPart',
     'Stretch',
@@ -28,7 +26,6 @@ __all__ = [
     'channel_tests',
     'find_faults',
     'find_lines',
-    'repeatability',
     'residual_noise_floor',
     'stretches_of',
     'without_channels',
