@@ -332,36 +332,6 @@ class Hysteresis:
         relaxing(x, np.array(self.relaxations), lags, out)
         return out, np.concatenate([end, lags])
 
-    def slope(self, v: float, excursion: float = 0.0) -> float:
-        """
-        Return the small-signal gain dw/dv around a settled bias.
-
-        Plays wider than the excursion stand still; narrower ones move by the part of the
-        excursion that exceeds their width.
-
-        Parameters
-        ----------
-        v : float
-            Bias, normalised.
-        excursion : float, optional
-            Peak-to-peak size of the small signal, normalised.
-        """
-        gain = self.p2 + 3.0 * self.p1 * v * v
-        if self._is_curved:
-            # in the middle of their bands, where a small loop settles
-            place = np.clip(v - self.thresholds / 2.0 - self.span[0], 0.0, self._wide[4])
-            gain += 2.0 * self.p0 * v + float(self._wide[3] @ place)
-        if excursion > 0.0:
-            moved = np.maximum(0.0, 1.0 - self.thresholds / excursion)
-            weights = self.weights if not self._is_curved else self.rise(self.span[0] + place, v)
-            gain += float(weights @ moved)
-        if self.relaxations is not None:
-            # the chord of a lag behind a triangle wave that has gone on for long
-            x = 0.5 * self.relaxations[:, 0] * max(excursion, 1e-9)
-            steepness = self.relaxations[:, 1:] @ np.array([1.0, 2.0 * v, 3.0 * v * v])
-            gain -= float(steepness @ (np.tanh(x) / x))
-        return gain
-
 
 class HysteresisOperator:
     """H as an operator, with its memory."""
