@@ -41,9 +41,6 @@ class Curve:
     mean, std : ndarray, shape (m,)
         Mean residual and its standard deviation [m]; whole stretches of time count as one
         observation, so correlated samples do not make it look better known than it is.
-    share : float
-        Share of the residual's variance, where the quantity is defined, that the curve (both
-        branches together) fitted to every other stretch of time explains in the rest; 0..1.
     """
 
     against: str
@@ -51,7 +48,6 @@ class Curve:
     x: Array
     mean: Array
     std: Array
-    share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +110,8 @@ def _against_v(motion: _Motion) -> list[Curve]:
     ends = np.linspace(motion.v.min(), motion.v.max() + 1e-12, BINS + 1)
     bins = np.clip(np.searchsorted(ends, motion.v, side='right') - 1, 0, BINS - 1)
     bins = bins + BINS * (motion.direction < 0.0)
-    share = _held_out(motion.e, bins, motion.chunk)
     return [
-        _curve('v', branch, motion.v, motion.e, bins, motion.chunk, own, share)
+        _curve('v', branch, motion.v, motion.e, bins, motion.chunk, own)
         for branch, own in (('up', motion.direction > 0.0), ('down', motion.direction < 0.0))
     ]
 
@@ -129,9 +124,8 @@ def _against_speed(motion: _Motion) -> list[Curve]:
     bins = np.zeros(motion.speed.size, dtype=np.int64)
     bins[moving] = _decades(np.abs(motion.speed[moving]))
     bins = 2 * bins + (motion.speed < 0.0)
-    share = _held_out(motion.e[moving], bins[moving], motion.chunk[moving])
     return [
-        _curve('dv/dt', branch, motion.speed, motion.e, bins, motion.chunk, own, share)
+        _curve('dv/dt', branch, motion.speed, motion.e, bins, motion.chunk, own)
         for branch, own in (
             ('up', moving & (motion.speed > 0.0)),
             ('down', moving & (motion.speed < 0.0)),
@@ -152,7 +146,6 @@ def _curve(
     bins: Integers,
     chunk: Integers,
     own: NDArray[np.bool_],
-    share: float,
 ) -> Curve:
     bins, x, e, chunk = bins[own], x[own], e[own], chunk[own]
     size = int(bins.max(initial=0)) + 1
@@ -170,31 +163,7 @@ def _curve(
     std = np.sqrt(spread * correction) / filled
     shown = np.flatnonzero((count >= FEWEST) & (visits >= VISITS))
     shown = shown[np.argsort(centre[shown])]
-    return Curve(against, branch, centre[shown], mean[shown], std[shown], share)
-
-
-def _held_out(e: Array, bins: Integers, chunk: Integers) -> float:
-    """Return the share of the variance of e that means of the bins explain, held out."""
-    left = whole = 0.0
-    size = int(bins.max(initial=0)) + 1
-    for fold in (0, 1):
-        test = chunk % 2 == fold
-        fit = ~test
-        if not (test.any() and fit.any()):
-            return 0.0
-        # what e has to offer without the curve is its mean over the other half
-        centre = float(e[fit].mean())
-        count = np.bincount(bins[fit], minlength=size)
-        value = np.bincount(bins[fit], e[fit] - centre, size) / np.maximum(count, 1)
-        rest = e[test] - centre
-        whole += float(rest @ rest)
-        rest = rest - value[bins[test]]
-        left += float(rest @ rest)
-    return _explained(left, whole)
-
-
-def _explained(left: float, whole: float) -> float:
-    return float(np.clip(1.0 - left / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+    return Curve(against, branch, centre[shown], mean[shown], std[shown])
 
 
 def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
@@ -212,16 +181,7 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
         used = np.flatnonzero(count)
         rows.append((used, sums[used] / count[used], s.step / largest))
     size = max(int(used[-1]) for used, _, _ in rows) + 1
-    left = whole = 0.0
-    for fold in (0, 1):
-        other, known = _common(rows[1 - fold :: 2], size)
-        for k, e, weight in rows[fold::2]:
-            own = known[k]
-            if own.sum() >= 2:
-                fitted = weight * other[k[own]]
-                whole += float(np.sum((e[own] - e[own].mean()) ** 2))
-                left += float(np.sum((e[own] - e[own].mean() - fitted + fitted.mean()) ** 2))
-    curve, _ = _common(rows, size)
+    curve = _common(rows, size)
     x = first * 10.0 ** ((np.arange(size) + 0.5) / PER_DECADE)
     top, bottom, visits = np.zeros((3, size))
     for k, e, weight in rows:
@@ -234,12 +194,11 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
         return []
     std = np.sqrt(top * visits / np.maximum(visits - 1, 1)) / np.maximum(bottom, 1e-300)
     mean = curve[shown] - curve[shown][0]
-    share = _explained(left, whole)
-    return [Curve('time since the step', 'both', x[shown], mean, std[shown], share)]
+    return [Curve('time since the step', 'both', x[shown], mean, std[shown])]
 
 
-def _common(rows: Sequence[_Hold], size: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the curve g that fits e = offset of the hold + weight g(bin) best, and its bins."""
+def _common(rows: Sequence[_Hold], size: int) -> Array:
+    """Return the curve g that fits e = offset of the hold + weight g(bin) best."""
     n = sum(k.size for k, _, _ in rows)
     A, b = np.zeros((n, size + len(rows))), np.zeros(n)
     at = 0
@@ -249,6 +208,4 @@ def _common(rows: Sequence[_Hold], size: int) -> tuple[Array, NDArray[np.bool_]]
         A[places, size + i] = 1.0
         b[places] = e
         at += k.size
-    known = np.asarray(np.abs(A[:, :size]).sum(axis=0) > 0.0)
-    g = np.linalg.lstsq(A, b, rcond=1e-9)[0][:size]
-    return np.asarray(g), known
+    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0][:size])

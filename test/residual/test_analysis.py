@@ -32,14 +32,12 @@ def test_survey_with_creep_that_the_model_lacks():
     # 1.5 nm of noise behind a converter of 2.29 nm
     assert found.floor.rms == pytest.approx(np.hypot(1.5e-9, 2.289e-9 / np.sqrt(12)), rel=0.03)
     (curve,) = curves(found, 'time since the step')
-    assert curve.share > 0.8
     # steps of 2.5 V and three relaxations of 0.1 um/V: 0.75 um, and earlier steps still go on
     assert 0.5e-6 < curve.mean[-1] < 1.2e-6
 
 
 def test_nothing_but_noise_depends_on_nothing():
     found = analyse([part_of(noise())])
-    assert all(c.share < 0.03 for c in found.curves)
     curve = curves(found, 'v')[0]
     # the standard deviations are honest: most points lie within two of zero
     assert np.mean(np.abs(curve.mean) < 2.5 * curve.std) > 0.8
@@ -49,14 +47,12 @@ def test_dependence_on_voltage_and_direction():
     direction = np.sign(np.gradient(V))
     up, down = curves(analyse([part_of(noise() + 1e-8 * np.cos(V) + 5e-9 * direction)]), 'v')
     assert (up.branch, down.branch) == ('up', 'down')
-    assert up.share > 0.8
     np.testing.assert_allclose(up.mean, 1e-8 * np.cos(up.x) + 5e-9, atol=3e-9)
     np.testing.assert_allclose(down.mean, 1e-8 * np.cos(down.x) - 5e-9, atol=3e-9)
 
 
 def test_dependence_on_speed():
     curve = curves(analyse([part_of(noise() + 1e-11 * np.gradient(V) * RATE)]), 'dv/dt')[0]
-    assert curve.share > 0.6
     # only the slope over the bins counts: within one the speed varies
     assert np.polyfit(curve.x, curve.mean, 1)[0] == pytest.approx(1e-11, rel=0.05)
 
@@ -73,7 +69,6 @@ def test_creep_is_straight_over_the_logarithm_of_time():
     late = curve.x > 10 / RATE
     slope = np.polyfit(np.log10(curve.x[late]), curve.mean[late], 1)[0]
     assert slope == pytest.approx(8e-9, rel=0.05)
-    assert curve.share > 0.98
 
 
 def test_outliers_do_not_reach_the_floor_nor_lines_the_noise():
