@@ -51,33 +51,15 @@ class ChannelTest:
     channel : str
     significant : bool
         A channel without a bearing on the residual is so in one of 100,000 cases.
-    chance : float
-        That an unrelated channel of the same kind gains as much, from circular shifts.
-    share : float
-        Share of the residual's mean square that the channel explains beyond the drive, 0..1.
     rms : float
         Of what it adds [m].
-    coherence, bound : float
-        Partial coherence given the drive, of residuals made white, all lags together; and what
-        an unrelated channel stays below in 99,999 of 100,000 cases.  For one column and L
-        independent observations that is ``1 - (1 - c)^(1/(L - 1))``.
-    kept : float
-        Share of that gain that is left in fifths of the data to which it was not fitted.
-    why : str
-        Why it was not tested; empty when it was.
     added : tuple of ndarray or None
-        What it adds to the residual of each part [m].
+        What it adds to the residual of each part [m]; empty when it was not tested.
     """
 
     channel: str
     significant: bool = False
-    chance: float = 1.0
-    share: float = 0.0
     rms: float = 0.0
-    coherence: float = 0.0
-    bound: float = 1.0
-    kept: float = 0.0
-    why: str = ''
     added: tuple[Array | None, ...] = field(default=(), repr=False, compare=False)
 
 
@@ -180,12 +162,9 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     ]
     rate = max((p.rate for p in every if p), default=0.0)
     found = [p for p in every if p and p.rate == rate and p.use.sum() > 4 * WHITE]
-    if not found:
-        return ChannelTest(name, why='too little was recorded with it')
-    if all(np.ptp(p.own[p.use]) == 0.0 for p in found):
-        return ChannelTest(name, why='it does not move')
-    if _follows(having, name, found):
-        return ChannelTest(name, why='it follows the drive, or moves as slowly as drift')
+    moves = any(np.ptp(p.own[p.use]) > 0.0 for p in found)
+    if not moves or _follows(having, name, found):
+        return ChannelTest(name)
     levels = [_level(p) for p in found]
     # what the channel adds is not made white: of a single tone nothing would be left
     at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(found, levels, strict=True)]
@@ -202,21 +181,14 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     coefficients = made @ (P.T @ E)
     of_part = {id(p): p.channel @ coefficients for p in found}
     added = np.concatenate([_centred(of_part[id(p)][p.use]) for p in found])
-    whole = np.concatenate([_centred(p.e[p.use]) for p in found])
-    power = float(np.mean(added**2))
     return ChannelTest(
         channel=name,
         significant=chance < SIGNIFICANT and gain > bound and kept > KEPT,
-        kept=kept,
+        rms=float(np.sqrt(np.mean(added**2))),
         added=tuple(
             None if p is None or id(p) not in of_part else _at_all(part, of_part[id(p)])
             for part, p in zip(parts, every, strict=True)
         ),
-        chance=chance,
-        share=min(power / max(float(np.mean(whole**2)), 1e-300), 1.0),
-        rms=float(np.sqrt(power)),
-        coherence=gain,
-        bound=bound,
     )
 
 
