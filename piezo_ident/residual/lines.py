@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
-from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of, true_runs
+from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
 from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
@@ -81,18 +81,10 @@ class LineSearch:
         By falling amplitude.
     searched : bool
         Whether a stretch was long enough.
-    tested : tuple of (float, float)
-        Bands [Hz] in which a line as large as the residual would have been seen; between them the
-        drive, a harmonic of it, or what it leaves hides it.
     """
 
     lines: tuple[Line, ...] = ()
     searched: bool = False
-    tested: tuple[tuple[float, float], ...] = ()
-
-    def is_tested(self, frequency: float) -> bool:
-        """Return whether a line of a frequency [Hz] would have been seen."""
-        return any(low <= frequency <= high for low, high in self.tested)
 
 
 def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> LineSearch:
@@ -114,8 +106,6 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     bins = max(1.0, TRIALS * float(keep.sum()) / FINE)
     negligible = max(SMALLEST * max(strokes_of(parts).values()), SIDELINE * _rms(parts))
     search = _Search(series, f, size)
-    seen = keep & (search.information() * _rms(parts) ** 2 > np.log(bins / SIGNIFICANT))
-    tested = tuple((float(f[a]), float(f[b - 1])) for a, b in true_runs(seen))
     found: list[Line] = []
     score, gain = search.score()
     for _ in range(2 * LINES):
@@ -137,7 +127,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
                 keep &= np.abs(f - frequency) > BESIDE * frequency
         # what was refined may lie some bins away from what stood out
         keep &= np.minimum(np.abs(f - frequency), np.abs(f - f[best])) > 2.0 / longest
-    return LineSearch(_grouped(found, 2.0 / longest), searched, tested)
+    return LineSearch(_grouped(found, 2.0 / longest), searched)
 
 
 def _rms(parts: Sequence[ResidualPart]) -> float:
@@ -199,14 +189,6 @@ class _Search:
             gain += ratio
             total += k * np.log1p(ratio / k)
         return _log_chance(total, len(self.records)), gain
-
-    def information(self) -> Array:
-        """Return what is known of an amplitude at every f in the best record [1/m^2]."""
-        known = np.zeros((len(self.records), self._f.size))
-        for s in self._spectra:
-            response = np.abs(s.series.gain(self._f)) * (0.5 * s.series.window.sum())
-            known[self.records.index(s.series.record)] += response**2 / s.noise
-        return np.asarray(known.max(axis=0))
 
     def refined(self, best: int) -> float:
         """

