@@ -336,7 +336,7 @@ def memory_rows(
             [taught[i] for i in few],
             weights=[weights[i] for i in few],
             iterations=6,
-        ).model
+        )
         found = scores(dict.fromkeys(softening.models, fitted), held_out)
         rows.append(f'| {memory:.0f} | {" | ".join(f"{s.pooled:.2f}" for s in found.values())} |')
     errors = ' | '.join(f'{s.pooled:.2f}' for s in softening.scores.values())

@@ -190,7 +190,7 @@ def explain(
                 still=still,
                 iterations=many,
                 warm_up=warm_up,
-            ).model
+            )
         return model
 
     def everywhere(model: LoopModel) -> dict[str, LoopModel]:
@@ -200,7 +200,7 @@ def explain(
     middle = middle_group(small)
 
     since = time.monotonic()
-    one = loop_fit(plain, small, weights=small_weights, iterations=iterations // 2).model
+    one = loop_fit(plain, small, weights=small_weights, iterations=iterations // 2)
     judged('linear', everywhere(one), since)
 
     since = time.monotonic()
@@ -227,7 +227,7 @@ def explain(
     model = grown(with_input_plays(model, middle), iterations)
     model = loop_fit(
         model, taught, weights=weights, iterations=max(1, iterations // 3), warm_up=warm_up
-    ).model
+    )
     judged('hysteretic_stiffness', everywhere(model), since)
     return Explanation(tuple(found))
 

@@ -11,7 +11,7 @@ of its y, so small amplitudes count as much as large ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Fit', 'Parameters', 'loop_fit', 'output_sensitivities']
+__all__ = ['Parameters', 'loop_fit', 'output_sensitivities']
 
 #: a real pole has died away to this part after the warm-up
 FADED = 0.01
@@ -33,6 +33,8 @@ RARE = 0.05
 #: the fit ends after so many steps in turn that gain less than this part of the error
 SLOW = 3e-3
 SLOW_STEPS = 3
+#: threads
+WORKERS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,22 +121,6 @@ class Parameters:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """
-    A fitted model.
-
-    Attributes
-    ----------
-    errors : tuple of float
-        100 rms of the weighted errors over rms of the weighted y, at the start and after each
-        step.
-    """
-
-    model: LoopModel
-    errors: tuple[float, ...]
-
-
 def output_sensitivities(
     model: LoopModel,
     parameters: Parameters,
@@ -190,9 +176,7 @@ def loop_fit(
     still: Collection[int] = (),
     iterations: int = 10,
     warm_up: int = 1024,
-    workers: int = 2,
-    progress: Callable[[int, float], None] | None = None,
-) -> Fit:
+) -> LoopModel:
     """
     Lower the error of a model in free run over periodic records.
 
@@ -204,25 +188,19 @@ def loop_fit(
         What is not fitted, see `Parameters.of`.
     warm_up : int
         Samples of the period that run before it, so that the stage forgets its rest.
-    workers : int
-        Threads.
-    progress : callable, optional
-        Called with each step and its error in %.
 
     Returns
     -------
-    Fit
-        Of a model whose modes are stable over its range of levels, which is what the records
-        often reach.
+    LoopModel
+        Whose modes are stable over its range of levels, which is what the records often reach.
     """
     weights = [1.0] * len(records) if weights is None else weights
     model = _ranged(model, records)
     problem = _Problem(model, records, weights, hold, still, warm_up)
     damping, slow = 1e-3, 0
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(WORKERS) as pool:
         cost = problem.cost(model, pool)
-        errors = [problem.percent(cost)]
-        for step in range(iterations):
+        for _ in range(iterations):
             hessian, gradient = problem.normal_equations(model, pool)
             before = cost
             for _ in range(8):
@@ -235,13 +213,10 @@ def loop_fit(
             else:
                 break
             damping = max(damping / 6, 1e-9)
-            errors.append(problem.percent(cost))
-            if progress is not None:
-                progress(step, errors[-1])
             slow = slow + 1 if before - cost < SLOW * before else 0
             if slow == SLOW_STEPS:
                 break
-    return Fit(_ranged(model, records), tuple(errors))
+    return _ranged(model, records)
 
 
 def _ranged(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
@@ -276,7 +251,6 @@ class _Problem:
     ) -> None:
         self.parameters = Parameters.of(model, hold=hold, still=still)
         self.targets = []
-        self.power = 0.0
         self.warm_up = min(warm_up, records[0].u.shape[1])
         self.slowest = FADED ** (1 / self.warm_up)
         for record, weight in zip(records, weights, strict=True):
@@ -284,10 +258,6 @@ class _Problem:
             weight = weight / float(np.sqrt(np.mean(y**2)))
             before = u[len(u) - self.warm_up :]
             self.targets.append((np.concatenate([before, u]), y, weight))
-            self.power += float(np.sum((weight * y) ** 2))
-
-    def percent(self, cost: float) -> float:
-        return 100 * float(np.sqrt(cost / self.power))
 
     def cost(self, model: LoopModel, pool: ThreadPoolExecutor) -> float:
         """Sum of the squared, weighted errors; infinite where the model is not stable."""
