@@ -34,7 +34,6 @@ __all__ = [
     'free_run_error',
     'instrumental_variables',
     'instruments_of',
-    'order_table',
     'scan_orders',
     'stabilised',
 ]
@@ -168,8 +167,8 @@ class OrderTable:
     ----------
     loss : ndarray
         One-step loss on the fitted part.
-    aic, bic, fpe : ndarray
-        Akaike's and Schwarz's criterion and Akaike's final prediction error.
+    aic, bic : ndarray
+        Akaike's and Schwarz's criterion.
     held_out : ndarray
         Free-run rms error on the held-out part, infinite for an unstable model.
     dynamics : tuple of tuple of Dynamics
@@ -178,12 +177,11 @@ class OrderTable:
     loss: NDArray[np.float64]
     aic: NDArray[np.float64]
     bic: NDArray[np.float64]
-    fpe: NDArray[np.float64]
     held_out: NDArray[np.float64]
     dynamics: tuple[tuple[Dynamics, ...], ...]
 
     def best(self, criterion: str) -> tuple[int, int]:
-        """Return (na, nb) of the smallest ``aic``, ``bic``, ``fpe`` or ``held_out``."""
+        """Return (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
         table = getattr(self, criterion)
         i, j = np.unravel_index(int(np.argmin(table)), table.shape)
         return int(i) + 1, int(j) + 1
@@ -242,28 +240,6 @@ def scan_orders(
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
     """
-    return order_table(
-        factor, d, nb_max, lambda model: free_run_error(model, d, u_held, y_held), tick
-    )
-
-
-def order_table(
-    factor: ArxFactor,
-    d: int,
-    nb_max: int,
-    judged: Callable[[Dynamics], float],
-    tick: Callable[[float], None] | None = None,
-) -> OrderTable:
-    """
-    Fit all orders up to (na_max, nb_max), and judge each as asked.
-
-    Parameters
-    ----------
-    factor, d, nb_max, tick
-        As in `scan_orders`.
-    judged : callable
-        Returns the held-out error of dynamics without the delay, infinite when unstable.
-    """
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
     size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
@@ -274,7 +250,7 @@ def order_table(
             loss[na - 1, nb - 1] = one_step
             model = Dynamics(a=theta[:na], b=theta[na:])
             row.append(model)
-            held[na - 1, nb - 1] = judged(model)
+            held[na - 1, nb - 1] = free_run_error(model, d, u_held, y_held)
         models.append(tuple(row))
         if tick is not None:
             tick(na / shape[0])
@@ -283,7 +259,6 @@ def order_table(
         loss=loss,
         aic=log_loss + 2.0 * size,
         bic=log_loss + np.log(factor.n) * size,
-        fpe=loss * (factor.n + size) / (factor.n - size),
         held_out=held,
         dynamics=tuple(models),
     )
