@@ -29,6 +29,8 @@ __all__ = ['OutputErrorFit', 'lag_products', 'output_error', 'simulation_error']
 RADIUS = 0.99999
 #: samples whose products are summed at once
 STRETCH = 1024
+#: the refinement ends when the loss falls by less than this share
+SLOW = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,19 +45,11 @@ class OutputErrorFit:
         Of (a, b), for white output noise.
     rms : float
         Root mean square of the simulation error.
-    offsets : ndarray
-        Constant added to each stretch.
-    iterations : int
-    improved : bool
-        Whether anything better than the start was found.
     """
 
     dynamics: Dynamics
     covariance: NDArray[np.float64]
     rms: float
-    offsets: NDArray[np.float64]
-    iterations: int
-    improved: bool
 
     @property
     def normalised_covariance(self) -> NDArray[np.float64]:
@@ -184,16 +178,15 @@ class _Problem:
         self.n = int(sum(s.use.sum() for s in stretches))
         self.used = [s.stretches for s in stretches]
 
-    def errors(self, model: Dynamics) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-        """Return what the free run leaves of each stretch, without its mean, and the means."""
-        found, offsets = [], []
+    def errors(self, model: Dynamics) -> list[NDArray[np.float64]]:
+        """Return what the free run leaves of each stretch, without its mean."""
+        found = []
         for s, used in zip(self.stretches, self.used, strict=True):
             e = filter_arx(model.a, model.b, s.u)
             np.subtract(s.x, e, out=e)
-            offsets.append(_mean(e, used))
-            e -= offsets[-1]
+            e -= _mean(e, used)
             found.append(e)
-        return found, np.array(offsets)
+        return found
 
     def loss(self, errors: Sequence[NDArray[np.float64]]) -> float:
         total = 0.0
@@ -239,14 +232,13 @@ class _Problem:
 def simulation_error(stretches: Sequence[Excerpt], model: Dynamics) -> float:
     """Return the rms of the free-run error, an offset taken out of each stretch."""
     problem = _Problem(stretches, model.a.size, model.b.size)
-    return float(np.sqrt(problem.loss(problem.errors(model)[0])))
+    return float(np.sqrt(problem.loss(problem.errors(model))))
 
 
 def output_error(
     stretches: Sequence[Excerpt],
     start: Dynamics,
     maxiter: int = 30,
-    tol: float = 1e-7,
     tick: Callable[[], None] | None = None,
 ) -> OutputErrorFit:
     """
@@ -258,8 +250,6 @@ def output_error(
     start : Dynamics
         Stable start; its orders are kept.
     maxiter : int, optional
-    tol : float, optional
-        Stop when the loss falls by less than this share.
     tick : callable, optional
         Called once an iteration; may raise to stop the work.
 
@@ -271,11 +261,9 @@ def output_error(
     na, nb = start.a.size, start.b.size
     problem = _Problem(stretches, na, nb)
     model = start
-    errors, offsets = problem.errors(model)
-    loss = first_loss = problem.loss(errors)
-    damping, iterations = 1e-3, 0
-    while iterations < maxiter:
-        iterations += 1
+    errors = problem.errors(model)
+    loss, damping = problem.loss(errors), 1e-3
+    for _ in range(maxiter):
         if tick is not None:
             tick()
         H, g = problem.normal(model, errors)
@@ -286,7 +274,7 @@ def output_error(
             step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
             trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
             if trial.is_within(RADIUS):
-                new_errors, new_offsets = problem.errors(trial)
+                new_errors = problem.errors(trial)
                 new = problem.loss(new_errors)
                 if new < loss:
                     accepted = True
@@ -295,13 +283,12 @@ def output_error(
         if not accepted:
             break
         fall = 1.0 - new / loss
-        model, loss, errors, offsets = trial, new, new_errors, new_offsets
+        model, loss, errors = trial, new, new_errors
         damping = max(damping / 10.0, 1e-12)
-        if fall < tol or loss == 0.0:
+        if fall < SLOW or loss == 0.0:
             break
     H, _ = problem.normal(model, errors)
     covariance = np.asarray(
         loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
     )
-    rms = float(np.sqrt(loss))
-    return OutputErrorFit(model, covariance, rms, offsets, iterations, loss < first_loss)
+    return OutputErrorFit(model, covariance, float(np.sqrt(loss)))
