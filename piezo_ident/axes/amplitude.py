@@ -51,12 +51,6 @@ class AmplitudeDependence:
     damping: NDArray[np.float64]
     models: tuple[Modal, ...]
 
-    def slope(self) -> NDArray[np.float64]:
-        """Return the change of each frequency per volt of rms, in Hz/V."""
-        if len(self.voltage) < 2:
-            return np.full(self.frequency.shape[1], np.nan)
-        return np.asarray(np.polyfit(self.voltage, self.frequency, 1)[0])
-
 
 def amplitude_dependence(
     start: Modal,

@@ -124,8 +124,6 @@ class AxesIdentification:
     explanation : Explanation
     errors : dict
         In free run on the records held out, by group.
-    orders : dict
-        Error in % by order of the linear model.
     periodicity : tuple of Periodicity
         Of all records.
     periods : Periods
@@ -134,7 +132,6 @@ class AxesIdentification:
     model: AxesModel
     explanation: Explanation
     errors: dict[str, Score]
-    orders: dict[int, float]
     periodicity: tuple[Periodicity, ...]
     periods: Periods
 
@@ -203,7 +200,7 @@ def identify_axes(
     progress('dynamics', 0.0)
     # order and start at the middle of the amplitudes
     middle = middle_group(periods.records)
-    linear, orders = choose_order(middle[:-1], middle[-1:], orders=ORDERS)
+    linear, _ = choose_order(middle[:-1], middle[-1:], orders=ORDERS)
     progress('candidates', 0.0)
     told = 0
 
@@ -229,4 +226,4 @@ def identify_axes(
         found.name,
         found[found.name].error,
     )
-    return AxesIdentification(model, found, found[found.name].scores, orders, repeats, periods)
+    return AxesIdentification(model, found, found[found.name].scores, repeats, periods)

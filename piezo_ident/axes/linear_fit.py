@@ -21,10 +21,8 @@ from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import IdentificationError
 
-__all__ = ['ORDERS', 'choose_order', 'linear_error', 'linear_fit', 'refined']
+__all__ = ['choose_order', 'linear_error', 'linear_fit', 'refined']
 
-#: orders that are tried, lowest first
-ORDERS = (4, 8, 12, 20, 28, 36, 44, 52)
 #: a higher order has to lower the held-out error by this part of it
 WORTH = 0.02
 #: every so many lines serve the choice of the order
@@ -94,7 +92,7 @@ def choose_order(
     records: Sequence[PeriodicRecord],
     held_out: Sequence[PeriodicRecord],
     *,
-    orders: Sequence[int] = ORDERS,
+    orders: Sequence[int],
     iterations: int = 6,
 ) -> tuple[Modal, dict[int, float]]:
     """

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.loop_kernels import trajectory
-from piezo_ident.axes.modal import Modal, Modes, modes
+from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError, ModelError
 
@@ -109,10 +109,6 @@ class LoopModel:
         soft = slice(0, self.levels)
         s = float(np.clip(s, *self.range))
         return np.asarray(self.linear.a + (s - 1) * self.e[:, soft] @ self.f[soft])
-
-    def modes_at(self, s: float, rate: float) -> Modes:
-        """Return frequencies and damping at a level s, the plays at rest."""
-        return modes(self.a_at(s), rate)
 
     @property
     def radius(self) -> float:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.modal import Modal
 from piezo_ident.common.errors import ModelError
-from piezo_ident.common.files import load_yaml, parse_yaml, write_text
+from piezo_ident.common.files import load_yaml, write_text
 import yaml
 
-__all__ = ['AxesModel', 'axes_model_from_text', 'axes_model_to_text']
+__all__ = ['AxesModel', 'axes_model_to_text']
 
 #: the key that tells such a text from a model of one axis
 KEY = 'several_axes'
@@ -109,18 +109,6 @@ def axes_model_to_text(held: AxesModel) -> str:
         'loop': arrays,
     }
     return yaml.safe_dump(_plain(data), sort_keys=False, default_flow_style=None, width=99)
-
-
-def axes_model_from_text(text: str, name: str = 'model') -> AxesModel:
-    """
-    Read a model that `axes_model_to_text` wrote.
-
-    Raises
-    ------
-    ModelError
-        When it is none.
-    """
-    return _model_of(parse_yaml(text, name), name)
 
 
 def _model_of(data: Mapping[str, Any], name: str) -> AxesModel:

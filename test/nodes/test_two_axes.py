@@ -8,7 +8,6 @@ import json
 from graph import Graph
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.axes.model_text import axes_model_from_text
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.model.files import model_from_dict
@@ -78,7 +77,9 @@ def test_a_service_call_identifies_both_axes(lab, tmp_path):
     assert float(end['error_percent']) < 0.5 * float(end['linear_percent'])
     assert f'{end["error_percent"]} %' in end['text']
     lab.wait(lambda: lab.texts('model'), 'the model')
-    held = axes_model_from_text(lab.texts('model')[-1])
+    text = lab.texts('model')[-1]
+    (tmp_path / 'axes_model.yaml').write_text(text)
+    held = pi.AxesModel.load(tmp_path / 'axes_model.yaml')
     assert (held.inputs, held.outputs) == (('v', 'v_b'), ('y', 'y_b'))
     assert held.model.radius < 1 and held.error_percent == pytest.approx(
         float(end['error_percent']), rel=5e-3
@@ -90,7 +91,7 @@ def test_a_service_call_identifies_both_axes(lab, tmp_path):
     assert (stage['lost'], stage['missing'], stage['altered_too_fast']) == ('0', '0', '0')
     # a node that takes one axis says so
     with pytest.raises(ModelError, match='a model of several axes'):
-        model_from_dict(parse_yaml(lab.texts('model')[-1], 'model'))
+        model_from_dict(parse_yaml(text, 'model'))
 
     lab.finish('recorder/stop')
     axes = pi.Axes.of(pi.read(tmp_path / 'bag').pieces[0])
