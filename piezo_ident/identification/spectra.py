@@ -116,16 +116,13 @@ class FrequencyResponse:
     coherence : ndarray, shape (n,)
         ``|S_uy|^2 / (S_uu S_yy)``.
     std : ndarray, shape (n,)
-        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))``.
-    averages : int
-        Number L of segments.
+        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))`` of L segments.
     """
 
     frequency: NDArray[np.float64]
     response: NDArray[np.complex128]
     coherence: NDArray[np.float64]
     std: NDArray[np.float64]
-    averages: int
 
     def at(self, kept: NDArray[np.bool_]) -> FrequencyResponse:
         """Return the response at some of its frequencies."""
@@ -211,5 +208,4 @@ def _response(
         response=s_uy / np.maximum(s_uu, tiny),
         coherence=coherence,
         std=np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages)),
-        averages=averages,
     )

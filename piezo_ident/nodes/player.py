@@ -14,7 +14,7 @@ nobody is waited for; each listener reports what it lost.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import threading
@@ -27,7 +27,7 @@ from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
 from piezo_ident.nodes.subscriptions import DEPTH, message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
-from piezo_ident.record.bags.recover import Bag, Stored
+from piezo_ident.record.bags.recover import Bag
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
@@ -219,7 +219,8 @@ class PlayerNode(LabNode):
     def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> Schedule:
         """Send every message when it is due."""
         schedule, first, reported = None, 0, float('-inf')
-        for connection, stamp, raw in self._chosen(bag, senders):
+        chosen = [c for c in bag.connections if c.topic in senders]
+        for connection, stamp, raw in bag.messages(chosen):
             now, rate = time.monotonic(), self.values['rate']
             if schedule is None:
                 # what is caught up with at once must fit into the queues of the readers
@@ -245,9 +246,6 @@ class PlayerNode(LabNode):
         if schedule is None:
             raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
         return schedule
-
-    def _chosen(self, bag: Bag, senders: Mapping[str, Any]) -> Iterator[Stored]:
-        return bag.messages([c for c in bag.connections if c.topic in senders])
 
     def _pause(self, replay: Replay, seconds: float) -> None:
         if replay.stop.wait(seconds):

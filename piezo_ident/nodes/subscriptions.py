@@ -150,18 +150,15 @@ class BlockSubscriptions:
             if not subscription.get_publisher_count()
         ]
 
-    def drain(self) -> int:
-        """Hand over all that has come; return how many messages that were."""
-        count = 0
+    def drain(self) -> None:
+        """Hand over all that has come."""
         for topic, (key, subscription) in self._subscriptions.items():
             # no more at once than it keeps, or a flood on one topic starves the others
             for _ in range(DEPTH):
                 message = subscription.handle.take_message(Float64MultiArray, False)
                 if message is None:
                     break
-                count += 1
                 self._take(topic, key, *message)
-        return count
 
 
 @dataclass(frozen=True)

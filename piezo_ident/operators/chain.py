@@ -18,12 +18,10 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['SLOTS', 'Block', 'Chain', 'Operator', 'Slot']
-
-Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
+__all__ = ['Block', 'Chain', 'Operator', 'Slot']
 
 #: the slots of a chain for effects, in the order of the signal
-SLOTS: tuple[Slot, ...] = ('input', 'hysteresis', 'hidden', 'output', 'acquisition')
+Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 
 
 @dataclass(frozen=True, eq=False)

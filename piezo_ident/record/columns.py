@@ -25,7 +25,7 @@ from piezo_ident.record.channels import channel_of_column, role_of
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
-__all__ = ['ChosenColumns', 'RecordTable', 'choose', 'is_wanted', 'listed']
+__all__ = ['ChosenColumns', 'RecordTable', 'choose', 'listed']
 
 Vector = NDArray[np.float64]
 
@@ -95,11 +95,6 @@ class ChosenColumns:
         return RecordTable(
             columns, [*names], starts, self.ignored, self.units, self.rate, self.faults
         )
-
-
-def is_wanted(name: str) -> bool:
-    """Return whether a column of this name is read without asking."""
-    return name in ('t', 'v', 'y') or bool(channel_of_column(name))
 
 
 def listed(names: Iterable[str]) -> str:

@@ -6,6 +6,7 @@
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import get_args
 
 from effect_table import (
     alone,
@@ -28,7 +29,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import catalogue, Effect, find_effect, Parameter, Trial, View
 from piezo_ident.model.files import load, model_to_dict
 from piezo_ident.model.stage_model import EffectSetting
-from piezo_ident.operators.chain import Block, SLOTS
+from piezo_ident.operators.chain import Block, Slot
 import pytest
 
 EVERY = sorted(VISIBLE)
@@ -56,7 +57,7 @@ def test_what_is_tested_here_is_in_the_catalogue():
 def test_effect_is_declared_in_full(name):
     effect = catalogue()[name]
     assert effect.name == name
-    assert effect.slot in SLOTS
+    assert effect.slot in get_args(Slot)
     assert effect.description
     assert effect.needs
     assert any(not np.isnan(p.neutral) for p in effect.parameters)

@@ -385,7 +385,6 @@ def two_records(order: int) -> list[Record]:
     return [one, two][:: order or 1]
 
 
-NOISY = np.random.default_rng(0)
 TALL = SHORT.replace(
     '{signal: triangle, slope: 20}', '{signal: triangle, slope: 20, peaks: [3, 6]}'
 )

@@ -32,11 +32,10 @@ _AGAIN = 2.0
 
 @dataclass(frozen=True)
 class Streams:
-    """Number of samples received, and time of the last one, of the two streams."""
+    """Number of voltages received, and time of the last sample of each stream."""
 
     voltage: int
     voltage_time: float
-    displacement: int
     displacement_time: float
 
 

@@ -88,12 +88,7 @@ class Inputs:
             # the stage sends all of them, one after the other: a run ends with the last one
             if key.startswith((APPLIED, 'displacement_')):
                 answered = min(answered, c.last_time(key))
-        return Streams(
-            self.passed['voltage'],
-            c.last_time('voltage'),
-            self.passed['displacement'],
-            answered,
-        )
+        return Streams(self.passed['voltage'], c.last_time('voltage'), answered)
 
     @property
     def unpublished(self) -> str:

@@ -49,7 +49,7 @@ __all__ = [
 
 # Okabe and Ito's palette: told apart with every common colour vision, and by lightness in grey
 BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
-GREEN, ORANGE, SKY, PURPLE = '#009E73', '#E69F00', '#56B4E9', '#CC79A7'
+GREEN, ORANGE, PURPLE = '#009E73', '#E69F00', '#CC79A7'
 GREY, ZERO = '#7A7A7A', '#555555'
 
 #: who is drawn how, in every picture; 'under' is the measured trace below that of the model

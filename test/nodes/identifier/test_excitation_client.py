@@ -69,7 +69,7 @@ def test_a_program_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, r
     monkeypatch.setattr(excitation_client, '_AGAIN', 0.01)
     node, ends, begun = Node(dropped), [], []
     nan = float('nan')
-    client = ExcitationClient(node, lambda: Streams(0, nan, 0, nan), lambda: '')
+    client = ExcitationClient(node, lambda: Streams(0, nan, nan), lambda: '')
     client.start('a program', 0.3, ends.append, lambda: begun.append(True))
     give_up = time.monotonic() + 10.0
     while client.running and not begun and time.monotonic() < give_up:
