@@ -27,6 +27,8 @@ __all__ = ['AmplitudeDependence', 'amplitude_dependence']
 APART = 0.02
 #: unless the peak of the other is below this part of its own
 FAINT = 0.1
+#: most modes that are followed, and steps of the fit to each group
+COUNT, STEPS = 6, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,29 +54,21 @@ class AmplitudeDependence:
     models: tuple[Modal, ...]
 
 
-def amplitude_dependence(
-    start: Modal,
-    records: Sequence[PeriodicRecord],
-    *,
-    count: int = 6,
-    iterations: int = 8,
-) -> AmplitudeDependence:
+def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> AmplitudeDependence:
     """
-    Follow the strongest modes of a model through the groups of records.
+    Follow the strongest modes of a model that stand alone through the groups of records.
 
     Parameters
     ----------
     start : Modal
         A model of any of the groups.
-    count : int
-        Modes to follow: those whose response is largest and that stand alone.
     """
     parts = groups(records)
     rate = records[0].rate
     models = tuple(
-        refined(start, frequency_response(part), iterations=iterations) for part in parts.values()
+        refined(start, frequency_response(part), iterations=STEPS) for part in parts.values()
     )
-    places = _strongest(start, rate, count)
+    places = _strongest(start, rate)
     frequency, damping = [], []
     for model in models:
         s = _poles(model, rate)[places]
@@ -94,7 +88,7 @@ def _poles(model: Modal, rate: float) -> NDArray[np.complex128]:
     return np.asarray(np.log(model.blocks[:, 0, 0] + 1j * model.blocks[:, 0, 1]) * rate)
 
 
-def _strongest(model: Modal, rate: float, count: int) -> NDArray[np.intp]:
+def _strongest(model: Modal, rate: float) -> NDArray[np.intp]:
     """Return the blocks of the modes with the largest peaks, by frequency."""
     s = _poles(model, rate)
     size = np.linalg.norm(model.b.reshape(len(s), -1), axis=1) * np.sqrt(
@@ -105,5 +99,5 @@ def _strongest(model: Modal, rate: float, count: int) -> NDArray[np.intp]:
     np.fill_diagonal(near, False)
     alone = ~(near & (peak > FAINT * peak[:, None])).any(axis=1)
     peak = np.where(alone, peak, 0)
-    chosen = np.argsort(-peak)[: min(count, int((peak > 0).sum()))]
+    chosen = np.argsort(-peak)[: min(COUNT, int((peak > 0).sum()))]
     return np.asarray(chosen[np.argsort(s.imag[chosen])])

@@ -37,6 +37,8 @@ __all__ = ['Explanation', 'Rival', 'Score', 'explain', 'groups', 'middle_group',
 
 #: a candidate is preferred to simpler ones where it takes at least this part of their error
 WORTH = 0.1
+#: candidates grow on so many records a group, those of the largest weight
+FEW = 2
 #: simplest first
 SINGLE = ('linear', 'input_hysteresis', 'loop_hysteresis', 'softening', 'hysteretic_stiffness')
 
@@ -133,7 +135,6 @@ def explain(
     held_out: Sequence[PeriodicRecord],
     *,
     weights: Sequence[float] | None = None,
-    few: int = 2,
     iterations: int = 10,
     warm_up: int = 1024,
     memory: float = 300.0,
@@ -142,15 +143,15 @@ def explain(
     """
     Fit every candidate, and judge all on the records held out.
 
+    Candidates grow on few records of each group; the last steps of ``hysteretic_stiffness`` are
+    fitted to all.
+
     Parameters
     ----------
     linear : Modal
         Start: the stage at the middle amplitude.
     weights : sequence of float, optional
         Of the records taught, see `piezo_ident.axes.periodic.periodicity`.
-    few : int
-        Candidates grow on so many records a group, those of the largest weight; the last steps
-        of ``hysteretic_stiffness`` are fitted to all.
     iterations : int
         Steps a candidate, or a part of ``hysteretic_stiffness``.
     memory : float
@@ -167,7 +168,7 @@ def explain(
     chosen = [
         pair
         for members in by_group.values()
-        for pair in sorted(members, key=lambda pair: -pair[0])[:few]
+        for pair in sorted(members, key=lambda pair: -pair[0])[:FEW]
     ]
     small = [record for _, record in chosen]
     small_weights = [weight for weight, _ in chosen]

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.frequency_response import frequency_response, LineResponse
-from piezo_ident.axes.modal import Modal
+from piezo_ident.axes.modal import Modal, RADIUS
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import IdentificationError
@@ -27,8 +27,8 @@ __all__ = ['choose_order', 'linear_error', 'linear_fit', 'refined']
 WORTH = 0.02
 #: every so many lines serve the choice of the order
 THIN = 3
-#: poles stay within
-RADIUS = 0.9999
+#: steps of each order that is tried
+STEPS = 6
 
 
 def linear_fit(response: LineResponse, order: int, *, iterations: int = 20) -> Modal:
@@ -93,7 +93,6 @@ def choose_order(
     held_out: Sequence[PeriodicRecord],
     *,
     orders: Sequence[int],
-    iterations: int = 6,
 ) -> tuple[Modal, dict[int, float]]:
     """
     Fit models of rising order, and choose by the error on records held out.
@@ -112,7 +111,7 @@ def choose_order(
     errors: dict[int, float] = {}
     for order in orders:
         try:
-            model = linear_fit(thin, order, iterations=iterations)
+            model = linear_fit(thin, order, iterations=STEPS)
         except IdentificationError:  # too few lines for any order from here on
             break
         found[order] = model

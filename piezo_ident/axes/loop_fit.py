@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.linear_fit import moved_blocks
 from piezo_ident.axes.loop_kernels import CHUNK, KINDS, sensitivities
-from piezo_ident.axes.loop_model import LoopModel, Passage, RADIUS
-from piezo_ident.axes.modal import Modal
+from piezo_ident.axes.loop_model import LoopModel, Passage
+from piezo_ident.axes.modal import Modal, RADIUS
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
 

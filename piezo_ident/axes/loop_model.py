@@ -28,9 +28,6 @@ from piezo_ident.common.errors import DataError, ModelError
 
 __all__ = ['LoopModel', 'LoopStream', 'Passage']
 
-#: poles of the stage, softened or not, stay within
-RADIUS = 0.9999
-
 
 @dataclass(frozen=True, eq=False)
 class Passage:

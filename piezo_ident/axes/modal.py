@@ -20,6 +20,9 @@ from piezo_ident.common.errors import ModelError
 
 __all__ = ['Modal', 'Modes', 'balanced', 'modes', 'to_modal']
 
+#: poles stay within
+RADIUS = 0.9999
+
 
 @dataclass(frozen=True, eq=False)
 class Modal:
@@ -113,11 +116,9 @@ def to_modal(
     b: NDArray[np.float64],
     c: NDArray[np.float64],
     d: NDArray[np.float64],
-    *,
-    radius: float = 0.9999,
 ) -> Modal:
     """
-    Bring a model into modal coordinates; poles beyond `radius` are mirrored to within.
+    Bring a model into modal coordinates; poles beyond `RADIUS` are mirrored to within.
 
     Raises
     ------
@@ -133,10 +134,10 @@ def to_modal(
     for i in complexes:
         basis += [vectors[:, i].real, vectors[:, i].imag]
         pole = complex(poles[i])
-        if abs(pole) > radius:
-            pole *= (radius / abs(pole)) ** 2
+        if abs(pole) > RADIUS:
+            pole *= (RADIUS / abs(pole)) ** 2
         blocks.append([[pole.real, pole.imag], [-pole.imag, pole.real]])
-    values = np.clip([poles[i].real for i in reals], -radius, radius)
+    values = np.clip([poles[i].real for i in reals], -RADIUS, RADIUS)
     basis += [vectors[:, i].real for i in reals]
     blocks += [[[v, 0.0], [0.0, w]] for v, w in zip(values[::2], values[1::2], strict=True)]
     t = np.array(basis).T

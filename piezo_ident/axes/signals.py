@@ -57,15 +57,11 @@ def with_loop_plays(
     return _with(model, *_extension(model), records, thresholds)
 
 
-def with_input_plays(
-    model: LoopModel,
-    records: Sequence[PeriodicRecord],
-    thresholds: Sequence[float] = THRESHOLDS,
-) -> LoopModel:
+def with_input_plays(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
     """Add plays of the voltages."""
     inputs = model.linear.b.shape[1]
     f, g = np.zeros((inputs, model.linear.order)), np.eye(inputs)
-    return _with(model, f, g, records, thresholds)
+    return _with(model, f, g, records, THRESHOLDS)
 
 
 def _extension(model: LoopModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -100,7 +100,7 @@ class LinearInverse:
         return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
 
 
-def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse:
+def linear_inverse(model: StageModel) -> LinearInverse:
     """
     Return the inverse of all that is linear and fast in a model: G, the delay, and their changes.
 
@@ -121,7 +121,7 @@ def linear_inverse(model: StageModel, epsilon: float = EPSILON) -> LinearInverse
     left = np.inf
     while n <= LONGEST:
         G = _response(model, n)
-        Q = np.conj(G) / (np.abs(G) ** 2 + (epsilon * np.abs(G[0])) ** 2)
+        Q = np.conj(G) / (np.abs(G) ** 2 + (EPSILON * np.abs(G[0])) ** 2)
         taps = np.roll(np.fft.irfft(Q, n), n // 2)
         size = np.abs(taps)
         before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]

@@ -37,6 +37,9 @@ __all__ = [
 PAPER_PEAKS = (3.0, 6.0, 9.0)
 PAPER_SLOPE = 6.0
 
+#: odd lines of which one is left out
+GROUP = 4
+
 #: longest signal; more would not fit into the memory of a lab computer
 MAX_SAMPLES = 50_000_000
 
@@ -210,19 +213,17 @@ def noise(
     return scaled
 
 
-def odd_lines(
-    lowest: int, highest: int, rng: np.random.Generator, group: int = 4
-) -> NDArray[np.int64]:
+def odd_lines(lowest: int, highest: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """
-    Return odd harmonic numbers, with one of every group left out at random.
+    Return odd harmonic numbers, with one of every `GROUP` left out at random.
 
     Odd and even lines that are not excited detect odd and even nonlinearity: the random-odd
     multisine of Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012.
     """
     odd = np.arange(lowest | 1, highest + 1, 2)
     keep = np.ones(odd.size, dtype=bool)
-    for start in range(0, odd.size - group + 1, group):
-        keep[start + rng.integers(group)] = False
+    for start in range(0, odd.size - GROUP + 1, GROUP):
+        keep[start + rng.integers(GROUP)] = False
     return odd[keep]
 
 

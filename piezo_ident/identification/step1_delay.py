@@ -22,6 +22,8 @@ __all__ = ['StepDelay', 'delay_from_loss', 'delay_from_steps', 'find_jumps', 'st
 
 #: the average response counts as risen at this many standard deviations of its noise
 THRESHOLD = 5.0
+#: rise over the smallest loss, as a share of it, that counts as none
+EQUAL = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +190,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 
-def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int | None:
+def delay_from_loss(loss: NDArray[np.float64]) -> int | None:
     """
     Return the delay that a scan of the ARX loss points to.
 
@@ -199,8 +201,6 @@ def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int |
     ----------
     loss : ndarray, shape (n,)
         One-step loss for d = 0, 1, ...
-    tolerance : float, optional
-        Rise over the smallest loss that counts as none.
 
     Returns
     -------
@@ -212,5 +212,5 @@ def delay_from_loss(loss: NDArray[np.float64], tolerance: float = 0.02) -> int |
     >>> delay_from_loss(np.array([1.0, 1.0, 1.01, 3.0, 9.0]))
     2
     """
-    low = np.flatnonzero(loss <= (1.0 + tolerance) * loss.min())
+    low = np.flatnonzero(loss <= (1.0 + EQUAL) * loss.min())
     return int(low[-1]) if low[-1] < loss.size - 1 else None

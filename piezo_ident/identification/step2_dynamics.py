@@ -40,6 +40,10 @@ __all__ = [
 
 #: what is left of a column of unit length, once those before it are taken off, must be more
 INDEPENDENT = 1e-10
+#: poles that are mirrored into the circle come to lie within
+RADIUS = 0.9995
+#: refinements by instrumental variables
+REFINEMENTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +268,7 @@ def scan_orders(
     )
 
 
-def stabilised(dynamics: Dynamics, radius: float = 0.9995) -> Dynamics:
+def stabilised(dynamics: Dynamics) -> Dynamics:
     """Return the dynamics with poles outside the circle mirrored into it, same static gain."""
     poles = dynamics.poles
     if poles.size == 0 or np.abs(poles).max() < 1.0:
@@ -272,7 +276,7 @@ def stabilised(dynamics: Dynamics, radius: float = 0.9995) -> Dynamics:
     outside = np.abs(poles) >= 1.0
     poles[outside] = 1.0 / np.conj(poles[outside])
     size = np.abs(poles)
-    poles = np.where(size > radius, poles * radius / np.maximum(size, radius), poles)
+    poles = np.where(size > RADIUS, poles * RADIUS / np.maximum(size, RADIUS), poles)
     a = np.real(np.poly(poles))[1:]
     gain = dynamics.gain
     b = dynamics.b
@@ -295,7 +299,6 @@ def instrumental_variables(
     y: NDArray[np.float64],
     start: Dynamics,
     d: int,
-    iterations: int = 3,
 ) -> Dynamics:
     """
     Refine an ARX model by instrumental variables.
@@ -312,7 +315,6 @@ def instrumental_variables(
         Least-squares model; made stable first.
     d : int
         Delay [samples].
-    iterations : int, optional
 
     Returns
     -------
@@ -320,16 +322,16 @@ def instrumental_variables(
         Possibly unstable: the caller judges.
     """
     part = Excerpt(delayed(u, d), y, np.ones(u.size, dtype=bool))
-    return instruments_of([part], start, iterations)
+    return instruments_of([part], start)
 
 
-def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics, iterations: int = 3) -> Dynamics:
+def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
     """Refine an ARX model by instrumental variables, from the samples that count of excerpts."""
     na, nb = start.a.size, start.b.size
     model = stabilised(start)
     first = max(na, nb)
     spans = [(e, max(a, first), b - max(a, first)) for e in excerpts for a, b in e.stretches]
-    for _ in range(iterations):
+    for _ in range(REFINEMENTS):
         A, right = np.zeros((na + nb, na + nb)), np.zeros(na + nb)
         scale = np.zeros(na + nb)
         filtered = [_filtered(e, model) for e in excerpts]

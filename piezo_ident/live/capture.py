@@ -32,9 +32,7 @@ NEEDED = ('step', 'noise', 'triangle')
 MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
 
 
-def refuse_incomplete(
-    record: Record, sent: Mapping[str, float] | None = None, most: float = MAX_MISSING
-) -> None:
+def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -> None:
     """
     Refuse a record that lost too much of what the three steps stand on.
 
@@ -46,8 +44,6 @@ def refuse_incomplete(
     sent : mapping of str to float, optional
         Time [s] of each kind of segment in the voltage: also what is missing at either end of
         the record is then seen.
-    most : float, optional
-        Share of the segments of a kind that may be missing.
 
     Raises
     ------
@@ -65,7 +61,7 @@ def refuse_incomplete(
     for kind in NEEDED:
         missing[kind] = max(missing[kind], (sent or {}).get(kind, 0.0) - present[kind])
         whole = present[kind] + missing[kind]
-        if missing[kind] > most * whole:
+        if missing[kind] > MAX_MISSING * whole:
             raise DataError(
                 f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
                 'are missing or not usable; find what loses samples, and run the program again'

@@ -118,7 +118,7 @@ def start_memory(model: StageModel, piece: Piece) -> NDArray[np.float64] | None:
     return None if is_at_rest(model, piece) else fit_memory(model, piece)
 
 
-def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDArray[np.float64]:
+def fit_memory(model: StageModel, piece: Piece) -> NDArray[np.float64]:
     """
     Estimate the play outputs, and the lags along the path, before the first sample of a piece.
 
@@ -126,8 +126,6 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
     ----------
     model : StageModel
     piece : Piece
-    stop : int, optional
-        Number of samples to use; those before the start is forgotten when absent.
 
     Returns
     -------
@@ -135,8 +133,8 @@ def fit_memory(model: StageModel, piece: Piece, stop: int | None = None) -> NDAr
         `start` of `StageModel.simulate`.
     """
     h = model.hysteresis
-    end = max(forgotten(piece.v, way=forgetting(model)), 10) if stop is None else stop
-    end = min(end, piece.n)
+    # by then what was before the start is forgotten
+    end = min(max(forgotten(piece.v, way=forgetting(model)), 10), piece.n)
     part = piece.cut(0, end)
     # the plays follow the voltage behind the effects of the input slot
     u = model.hysteresis_input(part)

@@ -129,7 +129,7 @@ class FeedforwardNode(DrivingNode):
             self._loader.load(self._source, lambda: model)
 
     def _on_model(self, message: String) -> None:
-        self._loader.load_text(message.data, 'topic model')
+        self._loader.load_text(message.data)
 
     def _prepared(self, model: StageModel) -> tuple[StageModel, Tracker | Successor]:
         # by the thread of the loader

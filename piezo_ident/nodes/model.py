@@ -80,7 +80,7 @@ class ModelNode(LabNode):
             self._error.window = changed['window']
 
     def _on_model(self, message: String) -> None:
-        self._loader.load_text(message.data, 'topic model')
+        self._loader.load_text(message.data)
 
     def _take_model(self, model: StageModel | None, source: str) -> None:
         if model is None:

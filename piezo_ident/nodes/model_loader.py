@@ -55,8 +55,9 @@ class ModelLoader(Generic[T]):
         """Load a file."""
         self.load(path, lambda: load(path))
 
-    def load_text(self, text: str, name: str) -> None:
-        """Load the text of a file."""
+    def load_text(self, text: str) -> None:
+        """Load the text of a file that came on the topic."""
+        name = 'topic model'
         self.load(name, lambda: model_from_dict(parse_yaml(text, name), name))
 
     def load(self, source: str, read: Callable[[], StageModel]) -> None:
