@@ -20,18 +20,17 @@ from numpy.typing import NDArray
 from piezo_ident.identification.fast_motion import FastMotion
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.slow_part import without_pairs, without_slow_part
-from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
     OutputErrorFit,
     simulation_error,
 )
 from piezo_ident.identification.spectra import cross_spectra
-from piezo_ident.identification.step1_delay import delay_from_loss
+from piezo_ident.identification.step1_delay import delay_from_loss, MAX_DELAY, SCAN_ORDER
 from piezo_ident.identification.step2_dynamics import (
-    arx_factor,
     ArxFactor,
     delayed,
+    factor_of,
     instruments_of,
     stabilised,
 )
@@ -46,8 +45,6 @@ __all__ = [
 
 Vector = NDArray[np.float64]
 
-#: delays [samples] that the scan tries, and its na and nb
-MAX_DELAY, SCAN_ORDER = 30, 8
 #: na of further starts by instrumental variables
 INSTRUMENTS = (4, 8)
 #: of the output error, which starts far from its optimum while H is rough
@@ -109,16 +106,15 @@ def _moved(excerpts: Sequence[Excerpt], delay: int) -> list[Excerpt]:
 
 def _factor(motion: FastMotion, na: int, lags: int) -> ArxFactor | None:
     """Return the factor of all stretches that are long enough."""
-    width, n, factors = na + lags + 1, 0, []
-    for e in motion.whole:
-        for start, stop in e.stretches:
-            if stop - start >= 3 * width:
-                part = arx_factor(e.u[start:stop], e.x[start:stop], na, lags)
-                factors.append(part.R)
-                n += part.n
-    if n < 10 * width:
-        return None
-    return ArxFactor(triangular_factor(factors, width), n, na, lags)
+    width = na + lags + 1
+    parts = [
+        (e.u[start:stop], e.x[start:stop])
+        for e in motion.whole
+        for start, stop in e.stretches
+        if stop - start >= 3 * width
+    ]
+    factor = factor_of(parts, na, lags) if parts else None
+    return factor if factor is not None and factor.n >= 10 * width else None
 
 
 def _pure_delay(motion: FastMotion) -> tuple[Delay, float]:
@@ -302,8 +298,7 @@ def find_linear_part(
         size = size if factor is not None else size // 2
     if factor is None:
         return LinearPart(pure, None, None, None, errors, judges)
-    low = min(SCAN_ORDER, size)
-    loss = np.array([factor.fit(low, low, d)[1] for d in range(MAX_DELAY)])
+    loss = factor.losses(min(SCAN_ORDER, size), MAX_DELAY)
     scan = delay_from_loss(loss)
     tried = [*delays, scan or 0, max(0, (scan or 0) - 1), 0] if given is None else [given]
     tried = list(dict.fromkeys(tried))

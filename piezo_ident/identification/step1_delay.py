@@ -24,6 +24,8 @@ __all__ = ['StepDelay', 'delay_from_loss', 'delay_from_steps', 'find_jumps', 'st
 THRESHOLD = 5.0
 #: rise over the smallest loss, as a share of it, that counts as none
 EQUAL = 0.02
+#: delays [samples] that a scan of the loss tries, and its na and nb
+MAX_DELAY, SCAN_ORDER = 30, 8
 
 
 @dataclass(frozen=True, eq=False)

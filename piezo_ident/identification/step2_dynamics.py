@@ -31,6 +31,7 @@ __all__ = [
     'OrderTable',
     'arx_factor',
     'delayed',
+    'factor_of',
     'free_run_error',
     'instrumental_variables',
     'instruments_of',
@@ -92,6 +93,10 @@ class ArxFactor:
         theta = x.copy()
         theta[:na] *= -1.0
         return theta, loss
+
+    def losses(self, order: int, delays: int) -> NDArray[np.float64]:
+        """Return the one-step loss of na = nb = `order` for so many delays from 0 on."""
+        return np.array([self.fit(order, order, d)[1] for d in range(delays)])
 
     def dynamics(self, na: int, nb: int, d: int) -> Dynamics:
         """Return one order by least squares, possibly unstable."""
@@ -160,6 +165,15 @@ def arx_factor(
 
     R = triangular_factor(rows(), p)
     return ArxFactor(R, n, na_max, n_lags)
+
+
+def factor_of(
+    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], na_max: int, n_lags: int
+) -> ArxFactor:
+    """Reduce stretches of input and output, none of them too short, to one triangular factor."""
+    factors = [arx_factor(u, y, na_max, n_lags) for u, y in parts]
+    R = triangular_factor([factor.R for factor in factors], na_max + n_lags + 1)
+    return ArxFactor(R, sum(factor.n for factor in factors), na_max, n_lags)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,17 +30,21 @@ from piezo_ident.identification.noise_segment import (
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.slow_part import fast_part
-from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.solvers.output_error import (
     output_error,
     simulation_error,
 )
 from piezo_ident.identification.spectra import frequency_response
-from piezo_ident.identification.step1_delay import delay_from_loss, delay_from_steps
+from piezo_ident.identification.step1_delay import (
+    delay_from_loss,
+    delay_from_steps,
+    MAX_DELAY,
+    SCAN_ORDER,
+)
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
-    ArxFactor,
     delayed,
+    factor_of,
     free_run_error,
     instrumental_variables,
     scan_orders,
@@ -69,8 +73,6 @@ __all__ = [
     'within',
 ]
 
-#: delays [samples] that the scan tries, and its na and nb
-MAX_DELAY, SCAN_ORDER = 30, 8
 #: orders within this share of the best held-out error count as equal; smaller ones go first
 SLACK = 0.05
 #: share by which instrumental variables must err less than least squares to choose the orders
@@ -140,21 +142,13 @@ def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
 
 def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:
     """Return the one-step loss over the delay, from all segments of a kind."""
-    width = SCAN_ORDER + SCAN_ORDER + MAX_DELAY + 1
-    factors, n = [], 0
+    lags, parts = SCAN_ORDER + MAX_DELAY, []
     for run in runs:
         for s in run.piece.find(kind):
-            if s.n < 4 * width:
-                continue
-            u, y = run.u[s.start : s.stop], run.x[s.start : s.stop]
-            factor = arx_factor(u - u[0], y - y[:20].mean(), SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
-            factors.append(factor.R)
-            n += factor.n
-    if not factors:
-        return None
-    R = triangular_factor(factors, width)
-    both = ArxFactor(R, n, SCAN_ORDER, SCAN_ORDER + MAX_DELAY)
-    return np.array([both.fit(SCAN_ORDER, SCAN_ORDER, d)[1] for d in range(MAX_DELAY)])
+            if s.n >= 4 * (SCAN_ORDER + lags + 1):
+                u, y = run.u[s.start : s.stop], run.x[s.start : s.stop]
+                parts.append((u - u[0], y - y[:20].mean()))
+    return factor_of(parts, SCAN_ORDER, lags).losses(SCAN_ORDER, MAX_DELAY) if parts else None
 
 
 def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
