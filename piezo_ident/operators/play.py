@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.operators.kernels import hysteresis, plays
 
-__all__ = ['initial_memory', 'play', 'play_columns', 'weighted_plays']
+__all__ = ['initial_memory', 'play_columns', 'weighted_plays']
 
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
@@ -58,6 +58,11 @@ def play_columns(
     Returns
     -------
     ndarray, shape (m, n)
+
+    Examples
+    --------
+    >>> play_columns([0.0, 1.0, 0.0], [0.25]).tolist()
+    [[0.0, 0.75, 0.0]]
     """
     x = np.ascontiguousarray(v, dtype=np.float64)
     # a frozen array would be another type to the compiler
@@ -66,19 +71,6 @@ def play_columns(
     out = np.empty((r.size, x.size))
     plays(x, r, start, out)
     return out
-
-
-def play(v: ArrayLike, threshold: float) -> NDArray[np.float64]:
-    """
-    Return the output of one play operator that starts from `initial_memory`.
-
-    Examples
-    --------
-    >>> play([0.0, 1.0, 0.0], 0.25).tolist()
-    [0.0, 0.75, 0.0]
-    """
-    result: NDArray[np.float64] = play_columns(v, [threshold])[0]
-    return result
 
 
 def weighted_plays(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.operators.play import initial_memory, play, play_columns, weighted_plays
+from piezo_ident.operators.play import initial_memory, play_columns, weighted_plays
 import pytest
 
 signals = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
@@ -50,9 +50,9 @@ def test_any_memory_ends_between_its_bounds(v, r, start):
 
 def test_ramp_up_is_dead_for_one_threshold_and_ramp_down_too():
     up = np.linspace(0, 1, 101)
-    assert_allclose(play(up, 0.25), np.maximum(0, up - 0.25), atol=1e-15)
-    there_and_back = np.concatenate([up, up[::-1]])
-    assert_allclose(play(there_and_back, 0.25)[101:], np.minimum(0.75, up[::-1]), atol=1e-15)
+    assert_allclose(play_columns(up, [0.25])[0], np.maximum(0, up - 0.25), atol=1e-15)
+    (back,) = play_columns(np.concatenate([up, up[::-1]]), [0.25])[:, 101:]
+    assert_allclose(back, np.minimum(0.75, up[::-1]), atol=1e-15)
 
 
 R = np.array([0.05, 0.1, 0.3, 0.55])
@@ -99,5 +99,5 @@ def test_one_bad_sample_does_not_stay_in_the_memory():
 
 @pytest.mark.parametrize('v', [[0, 1, 0], (0.0, 1.0, 0.0), np.array([0, 1, 0], dtype=np.int32)])
 def test_any_sequence_of_numbers_will_do(v):
-    assert_allclose(play(v, 0.25), [0.0, 0.75, 0.0])
-    assert_allclose(play(np.arange(10.0)[::-1][::3], 0.5), [8.5, 6.0, 3.0, 0.0])
+    assert_allclose(play_columns(v, [0.25]), [[0.0, 0.75, 0.0]])
+    assert_allclose(play_columns(np.arange(10.0)[::-1][::3], [0.5]), [[8.5, 6.0, 3.0, 0.0]])
