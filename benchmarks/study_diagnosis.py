@@ -14,16 +14,13 @@ record and judged on another that nothing saw.  Finished cases are kept beside t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
-import json
-import multiprocessing
 import os
 from pathlib import Path
 import platform
 import sys
-import time
 from typing import Any
 
 # two threads of BLAS fight over narrow matrices; one process a core is faster
@@ -37,11 +34,10 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
-from tqdm import tqdm
+from study_rows import all_rows, section
 from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, program
 
 RATE = 20_000.0
-SIZES = (0.1, 0.3, 1.0)
 SEEDS = (1, 2, 3)
 COLOURS = ('white', '1/f', '10-bit')
 #: left-over from which an effect counts, % of stroke
@@ -101,8 +97,6 @@ class Row:
     after: float
     unseen_before: float
     unseen_after: float
-    identify_time: float
-    diagnose_time: float
     error: str = ''
 
 
@@ -140,8 +134,8 @@ def record_of(
 @cache
 def measured(
     effects: tuple[str, ...], size: float, seed: int, noise: str
-) -> tuple[StageModel, Record, Record, float]:
-    """Return model, record to diagnose, unseen record and the time of the identification."""
+) -> tuple[StageModel, Record, Record]:
+    """Return model, record to diagnose and unseen record."""
     effect: Any = effects[0] if len(effects) == 1 else effects or None
     stage = make_stage(effect, size, seed, noise=noise)
     coupled = 'cross_coupling' in effects
@@ -153,26 +147,22 @@ def measured(
     t = np.arange(sequence.n) / RATE
     y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    start = time.perf_counter()
     record = record_of(sequence.v, y, labels, 'identification', None)
     model = identify(record, Settings(thresholds=10)).model
-    took = time.perf_counter() - start
     records = []
     for number, kind in enumerate(('diagnosis', 'unseen')):
         t, v, labels = program(kind, seed)
         channels = other(t, 100 + 10 * number + seed)
         y = stage.respond(t, v, changed=True, channels=channels)
         records.append(record_of(v, y, labels, kind, channels))
-    return model, records[0], records[1], took
+    return model, records[0], records[1]
 
 
 def judged(case: Case) -> Row:
     """Run one case."""
     try:
-        model, record, unseen, took = measured(case.effects, case.size, case.seed, case.noise)
-        start = time.perf_counter()
+        model, record, unseen = measured(case.effects, case.size, case.seed, case.noise)
         result = diagnose(model, record, DiagnosisSettings(without=case.without))
-        spent = time.perf_counter() - start
         errors = [free_run(m, unseen).errors.percent for m in (model, result.model)]
         return Row(
             key=case.key,
@@ -184,13 +174,11 @@ def judged(case: Case) -> Row:
             after=result.after.overall,
             unseen_before=errors[0],
             unseen_after=errors[1],
-            identify_time=took,
-            diagnose_time=spent,
         )
     # one failed case must not end hours of others
     except Exception as error:  # noqa: BLE001
         nan, reason = float('nan'), f'{type(error).__name__}: {error}'
-        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, nan, nan, reason)
+        return Row(case.key, 'failed', (), (), nan, nan, nan, nan, nan, reason)
 
 
 def outcome(case: Case, row: Row) -> str:
@@ -234,12 +222,6 @@ NOTE = (
 Done = Sequence[tuple[Case, Row]]
 
 
-def markdown(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
-    """Return a section with a table; the heads are separated by commas."""
-    head, *lines = ('| ' + ' | '.join(map(str, row)) + ' |' for row in (heads.split(', '), *rows))
-    return '\n'.join([f'## {title}', '', head, '|' + '---|' * (head.count('|') - 1), *lines])
-
-
 def single(done: Done) -> str:
     """Return the section of stages with one effect."""
 
@@ -264,7 +246,7 @@ def single(done: Done) -> str:
             outcomes.count('hidden'),
         )
     )
-    text = markdown('One effect', heads, map(line, EFFECTS))
+    text = section('One effect', heads, map(line, EFFECTS))
     text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
     text += f'no name, and among what may hide in the base model: {hidden}. '
     stated, told = (
@@ -298,14 +280,14 @@ def none(done: Done) -> str:
         others = [f'{r.verdict} ({", ".join(r.found)})' for r in own if r.verdict != 'none']
         return [noise, len(own), len(own) - len(others), '; '.join(others)]
 
-    return markdown('No effect', 'noise, cases, none, other verdicts', map(line, COLOURS))
+    return section('No effect', 'noise, cases, none, other verdicts', map(line, COLOURS))
 
 
 def outside(done: Done) -> str:
     """Return the section of effects that are not among the candidates."""
     own = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
     wrong = sum(r.verdict == 'named' for _, r in own)
-    return markdown(
+    return section(
         'The own candidate taken out of the catalogue, and effects outside it',
         'truth, seed, size, verdict, added, class',
         ([c.effects[0], c.seed, f'{r.size:.2f}', *_names(r)] for c, r in own),
@@ -329,7 +311,7 @@ def table(rows: dict[str, Row], todo: Sequence[Case], command: str) -> str:
         single(done),
         none(done),
         outside(done),
-        markdown(
+        section(
             'Pairs',
             'truth, size, verdict, added, class, unseen before, after',
             (
@@ -338,12 +320,12 @@ def table(rows: dict[str, Row], todo: Sequence[Case], command: str) -> str:
                 if c.kind == 'pair'
             ),
         ),
-        markdown(
+        section(
             'Laws of the stages',
             'effect, law',
             ([name, describe(name)] for name in (*EFFECTS, *OUTSIDE)),
         ),
-        markdown(
+        section(
             'Every case',
             'case, verdict, added, class, size, unseen',
             ([r.key, *_names(r), f'{r.size:.3f}', ' → '.join(unseen[c.key])] for c, r in done),
@@ -366,23 +348,7 @@ def main() -> None:
         # the same ones every time, so that two versions of the package can be compared
         drawn = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
         todo = [todo[i] for i in drawn]
-    arguments.kept.parent.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, Row] = {}
-    if arguments.kept.exists():
-        for text in arguments.kept.read_text(encoding='utf-8').splitlines():
-            data = json.loads(text)
-            rows[data['key']] = Row(
-                **{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-            )
-    left = [case for case in todo if case.key not in rows]
-    with (
-        multiprocessing.get_context('spawn').Pool(arguments.processes) as pool,
-        arguments.kept.open('a', encoding='utf-8') as kept,
-    ):
-        for row in tqdm(pool.imap_unordered(judged, left), total=len(left), unit='case'):
-            rows[row.key] = row
-            kept.write(json.dumps(asdict(row)) + '\n')
-            kept.flush()
+    rows = all_rows(arguments.kept, Row, todo, judged, arguments.processes)
     arguments.out.write_text(table(rows, todo, 'make study'), encoding='utf-8')
     sys.stdout.write(f'{arguments.out}\n')
 

@@ -12,7 +12,7 @@ at since; nothing may be tuned on the laws of `final`.  One case in Python:
 
     from study_foreign import case_records, judged
     records = case_records(draw('tuning', 7))
-    records.identification, records.diagnosis, records.unseen, records.sizes
+    records.identification, records.diagnosis, records.unseen, records.truth
 
 Finished cases are kept in ``build/study_foreign_SET.jsonl``, so a study that was stopped goes on.
 """
@@ -21,16 +21,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-import json
-import multiprocessing
+from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
 import platform
 import re
 import sys
-import time
-from typing import Any
 
 # two threads of BLAS fight over narrow matrices; one process a core is faster
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -49,7 +45,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-from tqdm import tqdm
+from study_rows import all_rows, section
 from truths import other_axis
 
 Array = NDArray[np.float64]
@@ -95,7 +91,6 @@ class Records:
         Error on the unseen record of each form of the hysteresis, likewise.
     stage : Stage
         With the effects in it.
-    volts : dict of str to ndarray
     """
 
     identification: Record
@@ -108,7 +103,6 @@ class Records:
     misfit_diagnosis: float
     unseen_forms: dict[str, float]
     stage: Stage
-    volts: dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -135,10 +129,6 @@ class Row:
     unseen_after: float = float('nan')
     centred_before: float = float('nan')
     centred_after: float = float('nan')
-    setting: str = ''
-    truth_time: float = float('nan')
-    identify_time: float = float('nan')
-    diagnose_time: float = float('nan')
     error: str = ''
 
     @property
@@ -266,7 +256,6 @@ def case_records(case: Case, forms: bool = True) -> Records:
         misfit_diagnosis=best['forty plays'].diagnosis,
         unseen_forms={form: r.unseen for form, r in best.items()},
         stage=stage,
-        volts=volts,
     )
 
 
@@ -279,19 +268,11 @@ def unseen_errors(model: StageModel, record: Record) -> tuple[float, float]:
 
 def judged(case: Case) -> Row:
     """Run one case."""
-    start = time.perf_counter()
     try:
         records = case_records(case)
-        stage, times = records.stage, [time.perf_counter()]
         model = identify(records.identification).model
-        times.append(time.perf_counter())
         result = diagnose(model, records.diagnosis)
-        times.append(time.perf_counter())
         errors = [unseen_errors(m, records.unseen) for m in (model, result.model)]
-        setting = (
-            f'{stage.rate:g} Hz, {stage.limits[0]:g}..{stage.limits[1]:g} V, '
-            f'{1e6 * stage.stroke:.1f} um, {stage.noise} {100 * stage.noise_rms:.4f} %'
-        )
         return Row(
             key=case.key,
             verdict=result.verdict,
@@ -313,10 +294,6 @@ def judged(case: Case) -> Row:
             unseen_after=errors[1][0],
             centred_before=errors[0][1],
             centred_after=errors[1][1],
-            setting=setting,
-            truth_time=times[0] - start,
-            identify_time=times[1] - times[0],
-            diagnose_time=times[2] - times[1],
         )
     # one failed case must not end hours of others
     except Exception as error:  # noqa: BLE001
@@ -410,12 +387,6 @@ NOTE = (
 )
 
 
-def markdown(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
-    """Return a section with a table; the heads are separated by commas."""
-    head, *lines = ('| ' + ' | '.join(map(str, row)) + ' |' for row in (heads.split(', '), *rows))
-    return '\n'.join([f'## {title}', '', head, '|' + '---|' * (head.count('|') - 1), *lines])
-
-
 def part_of(count: int, whole: int) -> str:
     """Return a count with its share."""
     return f'{count} of {whole} ({count / whole:.0%})' if whole else '0 of 0'
@@ -500,14 +471,14 @@ def summary(rows: Sequence[Row]) -> str:
         ['- without the mean', most(r.centred_after / r.centred_before for r in sound)],
         [
             '- grown by more than 5 %',
-            some(r.centred_after > 1.05 * r.centred_before for r in sound),
+            some(r.after_is_worse for r in sound),
         ],
     ]
     for way in ('labelled', 'unlabelled'):
         own = [r for r in plain if r.key.endswith(f' {way}')]
         ratios = [r.centred_before / min(r.unseen_forms.values()) for r in own]
         lines.append([f'nothing hidden, {way}: as identified over the best form', spread(ratios)])
-    return markdown('In short', 'what, share or median and 90th percentile', lines)
+    return section('In short', 'what, share or median and 90th percentile', lines)
 
 
 def by_effect(rows: Sequence[Row]) -> str:
@@ -522,7 +493,7 @@ def by_effect(rows: Sequence[Row]) -> str:
     for name in sorted(names):
         outcomes = [outcome(r) for r in names[name]]
         lines.append([name, len(outcomes), *(outcomes.count(x) for x in OUTCOMES)])
-    return markdown('One effect or fault', f'hidden, cases, {", ".join(OUTCOMES)}', lines)
+    return section('One effect or fault', f'hidden, cases, {", ".join(OUTCOMES)}', lines)
 
 
 def by_core(rows: Sequence[Row]) -> str:
@@ -543,7 +514,7 @@ def by_core(rows: Sequence[Row]) -> str:
             ]
         )
     heads = 'core, misfit, named though nothing is hidden, found, false name'
-    return markdown('Cores', heads, lines)
+    return section('Cores', heads, lines)
 
 
 def every(rows: Sequence[Row]) -> str:
@@ -571,7 +542,7 @@ def every(rows: Sequence[Row]) -> str:
             *(f'{x:.3f}' for x in errors),
         ]
 
-    return markdown('Every case', heads, map(line, rows))
+    return section('Every case', heads, map(line, rows))
 
 
 def table(rows: dict[str, Row], todo: Sequence[Case], group: str) -> str:
@@ -591,18 +562,6 @@ def table(rows: dict[str, Row], todo: Sequence[Case], group: str) -> str:
     return '\n\n'.join(sections) + '\n'
 
 
-def read_rows(path: Path) -> dict[str, Row]:
-    """Return the rows that are kept in a file, by key."""
-    known = {f.name for f in fields(Row)}
-    rows = {}
-    if path.exists():
-        for text in path.read_text(encoding='utf-8').splitlines():
-            data: dict[str, Any] = {k: x for k, x in json.loads(text).items() if k in known}
-            data = {k: tuple(x) if isinstance(x, list) else x for k, x in data.items()}
-            rows[data['key']] = Row(**data)
-    return rows
-
-
 def main() -> None:
     """Run what is not done yet, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -617,17 +576,7 @@ def main() -> None:
     todo = [draw(group, k) for k in range(CASES[group])][: arguments.first]
     todo = [case for case in todo if re.search(arguments.only, case.key)]
     path = arguments.kept or Path(f'build/study_foreign_{group}.jsonl')
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = read_rows(path)
-    left = [case for case in todo if case.key not in rows]
-    with (
-        multiprocessing.get_context('spawn').Pool(arguments.processes) as pool,
-        path.open('a', encoding='utf-8') as kept,
-    ):
-        for row in tqdm(pool.imap_unordered(judged, left), total=len(left), unit='case'):
-            rows[row.key] = row
-            kept.write(json.dumps(asdict(row)) + '\n')
-            kept.flush()
+    rows = all_rows(path, Row, todo, judged, arguments.processes)
     arguments.out.write_text(table(rows, todo, group), encoding='utf-8')
     sys.stdout.write(f'{arguments.out}\n')
 

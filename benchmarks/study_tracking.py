@@ -27,7 +27,8 @@ from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.report import length
 from piezo_ident.report.figures import style
 from study_diagnosis import measured
-from study_foreign import case_records, markdown
+from study_foreign import case_records
+from study_rows import section
 from tqdm import tqdm
 from truths import make_stage
 from truths.linear import RATE
@@ -119,7 +120,7 @@ def stage_of(what: tuple[str, float, int] | int) -> Stage:
         )
     effect, size, seed = what
     known = make_stage(effect, size, seed)
-    model, record, _, _ = measured((effect,), size, seed, 'white')
+    model, record, _ = measured((effect,), size, seed, 'white')
     return Stage(
         f'sum of plays, {plain(effect)}',
         lambda v: known.respond(np.arange(v.size) / RATE, v),
@@ -252,7 +253,7 @@ def main() -> None:
         'part': 100 * PART,
         'lines': LINES,
         'motions': len(SINES) + 2,
-        'table': markdown('All motions', heads, [row.cells() for row in rows]).strip(),
+        'table': section('All motions', heads, [row.cells() for row in rows]).strip(),
     }
     args.out.write_text(TEXT.format(**page))
     if args.picture is not None:

@@ -1,0 +1,53 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the studies of the diagnosis share: rows that are kept in a file, and their tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, fields
+import json
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+from side_by_side import markdown
+from tqdm import tqdm
+
+__all__ = ['all_rows', 'read_rows', 'section']
+
+
+def section(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
+    """Return a section with a table; the heads are separated by commas."""
+    return f'## {title}\n\n{markdown(heads.split(", "), rows)}'
+
+
+def read_rows(path: Path, kind: type) -> dict[str, Any]:
+    """Return the rows that are kept in a file, by key; a kind may have lost fields since."""
+    known = {f.name for f in fields(kind)}
+    rows = {}
+    if path.exists():
+        for text in path.read_text(encoding='utf-8').splitlines():
+            data = {k: x for k, x in json.loads(text).items() if k in known}
+            data = {k: tuple(x) if isinstance(x, list) else x for k, x in data.items()}
+            rows[data['key']] = kind(**data)
+    return rows
+
+
+def all_rows(
+    path: Path, kind: type, todo: Sequence[Any], judged: Callable[[Any], Any], processes: int
+) -> dict[str, Any]:
+    """Run the cases that a file does not hold yet, add them to it, and return all rows by key."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = read_rows(path, kind)
+    left = [case for case in todo if case.key not in rows]
+    with (
+        multiprocessing.get_context('spawn').Pool(processes) as pool,
+        path.open('a', encoding='utf-8') as kept,
+    ):
+        for row in tqdm(pool.imap_unordered(judged, left), total=len(left), unit='case'):
+            rows[row.key] = row
+            kept.write(json.dumps(asdict(row)) + '\n')
+            kept.flush()
+    return rows
