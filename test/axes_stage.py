@@ -47,6 +47,14 @@ def loop_stage(*, softening=0.04, plays=0.08):
     )
 
 
+def modes(a):
+    """Return the frequencies in Hz and damping ratios of the modes of A, slowest first."""
+    poles = np.linalg.eigvals(a)
+    s = np.log(poles[poles.imag > 1e-9]) * RATE
+    s = s[np.argsort(np.abs(s))]
+    return np.abs(s) / (2 * np.pi), -s.real / np.abs(s)
+
+
 def multisine(rng, amplitude, count=2):
     """Return voltages of rms `amplitude` up to 0.4 of the rate, shape (samples, count)."""
     lines = np.zeros((SAMPLES // 2 + 1, count), complex)

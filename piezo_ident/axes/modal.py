@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Modal', 'Modes', 'balanced', 'modes', 'to_modal']
+__all__ = ['Modal', 'balanced', 'to_modal']
 
 #: poles stay within
 RADIUS = 0.9999
@@ -93,22 +93,6 @@ class Modal:
     def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return C (z - A)^-1 B + D, shape (k, outputs, inputs)."""
         return np.asarray(self.c @ self.states(z) + self.d)
-
-
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """Frequencies in Hz and damping ratios of the modes, slowest first."""
-
-    frequency: NDArray[np.float64]
-    damping: NDArray[np.float64]
-
-
-def modes(a: NDArray[np.float64], rate: float) -> Modes:
-    """Return the modes of a matrix A: its complex poles as frequency and damping ratio."""
-    poles = np.linalg.eigvals(a)
-    s = np.log(poles[poles.imag > 1e-9]) * rate
-    s = s[np.argsort(np.abs(s))]
-    return Modes(np.abs(s) / (2 * np.pi), -s.real / np.abs(s))
 
 
 def to_modal(
