@@ -130,9 +130,10 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
             'diagnose again, with that record',
             prompt.command('diagnose', prompt.given, *prompt.files(result.records), OTHER),
         )
-    if result.verdict == 'none':
+    is_changed = bool(changes(result.given, result.model))
+    if result.verdict == 'none' and not is_changed:
         yield _use('the model lacks nothing that these data show', prompt, prompt.given)
-    elif not result.unseen and changes(result.given, result.model):
+    elif not result.unseen and is_changed:
         yield Step(
             'check the refined model on a record that took no part',
             prompt.command('predict', prompt.model, OTHER),

@@ -86,6 +86,10 @@ def test_a_diagnosis_asks_for_the_experiment_that_decides(verdict):
 def test_a_model_that_lacks_nothing_is_used():
     result = replace(example('none'), untestable=())
     assert commands(result) == ['piezo_ident predict old.yaml scan.csv --out predicted.csv']
+    # a refit of the hysteresis alone is a model to check
+    scaling = replace(result.model.scaling, y0=1e-7)
+    refitted = replace(result, model=replace(result.model, scaling=scaling))
+    assert [line.split()[2] for line in commands(refitted)] == ['new.yaml']
 
 
 def test_the_page_shows_the_commands(tmp_path, identified):
