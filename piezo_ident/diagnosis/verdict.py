@@ -223,7 +223,9 @@ def candidates_of(
     `aside` are those that were not tried, and why.
     """
     possible = {name for one in rounds for name in one.best}
-    possible |= {*findings.effects, *(findings.group.names if findings.group else ())}
+    group = findings.group.names if findings.group else ()
+    possible |= {*findings.effects, *group}
+    visible = _visible(rounds)
     shares: dict[str, float] = {}
     last: dict[str, Round] = {}
     for one in rounds:
@@ -242,7 +244,8 @@ def candidates_of(
         last |= dict.fromkeys(one.best, one)
     found = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        if name in findings.effects:
+        # what these data cannot show is among the untestable
+        if name in findings.effects or (visible[name] < criteria.SWALLOWED and name not in group):
             continue
         value = float(np.clip(share, 0.0, 1.0))
         why = _why_not(name, value, findings, last[name], rows.passes)
@@ -252,7 +255,7 @@ def candidates_of(
         found.append(Candidate(name, value, why))
     found += [
         Candidate(name, 0.0, 'these data speak against it')
-        for name, share in _visible(rounds).items()
+        for name, share in visible.items()
         if share >= criteria.SWALLOWED and name not in possible
     ]
     return (*found, *(Candidate(name, 0.0, why) for name, why in aside.items()))

@@ -14,7 +14,7 @@ from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separat
 from piezo_ident.diagnosis.results import Errors, Unexplained
 from piezo_ident.diagnosis.search import stands_out, takes
 from piezo_ident.diagnosis.state import State
-from piezo_ident.diagnosis.verdict import Findings, judge, rivals_of
+from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
 import pytest
 
@@ -321,6 +321,19 @@ def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
     simulator.copies = lambda _: [simulator]
     search._contenders(simulator, before, starts, 0.0, lambda _: None)
     assert seen == ended
+
+
+def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
+    rows.passes = 9.0
+    this = a_round(contender('saturation', 0.9))
+    this.best = {
+        name: SimpleNamespace(errors=0.95 * this.before.errors)
+        for name in ('saturation', 'creep', 'gain_drift')
+    }
+    this.visible = {'saturation': 0.5, 'creep': 1e-6, 'gain_drift': 1e-6}
+    found = Findings('unexplained', 0.0, (), None, 0.9).hiding(('gain_drift', 'saturation'))
+    names = [c.name for c in candidates_of(rows, [this], found, 0.0, {})]
+    assert sorted(names) == ['gain_drift', 'saturation']
 
 
 @pytest.mark.parametrize(
