@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import TUNED
+from piezo_ident.diagnosis.criteria import LEAST_GAIN, TUNED
 from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.rows import Rows
@@ -78,10 +78,13 @@ def warnings_of(
     if not floor.known:
         found.append(f'{floor.source}: every share counts the noise as unexplained')
     if not refined.is_given and np.any(np.abs(state.retuning) > TUNED):
+        why = (
+            f', and {100.0 * bent:.0f} % of what a refit of the hysteresis leaves goes with that '
+            'alone: an effect bent them at the identification, or they have changed since'
+        )
         found.append(
-            'the dynamics were retuned in the band that the data drive, and '
-            f'{100.0 * max(bent, 0.0):.0f} % of what a refit of the hysteresis leaves goes with '
-            'that alone: an effect bent them at the identification, or they have changed since'
+            'the dynamics were retuned in the band that the data drive'
+            f'{why if bent >= LEAST_GAIN else ""}'
         )
     stay = bool(lasting(findings.effects))
     found += [
