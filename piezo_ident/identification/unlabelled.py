@@ -395,5 +395,7 @@ def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Exc
         G=unit,
         delay=replace(joint.delay, samples=0, fraction=0.0, std=float('inf'), source='none'),
         dynamics=replace(joint.dynamics, order=(0, 1), methods={}, covariance=np.zeros((1, 1))),
-        not_identified=(*joint.not_identified, ('delay', reason), ('dynamics', reason)),
+        not_identified=tuple(
+            (dict(joint.not_identified) | dict.fromkeys(('delay', 'dynamics'), reason)).items()
+        ),
     )

@@ -96,8 +96,10 @@ def _of_fit(result: Identification) -> list[str]:
 
 def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     """Say when the excitation ends where G has hardly begun to act."""
-    # a band that ends near half the sampling rate leaves nothing to see
-    if not dynamics.band < 0.2 * model.sample_rate:
+    # a band that ends near half the sampling rate leaves nothing to see, and without a G that is
+    # said already
+    is_unit = model.dynamics.a.size + model.dynamics.b.size == 1
+    if not dynamics.band < 0.2 * model.sample_rate or is_unit:
         return []
     G = model.dynamics.response([dynamics.band], model.sample_rate)[0]
     change = float(np.abs(G - 1.0))
