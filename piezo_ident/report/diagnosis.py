@@ -214,8 +214,12 @@ def _law(result: Diagnosis) -> list[str]:
     )
     # with an effect beside it, the wider law need not be that of H
     told = 'fitted with' if result.effects else 'not a sum of plays: H has'
-    about = 'a sum of plays' if words is None else f'{told} {words}'
-    return [f'{about}; with nothing added, laws of H predict what was held out to {compared}']
+    about = 'a sum of plays' if words is None else f'{told} {words} ({result.law})'
+    if result.verdict != 'refitted' and not changes(result.given, result.model):
+        about = 'as it was given'
+    return [
+        f'{about}; refitted with nothing added, laws of H predict what was held out to {compared}'
+    ]
 
 
 def _left(share: float, rms_percent: float) -> str:
