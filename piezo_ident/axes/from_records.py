@@ -29,8 +29,8 @@ __all__ = ['AxesIdentification', 'Periods', 'identify_axes', 'periods_of']
 
 #: most periods of one segment
 PERIODS = 64
-#: voltages that differ by less than this part of their range are equal: what a converter rounds
-EQUAL = 1e-6
+#: voltages that differ by less than this part of their range are equal: measured ones do by 2e-4
+EQUAL = 1e-3
 #: orders that are tried
 ORDERS = (4, 6, 8, 12, 16, 20, 28, 36)
 
@@ -85,7 +85,8 @@ def periods_of(records: Sequence[Record]) -> Periods:
         raise DataError(
             f'the records hold periods of {sizes} samples; play one multisine again and again'
             if sizes
-            else 'no segment of the records repeats itself; play multisines of two periods or more'
+            else 'no segment of the records repeats its voltages; give every realisation of a '
+            'multisine as a segment of its own, of two whole periods or more (docs/two_axes.md)'
         )
     v0 = np.mean([u.mean(axis=(0, 1)) for _, u, _ in found], axis=0)
     rate = every[0].sample_rate

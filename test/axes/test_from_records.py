@@ -35,6 +35,13 @@ def test_periods_are_found_and_the_first_is_left_to_settle(record):
     assert [r.group for r in found.records] == ['multisine:small'] * 3 + ['multisine:large'] * 3
     assert (found.inputs, found.outputs) == (('v', 'v_b'), ('y', 'y_b'))
     np.testing.assert_allclose(found.v0, 5.0, atol=1e-9)
+    # measured voltages never repeat to the last digit
+    rng = np.random.default_rng(3)
+    (piece,) = record
+    noisy = pi.Record(
+        (replace(piece, v=piece.v + 1e-4 * np.ptp(piece.v) * rng.uniform(-1, 1, piece.n)),), 'noisy'
+    )
+    assert [r.u.shape for r in periods_of([noisy]).records] == [(2, 2048, 2)] * 6
     two = STAGE.play(program('small', realisations=1, periods=2))
     assert periods_of([two]).records[0].u.shape == (2, 2048, 2)
 
