@@ -51,7 +51,23 @@ def warnings_of(
     wrong = misspelt([label for record in records for label in record.labels])
     if wrong:
         warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
-    return [*warnings, *_of_errors(result, pieces)]
+    return [*warnings, *_of_axes(pieces), *_of_errors(result, pieces)]
+
+
+def _of_axes(pieces: Sequence[Piece]) -> list[str]:
+    """Say when other axes were driven, too."""
+    moved = {
+        name: None
+        for piece in pieces
+        for name, x in piece.channels.items()
+        if name.startswith('v_') and np.ptp(x) > 0.0
+    }
+    if not moved:
+        return []
+    return [
+        f'{", ".join(moved)} moved, too: what they do to this axis counts as its error and noise; '
+        'a stage of several axes is identified by identify_axes (docs/two_axes.md)'
+    ]
 
 
 def _of_law(fit: HysteresisFit) -> list[str]:

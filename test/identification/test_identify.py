@@ -18,11 +18,12 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.refusals import refuse_undriven
 from piezo_ident.identification.results import Settings
 from piezo_ident.identification.step1_delay import delay_from_steps
+from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, Scaling
-from piezo_ident.operators.dynamics import filter_arx
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program
 import pytest
@@ -522,6 +523,26 @@ def test_triangle_that_does_not_cover_the_range_warns():
     assert result.model.scaling.range == pytest.approx((0.0, 6.0), abs=0.01)
     wide = free_run(result.model, PAPER.ideal.play(FULL.build()))
     assert wide.warnings
+
+
+def test_axes_that_move_too_are_named(paper):
+    _, result = paper
+    n = 100
+    v = np.linspace(0.0, 10.0, n)
+    channels = {'v_b': v[::-1], 'v_c': np.full(n, 2.0), 'y_b': v, 'heat': v}
+    for others, is_said in ((channels, True), ({'heat': v}, False)):
+        record = Record.from_arrays(v, 1e-6 * v, sample_rate=1000, channels=others)
+        said = [x for x in warnings_of(result, [record], list(record)) if 'axes' in x]
+        assert [x.startswith('v_b moved, too') for x in said] == [True] * is_said
+
+
+def test_a_band_is_too_narrow_for_a_g_and_not_for_none(paper):
+    record, result = paper
+    narrow = replace(result, dynamics=replace(result.dynamics, band=1.0))
+    unit = replace(narrow, model=replace(narrow.model, dynamics=Dynamics.unit()))
+    for result, is_said in ((narrow, True), (unit, False)):
+        said = warnings_of(result, [record], list(record))
+        assert any('what it does beyond' in x for x in said) == is_said
 
 
 def test_nothing_is_refused():
