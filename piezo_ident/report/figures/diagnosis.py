@@ -153,7 +153,7 @@ def errors_figure(diagnosis: Diagnosis) -> Figure:
         axes.barh(at, values, 0.92 * height, color=colour, label=name)
         for y, value in zip(at, values, strict=True):
             if np.isfinite(value):
-                axes.annotate(f'{value:.2g}', (value, y), fontsize=style.SMALL - 1.5, **beside)
+                axes.annotate(f'{value:.3g}', (value, y), fontsize=style.SMALL - 1.5, **beside)
     axes.set_yticks(place, ['overall', *map(style.safe, labels)])
     axes.invert_yaxis()
     if diagnosis.noise_floor is not None:
