@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
@@ -25,6 +26,8 @@ from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
 from piezo_ident.report import (
     changes,
     diagnosis_text,
@@ -58,6 +61,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
+    diagnosis = replace(diagnosis, warnings=(*_of_names(given, records), *diagnosis.warnings))
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
@@ -74,6 +78,18 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
             'next': steps,
         }
     )
+
+
+def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:
+    """Say which records have the name of one that the model was identified from."""
+    used = given.identification.get('records')
+    known = used if isinstance(used, Sequence) else ()
+    return [
+        f'{record.name}: the model was identified from a record of this name; if it is the same, '
+        'its error says nothing about other motion: give a record that took no part'
+        for record in records
+        if record.name in known
+    ]
 
 
 def _settings(args: SimpleNamespace) -> DiagnosisSettings:

@@ -135,6 +135,17 @@ def test_a_model_that_lacks_nothing_stays_as_it_is(capsys, made, quick):
     assert data['model_changes'] == []
 
 
+def test_a_record_of_the_identification_is_no_test(capsys, made, quick):
+    argv = ['diagnose', made / 'model.yaml', made / 'val.npz', made / 'unseen.npz', '--json']
+    said = 'val.npz: the model was identified from a record of this name'
+    assert not any(said in x for x in json.loads(succeed(capsys, *argv))['warnings'])
+    model = slow_model()
+    known = {**model.identification, 'records': ['val.npz']}
+    replace(model, identification=known).save(made / 'model.yaml')
+    warnings = json.loads(succeed(capsys, *argv))['warnings']
+    assert [x.startswith(said) for x in warnings].count(True) == 1
+
+
 def test_options_reach_the_diagnosis(capsys, made, quick):
     argv = ['diagnose', made / 'model.yaml', made / 'val.npz', made / 'unseen.npz']
     succeed(capsys, *argv)
