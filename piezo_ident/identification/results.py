@@ -193,6 +193,12 @@ class DynamicsResult:
     slope_model: float = float('nan')
     band: float = float('nan')
 
+    @property
+    def known_to(self) -> float:
+        """Highest frequency with power in the input, or at which the response was measured [Hz]."""
+        measured = () if self.response is None else self.response.frequency
+        return float(np.fmax(self.band, np.max(measured, initial=0.0)))
+
 
 @dataclass(frozen=True, eq=False)
 class Steps:

@@ -115,14 +115,14 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     # a band that ends near half the sampling rate leaves nothing to see, and without a G that is
     # said already
     is_unit = model.dynamics.a.size + model.dynamics.b.size == 1
-    if not dynamics.band < 0.2 * model.sample_rate or is_unit:
+    if not dynamics.known_to < 0.2 * model.sample_rate or is_unit:
         return []
-    G = model.dynamics.response([dynamics.band], model.sample_rate)[0]
+    G = model.dynamics.response([dynamics.known_to], model.sample_rate)[0]
     change = float(np.abs(G - 1.0))
     if change > HARDLY:
         return []
     return [
-        f'the voltage drives the stage up to {dynamics.band:.3g} Hz, where G is within '
+        f'the voltage drives the stage up to {dynamics.known_to:.3g} Hz, where G is within '
         f'{100 * change:.2g} % of its static gain: what it does beyond is not known; record noise '
         'up to higher frequencies'
     ]

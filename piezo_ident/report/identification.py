@@ -205,19 +205,20 @@ def dynamics_tables(result: Identification) -> list[Table]:
         for mode in G.modes(model.sample_rate, dynamics.covariance)
     ]
     note = (
-        'A mode whose uncertainty is as large as itself only helps the others to fit. The input '
-        f'has power up to {number(dynamics.band, 4)} Hz; what lies above is an extrapolation.'
+        'A mode whose uncertainty is as large as itself only helps the others to fit. The data '
+        f'tell G up to {number(dynamics.known_to, 4)} Hz; what lies above is an extrapolation.'
     )
     tables += table('Modes of G', ('frequency / Hz', '± / Hz', 'damping ratio', '±'), modes, note)
     methods = [
         (name, number(error) if math.isfinite(error) else 'unstable')
         for name, error in dynamics.methods.items()
     ]
-    note = (
-        f'At the order ({dynamics.order[0]}, {dynamics.order[1]}). Small-signal gain of '
-        f'the noise {number(dynamics.slope_measured)}, of H at its bias '
-        f'{number(dynamics.slope_model)} (normalised).'
-    )
+    note = f'At the order ({dynamics.order[0]}, {dynamics.order[1]}).'
+    if math.isfinite(dynamics.slope_measured):
+        note += (
+            f' Small-signal gain of the noise {number(dynamics.slope_measured)}, of H at its bias '
+            f'{number(dynamics.slope_model)} (normalised).'
+        )
     head = ('method', 'free-run error / % of rms')
     return [*tables, *table('Methods compared on held-out noise', head, methods, note)]
 
