@@ -39,7 +39,8 @@ def test_periods_are_found_and_the_first_is_left_to_settle(record):
     rng = np.random.default_rng(3)
     (piece,) = record
     noisy = pi.Record(
-        (replace(piece, v=piece.v + 1e-4 * np.ptp(piece.v) * rng.uniform(-1, 1, piece.n)),), 'noisy'
+        (replace(piece, v=piece.v + 1e-4 * np.ptp(piece.v) * rng.uniform(-1, 1, piece.n)),),
+        'noisy',
     )
     assert [r.u.shape for r in periods_of([noisy]).records] == [(2, 2048, 2)] * 6
     two = STAGE.play(program('small', realisations=1, periods=2))
