@@ -195,7 +195,7 @@ class DynamicsResult:
 
     @property
     def known_to(self) -> float:
-        """Highest frequency with power in the input, or at which the response was measured [Hz]."""
+        """Highest frequency with power in the input, or with a measured response [Hz]."""
         measured = () if self.response is None else self.response.frequency
         return float(np.fmax(self.band, np.max(measured, initial=0.0)))
 
