@@ -190,8 +190,8 @@ def test_plays_that_widen_much_and_otherwise_than_the_model_says(frequency, left
     learning = pi.Learning(model, 35e-6 - 25e-6 * soft * np.cos(2 * np.pi * frequency * T))
     for _ in range(4):
         learning.take(stage.simulate(learning.drive.v))
-    # passes of the inverse alone end at 0.11 and 0.354; at 50 Hz the voltage that the inverse finds
-    # turns on the last digit, and with a cutoff that differs by 1e-10 to 1e-4 of itself 0.21 to
+    # passes of the inverse alone end at 0.11 and 0.354; at 50 Hz the voltage that the inverse
+    # finds turns on the last digit: with a cutoff that differs by 1e-10 to 1e-4 of itself 0.21 to
     # 0.32 is left
     assert learning.best.error < left
 
