@@ -33,7 +33,7 @@ from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['Round', 'search_round', 'stands_out', 'takes']
+__all__ = ['Round', 'gains_of', 'search_round', 'stands_out', 'takes']
 
 Array = NDArray[np.float64]
 
@@ -305,11 +305,19 @@ def stands_out(rows: Rows, this: Round) -> bool:
     before, best = this.before, this.contenders[0]
     if not before.state.retuning or find_effect(best.name).rate_independent:
         return False
-    total = float(before.errors.sum())
-    gains = [(total - s.error) / rows.n for name, s in this.best.items() if name != best.name]
-    gains += [before.mean_square - c.mean_square for c in this.contenders[1:]]
-    most = max(gains, default=0.0)
-    return bool(before.mean_square - best.mean_square >= criteria.STANDS_OUT * most)
+    others = [gain for name, gain in gains_of(rows, this).items() if name != best.name]
+    most = max(others, default=0.0)
+    return before.mean_square - best.mean_square >= criteria.STANDS_OUT * most
+
+
+def gains_of(rows: Rows, this: Round) -> dict[str, float]:
+    """Return the mean square that each candidate of a round gains, tried or fitted jointly."""
+    total = float(this.before.errors.sum())
+    gains = {name: (total - s.error) / rows.n for name, s in this.best.items()}
+    for c in this.contenders:
+        gain = this.before.mean_square - c.mean_square
+        gains[c.name] = max(gains.get(c.name, gain), gain)
+    return gains
 
 
 def _harms(rows: Rows, before: Fitted, after: Fitted) -> bool:

@@ -33,7 +33,7 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Round
+from piezo_ident.diagnosis.search import gains_of, Round
 from piezo_ident.effects import catalogue, find_effect
 
 __all__ = [
@@ -230,17 +230,12 @@ def candidates_of(
     last: dict[str, Round] = {}
     for one in rounds:
         left = max(one.before.mean_square - noise, 1e-300)
-        new = {
-            name: (one.before.errors.sum() - s.errors.sum()) / rows.n / left
-            for name, s in one.best.items()
+        shares |= {
+            name: gain / left
+            for name, gain in gains_of(rows, one).items()
             # what follows the path counts beside plays, which come last
             if name not in shares or find_effect(name).rate_independent
         }
-        for c in one.contenders:
-            if c.name in new:
-                gain = (one.before.mean_square - c.mean_square) / left
-                new[c.name] = max(new[c.name], gain)
-        shares |= new
         last |= dict.fromkeys(one.best, one)
     found = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):

@@ -327,7 +327,7 @@ def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
     rows.passes = 9.0
     this = a_round(contender('saturation', 0.9))
     this.best = {
-        name: SimpleNamespace(errors=0.95 * this.before.errors)
+        name: SimpleNamespace(error=0.95 * this.before.errors.sum())
         for name in ('saturation', 'creep', 'gain_drift')
     }
     this.visible = {'saturation': 0.5, 'creep': 1e-6, 'gain_drift': 1e-6}
