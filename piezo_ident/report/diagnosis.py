@@ -14,10 +14,9 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter
 from piezo_ident.effects import find_effect
-from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model import metrics
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
-from piezo_ident.report.refined import changes
+from piezo_ident.report.refined import changes, law_told
 from piezo_ident.report.table import (
     FAULTS,
     length,
@@ -187,7 +186,7 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
         # nothing was added that could have a share
         ('unexplained', (_left(left.share, left.rms_percent) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
-        *(('hysteresis', text) for text in _law(result)),
+        *(('hysteresis', text) for text in law_told(result)),
         ('noise floor', f'{noise} ({source})'),
     ]
     if smallest is not None:
@@ -201,25 +200,6 @@ def _stands_for(result: Diagnosis) -> str:
         return 'for motion like that of these data alone: parts were predicted from the rest'
     kinds = listed(result.kinds)
     return f'for motion of the kinds in these data, each predicted from the others: {kinds}'
-
-
-def _law(result: Diagnosis) -> list[str]:
-    """Return whether H is a sum of plays, and what each law leaves on kinds held out."""
-    errors = result.errors_of_laws
-    if not errors:
-        return []
-    words = LAW_WORDS.get(result.law)
-    compared = ', '.join(
-        f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
-    )
-    # with an effect beside it, the wider law need not be that of H
-    told = 'fitted with' if result.effects else 'not a sum of plays: H has'
-    about = 'a sum of plays' if words is None else f'{told} {words} ({result.law})'
-    if result.verdict != 'refitted' and not changes(result.given, result.model):
-        about = 'as it was given'
-    return [
-        f'{about}; refitted with nothing added, laws of H predict what was held out to {compared}'
-    ]
 
 
 def _left(share: float, rms_percent: float) -> str:

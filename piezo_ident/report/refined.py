@@ -11,12 +11,14 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.effects import find_effect
+from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
+from piezo_ident.report.table import number
 
-__all__ = ['changes', 'validated']
+__all__ = ['changes', 'law_told', 'validated']
 
 
 def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
@@ -67,6 +69,27 @@ def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
     texts += [_with(e) for e in refined.effects if e.name not in before]
     texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
     return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
+
+
+def law_told(result: Diagnosis) -> list[str]:
+    """Return whether H is a sum of plays, and what each law leaves on kinds held out."""
+    errors = result.errors_of_laws
+    if not errors:
+        return []
+    compared = ', '.join(
+        f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
+    )
+    if result.verdict != 'refitted' and not changes(result.given, result.model):
+        about = 'as it was given'
+    elif result.law not in LAW_WORDS:
+        about = 'a sum of plays'
+    else:
+        # with an effect beside it, the wider law need not be that of H
+        kind = 'fitted with' if result.effects else 'not a sum of plays: H has'
+        about = f'{kind} {LAW_WORDS[result.law]} ({result.law})'
+    return [
+        f'{about}; refitted with nothing added, laws of H predict what was held out to {compared}'
+    ]
 
 
 def _with(added: EffectSetting) -> str:
