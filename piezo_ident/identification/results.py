@@ -197,7 +197,7 @@ class DynamicsResult:
     def known_to(self) -> float:
         """Highest frequency with power in the input, or with a measured response [Hz]."""
         measured = () if self.response is None else self.response.frequency
-        return float(np.fmax(self.band, np.max(measured, initial=0.0)))
+        return float(np.fmax.reduce(measured, initial=self.band))
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,11 +384,9 @@ class Identification(Showable):
     @property
     def headline(self) -> Headline:
         """The errors to quote: on data for validation if there are any, else on the next best."""
-        rows: list[ErrorRow] = []
-        for data in ('validation', 'held out', 'selection', 'fitted'):
-            rows = self._driven(data)
-            if rows:
-                break
+        kinds = ('validation', 'held out', 'selection', 'fitted')
+        data = next((kind for kind in kinds if self._driven(kind)), 'fitted')
+        rows = self._driven(data)
         return Headline(
             data=data,
             records=tuple(dict.fromkeys(row.record for row in rows)),

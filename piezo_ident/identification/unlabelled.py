@@ -375,7 +375,7 @@ def _named(run: Run, fitted: Mask) -> str:
 def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Excerpt]) -> JointFit:
     """Return the fit, without its G or its delay too where that errs less on what chooses."""
     delay = Delay(joint.delay.samples, joint.delay.fraction)
-    if joint.G.a.size + joint.G.b.size == 1 and delay.total == 0.0:
+    if joint.G.is_static and delay.total == 0.0:
         return joint
     r = joint.hysteresis.thresholds
 
@@ -390,12 +390,11 @@ def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Exc
     if error(joint.G, delay) <= (1.0 + WORSE) * error(unit, Delay(0)) + joint.gain:
         return joint
     reason = 'with dynamics the model errs more on data held out than without; add steps or noise'
+    missing = dict(joint.not_identified) | dict.fromkeys(('delay', 'dynamics'), reason)
     return replace(
         joint,
         G=unit,
         delay=replace(joint.delay, samples=0, fraction=0.0, std=float('inf'), source='none'),
         dynamics=replace(joint.dynamics, order=(0, 1), methods={}, covariance=np.zeros((1, 1))),
-        not_identified=tuple(
-            (dict(joint.not_identified) | dict.fromkeys(('delay', 'dynamics'), reason)).items()
-        ),
+        not_identified=tuple(missing.items()),
     )

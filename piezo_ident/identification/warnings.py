@@ -13,6 +13,7 @@ from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import DynamicsResult, Identification
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.record.channels import role_of
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
 
@@ -60,7 +61,7 @@ def _of_axes(pieces: Sequence[Piece]) -> list[str]:
         name: None
         for piece in pieces
         for name, x in piece.channels.items()
-        if name.startswith('v_') and np.ptp(x) > 0.0
+        if role_of(name) == 'v' and np.ptp(x) > 0.0
     }
     if not moved:
         return []
@@ -114,8 +115,7 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     """Say when the excitation ends where G has hardly begun to act."""
     # a band that ends near half the sampling rate leaves nothing to see, and without a G that is
     # said already
-    is_unit = model.dynamics.a.size + model.dynamics.b.size == 1
-    if not dynamics.known_to < 0.2 * model.sample_rate or is_unit:
+    if not dynamics.known_to < 0.2 * model.sample_rate or model.dynamics.is_static:
         return []
     G = model.dynamics.response([dynamics.known_to], model.sample_rate)[0]
     change = float(np.abs(G - 1.0))

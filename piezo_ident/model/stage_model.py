@@ -168,8 +168,7 @@ class StageModel:
     @property
     def is_static(self) -> bool:
         """Whether neither G nor the delay nor an effect depends on the sampling rate."""
-        trivial = self.dynamics.a.size == 0 and self.dynamics.b.size == 1
-        return trivial and self.delay.total == 0.0 and not self.effects
+        return self.dynamics.is_static and self.delay.total == 0.0 and not self.effects
 
     def without_dynamics(self) -> StageModel:
         """Return the hysteresis alone, times the static gain of G; no delay, no effects."""

@@ -87,6 +87,11 @@ class Dynamics:
         return cls(a=np.empty(0), b=np.ones(1))
 
     @property
+    def is_static(self) -> bool:
+        """Whether G is a gain alone."""
+        return self.a.size == 0 and self.b.size == 1
+
+    @property
     def gain(self) -> float:
         """Static gain G(1), infinite for an integrator."""
         return _static_gain(self.b, self.a)

@@ -148,8 +148,7 @@ def response_figure(identification: Identification) -> Figure:
     """
     model, dynamics = identification.model, identification.dynamics
     measured = dynamics.response
-    static = model.dynamics.a.size == 0 and model.dynamics.b.size == 1
-    if measured is None and static:
+    if measured is None and model.dynamics.is_static:
         raise NothingToDraw('no broadband motion, and no dynamics were identified')
     rate = model.sample_rate
     top = 0.5 * rate if measured is None else float(measured.frequency[-1])
