@@ -20,6 +20,12 @@ from .more_cores import (
     skewed_bouc_wen,
     turning_curves,
 )
+from .sealed_cores import (
+    dragged_moments,
+    gap_shares,
+    loaded_sliders,
+    random_bonds,
+)
 from .unseen_cores import (
     back_stresses,
     growing_domains,
@@ -49,6 +55,10 @@ LAWS = {
     'energy-balance': energy_balance,
     'limiting-loops': limiting_loops,
     'pinned-line': pinned_line,
+    'dragged-moments': dragged_moments,
+    'gap-shares': gap_shares,
+    'loaded-sliders': loaded_sliders,
+    'random-bonds': random_bonds,
 }
 
 #: how often each is dealt; the laws of 'final' are for judging alone, all others may be looked at
@@ -63,17 +73,23 @@ SETS = {
         'dahl',
         'turning-curves',
     ),
-    'past': (
+    'former': (
         'back-stresses',
         'growing-domains',
         'phase-fractions',
         'rotating-grains',
         'tetragonal-grains',
     ),
-    'final': (
+    'past': (
         'bounding-lines',
         'energy-balance',
         'limiting-loops',
         'pinned-line',
+    ),
+    'final': (
+        'dragged-moments',
+        'gap-shares',
+        'loaded-sliders',
+        'random-bonds',
     ),
 }

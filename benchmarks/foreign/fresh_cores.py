@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Laws of the final set, which nothing is tuned on.
+Laws of the past set, which the diagnosis was judged on and may be looked at since.
 
 - a balance of energies, whose irreversible part every turn begins anew (Hauser, J. Appl. Phys. 96
   (2004) 2753),

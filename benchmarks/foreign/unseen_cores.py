@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Laws of the past set, which the diagnosis was judged on and may be looked at since.
+Laws of the former set, which the diagnosis was judged on before those of the past one.
 
 - plastic strain under stress, with back-stresses that fade (Armstrong, Frederick, CEGB report
   RD/B/N731, 1966; Chaboche, Int. J. Plast. 2 (1986) 149), elements in series,
