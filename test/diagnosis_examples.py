@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
@@ -45,18 +46,27 @@ CREEP = {'gain': [0.012, 0.01], 'time_constant': [0.1, 1.0]}
 @cache
 def refined_model() -> StageModel:
     """Return the same stage with creep."""
-    return replace(slow_model(), effects=(EffectSetting('creep', CREEP),))
+    return with_effects(creep=CREEP)
+
+
+def with_effects(**effects: dict[str, object]) -> StageModel:
+    """Return the slow stage with effects, by their names."""
+    return replace(slow_model(), effects=tuple(EffectSetting(*one) for one in effects.items()))
+
+
+def played(model: StageModel, name: str, earlier: ArrayLike = ()) -> Record:
+    """Return what is measured of a stage that played the program, behind an earlier voltage."""
+    sequence = parse_program(PROGRAM, 'program').build(SLOW)
+    segments = tuple(Segment(s.label, s.start, s.stop) for s in sequence.segments)
+    y = model.simulate(np.concatenate([earlier, sequence.v]))[-sequence.n :]
+    noise = NOISE * np.random.default_rng(3).standard_normal(y.size)
+    return Record((Piece(sequence.v, y + noise, SLOW, segments=segments),), name)
 
 
 @cache
 def measured(name: str = 'val.npz') -> Record:
     """Return a record of the stage that creeps."""
-    sequence = parse_program(PROGRAM, 'program').build(SLOW)
-    segments = tuple(Segment(s.label, s.start, s.stop) for s in sequence.segments)
-    piece = Piece(sequence.v, np.zeros(sequence.n), SLOW, segments=segments)
-    y = refined_model().predict_piece(piece)
-    noise = NOISE * np.random.default_rng(3).standard_normal(y.size)
-    return Record((replace(piece, y=y + noise),), name)
+    return played(refined_model(), name)
 
 
 def errors(record: Record, residual: np.ndarray) -> Errors:

@@ -91,10 +91,12 @@ def _selected(
     beside, widest = plays, wide
     if found.taken:
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
+    known = found.fitted.state
+    start = replace(given, effects=known.effects, fading=known.fading, earlier=known.earlier)
     as_given = fit_jointly(
         simulator,
-        replace(given, effects=found.fitted.state.effects, retuning=(0.0,) * len(RETUNING)),
-        base_at(simulator, given),
+        replace(start, retuning=(0.0,) * len(RETUNING)),
+        base_at(simulator, start),
         # whether it leaves little shows before the end
         enough=criteria.OF_LEAST * simulator.rows.square(criteria.SMALLEST_EFFECT),
         # more than plays leave says nothing

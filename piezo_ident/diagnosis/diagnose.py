@@ -292,7 +292,7 @@ def _diagnosed(
         blocks=int(rows.fold.size),
         warnings=(
             *part_judged(rows),
-            *warnings_of(model, refined, findings, floor, bent),
+            *warnings_of(model, refined, findings, floor, bent, rows.stroke),
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
 from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
@@ -353,18 +354,13 @@ class ForwardSelection:
             )
             for i in dropped:
                 del taken[i]
-            if len(taken) == self._most or fitted.mean_square - self._noise < self._least:
+            fitted = with_earlier_motion(self._simulator, fitted, self._alive)
+            if len(taken) == self._most or self._beyond_noise(fitted) < self._least:
                 break
             this = self._round(fitted)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
-            fitted = polished(
-                self._simulator,
-                fitted,
-                self._lines,
-                self._noise,
-                lambda: self._progress('candidates', 0.95),
-            )
+            fitted = polished(self._simulator, fitted, self._lines, self._noise, self._alive)
             # an effect that was not fitted to the end leaves something for another one to explain;
             # all but the last were tried beside that
             newest = len(fitted.state.effects) - 1
@@ -384,6 +380,9 @@ class ForwardSelection:
         if len(taken) == len(shown):
             fitted = shown[-1].contenders[0] if shown else self._base
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
+
+    def _alive(self) -> None:
+        self._progress('candidates', 0.95)
 
     def _wanted(self, effects: Sequence[type[Effect]]) -> float:
         """Return the share that effects must explain together."""

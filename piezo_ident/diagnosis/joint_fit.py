@@ -11,12 +11,12 @@ but for a factor near one (`retuning.retuned`): a change of them is a candidate 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.criteria import WEIGHT_SPREAD, WIDE_SPREAD
+from piezo_ident.diagnosis.criteria import EARLIER_COST, WEIGHT_SPREAD, WIDE_SPREAD
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     held_out_residual,
@@ -37,7 +37,6 @@ __all__ = [
     'base_at',
     'fit_base',
     'fit_jointly',
-    'offset_columns',
 ]
 
 Array = NDArray[np.float64]
@@ -128,28 +127,28 @@ class Fitted:
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Return H refitted as one of a family, effects kept as they are, and the columns used."""
     rows, m = simulator.rows, law.size
-    columns = simulator.base_columns(law)
-    base = BaseColumns.of(rows, np.concatenate([columns, offset_columns(rows).T]).T)
-    effects = simulator.run(state) - state.offsets[rows.of_record] - simulator.bare(state)
+    columns, added = simulator.base_columns(law), simulator.added_columns(state)
+    base = BaseColumns.of(rows, np.concatenate([columns, added.T]).T)
+    effects = simulator.run(state) - added @ state.only_adds - simulator.bare(state)
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
     step = FitStep(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
-    return replace(state, offsets=theta[m:]).with_coefficients(law, theta[:m]), base
+    return state.with_only_added(theta[m:]).with_coefficients(law, theta[:m]), base
 
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
     """
     Return the columns of a refit of H in a state, its effects and a retuned G included.
 
-    An H of no law stays as it is: offsets alone.
+    An H of no law stays as it is: what only adds alone.
     """
-    rows, offsets = simulator.rows, offset_columns(simulator.rows)
+    rows, added = simulator.rows, simulator.added_columns(state)
     if state.law is None:
-        return BaseColumns.of(rows, offsets)
+        return BaseColumns.of(rows, added)
     simulator.remember(state)
-    columns = simulator.columns(state, state.law, WEIGHT_STEP, offsets.T)
+    columns = simulator.columns(state, state.law, WEIGHT_STEP, added.T)
     return BaseColumns.of(rows, columns.T)
 
 
@@ -270,12 +269,6 @@ def _firm(prior: Array, moving: Array) -> Array:
     return firm
 
 
-def offset_columns(rows: Rows) -> Array:
-    """Return a column for the offset of each record; shape (n, records)."""
-    of = rows.of_record[:, None] == np.arange(len(rows.names))
-    return np.asarray(of, dtype=np.float64)
-
-
 def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
@@ -284,6 +277,8 @@ def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     plays = 0 if state.law is None else state.law.thresholds.size
     spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
     prior[: spread.size] = float(e @ e) / count / spread**2
+    fading = slice(spread.size + state.offsets.size, spread.size + state.only_adds.size)
+    prior[fading] = rows.n * EARLIER_COST**2
     return prior
 
 
@@ -340,8 +335,8 @@ def _moved(
     factor: float,
 ) -> State:
     """Return the state after a step, that of H divided by a factor, but for steps to a bound."""
-    m, k = state.coefficients.size, state.offsets.size
-    new = replace(state, offsets=state.offsets + step[m : m + k])
+    m, k = state.coefficients.size, state.only_adds.size
+    new = state.with_only_added(state.only_adds + step[m : m + k])
     if state.law is not None:
         of_H = np.where(step[:m] > lower[:m], step[:m] / factor, step[:m])
         new = new.with_coefficients(state.law, state.coefficients + of_H)

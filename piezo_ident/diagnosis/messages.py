@@ -66,12 +66,18 @@ def part_judged(rows: Rows) -> list[str]:
 
 
 def warnings_of(
-    given: StageModel, refined: Refined, findings: Findings, floor: NoiseFloor, bent: float
+    given: StageModel,
+    refined: Refined,
+    findings: Findings,
+    floor: NoiseFloor,
+    bent: float,
+    stroke: float,
 ) -> list[str]:
     """
     Return what a user of the refined model must know.
 
-    `bent` is the share of the explainable part that goes with a retuned G alone.
+    `bent` is the share of the explainable part that goes with a retuned G alone, and `stroke` that
+    of the records, normalised.
     """
     state = refined.state
     found = []
@@ -85,6 +91,13 @@ def warnings_of(
         found.append(
             'the dynamics were retuned in the band that the data drive'
             f'{why if bent >= LEAST_GAIN else ""}'
+        )
+    crept = 100.0 * float(np.abs(state.earlier.sum(axis=-1)).max(initial=0.0)) / stroke
+    if state.fading:
+        found.append(
+            f'the stage still crept when a record began, by up to {crept:.2g} % of stroke; this '
+            'was fitted and is no part of any error, but a prediction of such a record starts '
+            'from rest and errs by it'
         )
     stay = bool(lasting(findings.effects))
     found += [

@@ -149,6 +149,13 @@ class Rows:
         run = self.runs[i]
         return run.piece.time(0, run.u.size) - float(self.begin[i])
 
+    def fading(self, i: int, times: Sequence[float]) -> Array:
+        """Return decays with some time constants [s] from the start of a run's record."""
+        first = min(r.piece.start_time for r in self.runs if r.record == self.runs[i].record)
+        run = self.runs[i]
+        t = run.piece.time(0, run.u.size) - first
+        return np.exp(-t / np.asarray(times, np.float64)[:, None])
+
     @property
     def longest(self) -> int:
         """Number of the record that has most rows."""

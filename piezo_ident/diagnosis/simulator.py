@@ -67,6 +67,8 @@ class Simulator:
         self._kept: _Kept | None = None
         #: what G makes of the columns of the law that was asked for last
         self._of_law: tuple[Any, Array] | None = None
+        #: columns of what only adds, and the time constants they were made of
+        self._added: tuple[tuple[float, ...], Array] | None = None
         #: compiled loops leave the interpreter to others, so runs and states go side by side; each
         #: holds some signals as long as a run
         self._threads = min(MOST_THREADS, os.cpu_count() or 1)
@@ -161,6 +163,18 @@ class Simulator:
 
         return self._of_columns(law.size, of_run, more)
 
+    def added_columns(self, state: State) -> Array:
+        """Return a column for each number of `State.only_adds`; shape (n, records (1 + times))."""
+        times = state.fading
+        if self._added is None or self._added[0] != times:
+            rows = self.rows
+            of = (rows.of_record[:, None] == np.arange(len(rows.names))).astype(np.float64)
+            fading = [rows.fading(i, times) for i in range(len(rows.runs))]
+            decays = [rows.of([x[k] for x in fading]) for k in range(len(times))]
+            parts = [record * decay for record in of.T for decay in decays]
+            self._added = times, np.array([*of.T, *parts]).T
+        return self._added[1]
+
     def bare(self, state: State) -> Array:
         """Return the rows of H, G and the delay alone; shape (n,)."""
         G, delay, h = self.model.dynamics, self.model.delay, state.hysteresis
@@ -179,7 +193,13 @@ class Simulator:
     def full(self, state: State) -> list[Array]:
         """Return the prediction of each run at the full rate, normalised."""
         outputs = self._of_runs(lambda i: self._chain(state, i).output())
-        return [x + state.offsets[k] for x, k in zip(outputs, self.rows.record, strict=True)]
+        added = state.offsets[self.rows.record]
+        if not state.fading:
+            return [x + offset for x, offset in zip(outputs, added, strict=True)]
+        return [
+            x + added[i] + state.earlier[k] @ self.rows.fading(i, state.fading)
+            for i, (x, k) in enumerate(zip(outputs, self.rows.record, strict=True))
+        ]
 
     def remember(self, state: State) -> Array:
         """Return the predicted rows, and keep what runs between the links."""
@@ -318,7 +338,7 @@ class Simulator:
         return self._kept
 
     def _predicted(self, state: State, outputs: Sequence[Array]) -> Array:
-        return self.rows.of(outputs) + state.offsets[self.rows.of_record]
+        return self.rows.of(outputs) + self.added_columns(state) @ state.only_adds
 
     def _joined(self, parts: Sequence[Array]) -> Array:
         """Return the rows that count of all rows of each run, shape (n // m,) or (k, n // m)."""

@@ -70,6 +70,10 @@ class State:
         The family of H; None for an H that is taken as it is.
     coefficients : ndarray, shape (size,)
         Those of the law.
+    fading : tuple of float
+        Time constants of what creeps on in each record from motion before it [s].
+    earlier : ndarray, shape (records, times)
+        What creeps on as each record begins, of each time constant, normalised.
     """
 
     hysteresis: Hysteresis
@@ -78,6 +82,18 @@ class State:
     retuning: tuple[float, ...] = ()
     law: HysteresisLaw | None = None
     coefficients: Array = field(default_factory=lambda: np.empty(0))
+    fading: tuple[float, ...] = ()
+    earlier: Array = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def only_adds(self) -> Array:
+        """All that is added to the displacement of records, shape (records (1 + times),)."""
+        return np.concatenate([self.offsets, self.earlier.ravel()])
+
+    def with_only_added(self, values: Array) -> State:
+        """Return the state with other offsets and other creep of earlier motion."""
+        k = self.offsets.size
+        return replace(self, offsets=values[:k], earlier=values[k:].reshape(self.earlier.shape))
 
     def with_coefficients(self, law: HysteresisLaw, coefficients: Array) -> State:
         """Return the state with another H of a family."""
