@@ -278,10 +278,15 @@ class ForwardSelection:
         rows = self._simulator.rows
         if rows.passes < criteria.PASSES or not this.contenders:
             return False
-        if not first and self._makes_up(this):
-            return False
         # what shows where it alone acts is no misfit of H
         own = has_place(this.contenders[0].name)
+        if not first:
+            left = self._beyond_noise(this.before)
+            if self._left(this) <= (1.0 - criteria.TOGETHER) * left:
+                # nor is what explains most of the rest, however little that is
+                own, explainable = True, min(explainable, left)
+            elif self._makes_up(this):
+                return False
         smallest = criteria.SMALLEST_EFFECT if own else self._smallest
         known = min(this.before.mean_square, self._given)
         return takes(rows, this, known, self._noise, explainable, smallest, first=first)
@@ -347,6 +352,7 @@ class ForwardSelection:
         fitted, this = start, first
         rounds, taken = [*shown, first], [*shown]
         explainable = self._explainable(start)
+        smallest = self._simulator.rows.square(criteria.SMALLEST_EFFECT)
         while self._takes(this, explainable, first=len(taken) == len(shown)):
             taken.append(this)
             fitted, dropped = without_needless(
@@ -355,7 +361,7 @@ class ForwardSelection:
             for i in dropped:
                 del taken[i]
             fitted = with_earlier_motion(self._simulator, fitted, self._alive)
-            if len(taken) == self._most or self._beyond_noise(fitted) < self._least:
+            if len(taken) == self._most or self._beyond_noise(fitted) < smallest:
                 break
             this = self._round(fitted)
             rounds.append(this)

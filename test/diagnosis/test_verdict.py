@@ -364,11 +364,23 @@ def test_an_effect_that_costs_a_kind_is_not(rows):
     assert not takes(rows, a_round(best), WHOLE, 0.0, WHOLE, 0.05, first=True)
 
 
-@pytest.mark.parametrize(('parameters', 'is_taken'), [(10, False), (7, True)])
-def test_many_parameters_may_make_up_for_the_form_of_the_law_before(rows, parameters, is_taken):
+@pytest.mark.parametrize(
+    ('parameters', 'left', 'smallest', 'is_taken'),
+    [
+        (10, 0.02, 0.05, False),
+        (7, 0.02, 0.05, True),
+        (7, 0.02, 0.3, False),
+        # what explains most of the rest makes up for nothing, and is no misfit of H
+        (10, 0.01, 0.05, True),
+        (10, 0.01, 0.3, True),
+    ],
+)
+def test_a_further_effect_may_make_up_for_the_form_of_the_law_before(
+    rows, parameters, left, smallest, is_taken
+):
     search = object.__new__(forward_selection.ForwardSelection)
     search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
-    search._noise, search._smallest, search._given = 0.0, 0.05, np.inf
+    search._noise, search._smallest, search._given = 0.0, smallest, np.inf
     search._base = SimpleNamespace(mean_square=WHOLE)
     before = SimpleNamespace(
         mean_square=0.07 * WHOLE,
@@ -376,11 +388,11 @@ def test_many_parameters_may_make_up_for_the_form_of_the_law_before(rows, parame
         parameters=(None,) * 6,
         state=SimpleNamespace(retuning=(0.0,) * 4),
     )
-    best = contender('rate_dependent_hysteresis', 0.01, parameters=parameters)
+    best = contender('rate_dependent_hysteresis', left, parameters=parameters)
     this = SimpleNamespace(before=before, contenders=(best,), chance={})
     assert search._takes(this, 0.3 * WHOLE, first=False) == is_taken
     # where a name may not leave as much, more is missing
-    search._base = SimpleNamespace(mean_square=0.3 * WHOLE)
+    search._base, search._smallest = SimpleNamespace(mean_square=0.3 * WHOLE), 0.05
     assert search._takes(this, 0.3 * WHOLE, first=False)
 
 
