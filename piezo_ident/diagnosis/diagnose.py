@@ -269,6 +269,7 @@ def _diagnosed(
     aside = set_aside(rows, selected, settings, noise, missed, tested)
     explainable = max(base.mean_square - noise, 1e-300)
     bent = (base.mean_square - selected.rounds[0].before.mean_square) / explainable
+    crept = rows.percent(float(np.max(simulator.crept(refined.state) ** 2)))
     progress('verdict', 1.0)
     return Diagnosis(
         verdict=findings.verdict,
@@ -292,7 +293,7 @@ def _diagnosed(
         blocks=int(rows.fold.size),
         warnings=(
             *part_judged(rows),
-            *warnings_of(model, refined, findings, floor, bent, rows.stroke),
+            *warnings_of(model, refined, findings, floor, bent, crept),
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,

@@ -15,15 +15,17 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.state import CREEP, State
 
 __all__ = ['with_earlier_motion']
 
-#: effect that goes on when the motion has ended
-CREEP = 'creep'
+#: elements that are faster may make up for dynamics [s]
+AT_ONCE = 0.05
 
 
 def with_earlier_motion(
@@ -32,27 +34,42 @@ def with_earlier_motion(
     """
     Return a fit in which creep goes on from before each record.
 
-    Without creep nothing does.  It must predict clearly better, both blocks and kinds of motion
-    held out.  `tick` is called between the steps of a fit.
+    Without creep nothing does.  It must predict held-out blocks clearly better, and be no more
+    than earlier motion can leave.  `tick` is called between the steps of a fit.
     """
     state = fitted.state
     creeping = [added for added in state.effects if added.name == CREEP]
-    if bool(creeping) == bool(state.fading):
+    if state.fading or not creeping:
         return fitted
-    if not creeping:
-        return _settled(simulator, replace(state, fading=(), earlier=np.empty(0)), tick)
     times = tuple(map(float, creeping[0].values[0]['time_constant']))
     none = np.zeros((len(simulator.rows.names), len(times)))
-    fitted, again = (
-        _settled(simulator, start, tick)
-        for start in (state, replace(state, fading=times, earlier=none))
+    try:
+        fitted = _settled(simulator, state, tick)
+        crept = _settled(simulator, replace(state, fading=times, earlier=none), tick)
+    except IdentificationError:
+        # what cannot be fitted is not there
+        return fitted
+    is_better = crept.mean_square <= criteria.EARLIER_LEAVES**2 * fitted.mean_square
+    return crept if is_better and _is_possible(simulator.rows, crept.state) else fitted
+
+
+def _is_possible(rows: Rows, state: State) -> bool:
+    """
+    Return whether creep can have left as much as a record begins with.
+
+    Each element has followed voltages of the range.  A record that begins at the lowest one sinks
+    at first; a drift may rise, and by more.
+    """
+    (values,) = (added.values[0] for added in state.effects if added.name == CREEP)
+    gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
+    gain, doubt = (
+        float(gains[times > AT_ONCE].sum()),
+        np.sqrt(rows.square(criteria.SMALLEST_EFFECT)),
     )
-    share = criteria.EARLIER_LEAVES**2
-    is_better = (
-        again.errors.sum() <= share * fitted.errors.sum()
-        and again.transfer.sum() <= share * fitted.transfer.sum()
-    )
-    return again if is_better else fitted
+    starts = {k: run.u[0] for run, k in reversed([*zip(rows.runs, rows.record, strict=True)])}
+    ends = gain * (np.array(rows.reach) - np.array([[starts[k]] for k in sorted(starts)]))
+    left = state.earlier.sum(axis=1)
+    return bool(np.all((ends.min(axis=1) - doubt <= left) & (left <= ends.max(axis=1) + doubt)))
 
 
 def _settled(simulator: Simulator, state: State, tick: Callable[[], None]) -> Fitted:

@@ -93,13 +93,8 @@ class ForwardSelection:
         given: float = np.inf,
     ) -> None:
         self._simulator = simulator
-        self._lines = lines
-        self._noise = noise
-        self._smallest = smallest
-        self._missed = missed
-        self._misfit = misfit
-        self._given = given
-        self._certain = certain
+        self._lines, self._noise, self._certain, self._given = lines, noise, certain, given
+        self._smallest, self._missed, self._misfit = smallest, missed, misfit
         #: fits, and the same with G retuned
         self._retunings: list[tuple[Fitted, Fitted]] = []
         self._most = settings.most_effects
@@ -109,6 +104,8 @@ class ForwardSelection:
         self._candidates = [find_effect(name) for name in names if name not in settings.without]
         self._have = {setting.name for setting in simulator.model.effects}
         self._count = 0
+        #: mean square that each effect must be worth to stay
+        self._worth = self._least
 
     def run(self, base: Fitted) -> Selected:
         """
@@ -259,7 +256,7 @@ class ForwardSelection:
             return found
         # what beside the wide H was explained by another effect
         stay = sum(one.contenders[0].name in TESTED for one in found.taken)
-        fitted, dropped = without_needless(self._simulator, this.contenders[0], self._least, stay)
+        fitted, dropped = without_needless(self._simulator, this.contenders[0], self._worth, stay)
         taken = [one for i, one in enumerate(found.taken) if i not in dropped]
         return replace(found, taken=(*taken, this), fitted=fitted)
 
@@ -355,8 +352,10 @@ class ForwardSelection:
         smallest = self._simulator.rows.square(criteria.SMALLEST_EFFECT)
         while self._takes(this, explainable, first=len(taken) == len(shown)):
             taken.append(this)
+            # it stays worth most of what it was taken for, where that is little
+            self._worth = min(self._worth, criteria.TOGETHER * self._gain(this))
             fitted, dropped = without_needless(
-                self._simulator, this.contenders[0], self._least, len(shown)
+                self._simulator, this.contenders[0], self._worth, len(shown)
             )
             for i in dropped:
                 del taken[i]
@@ -371,7 +370,7 @@ class ForwardSelection:
             # all but the last were tried beside that
             newest = len(fitted.state.effects) - 1
             fitted, dropped = without_needless(
-                self._simulator, fitted, self._least, max(newest, len(shown)), last=0
+                self._simulator, fitted, self._worth, max(newest, len(shown)), last=0
             )
             for i in dropped:
                 del taken[i]

@@ -27,12 +27,14 @@ def found_effects(
     if not selected.taken:
         return ()
     std = _standard_deviations(rows, last)
-    steps = [this.contenders[0].mean_square for this in selected.taken[:-1]]
-    levels = [base.mean_square, *steps, selected.fitted.mean_square]
+    ends = [this.contenders[0].mean_square for this in selected.taken[:-1]]
+    starts = list(ends)
+    if last.state.fading:
+        # what crept on from before is no gain of an effect that was added after it
+        starts = [this.before.mean_square for this in selected.taken[1:]]
+    starts, ends = [base.mean_square, *starts], [*ends, selected.fitted.mean_square]
     found = []
-    for i, (added, level, left) in enumerate(
-        zip(last.state.effects, levels[:-1], levels[1:], strict=True)
-    ):
+    for i, (added, level, left) in enumerate(zip(last.state.effects, starts, ends, strict=True)):
         gain = max(level - left, 0.0)
         values = added.values[rows.longest]
         parameters = {}

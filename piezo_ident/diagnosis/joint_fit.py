@@ -119,7 +119,7 @@ class Fitted:
 
         Blocks of one number in `sets` are held out together; spread over all data when absent.
         """
-        prior = self.prior if sets is None else _firm(self.prior, self.moving)
+        prior = self.prior if sets is None else _firm(rows, self.state, self.prior, self.moving)
         sets = rows.fold if sets is None else sets
         return held_out_residual(rows, self.J, self.e, prior[self.free], sets, self.pull)
 
@@ -133,6 +133,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
+    prior[_places_of_decays(state)] = _cost_of_decays(rows)
     step = FitStep(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return state.with_only_added(theta[m:]).with_coefficients(law, theta[:m]), base
@@ -185,7 +186,7 @@ def fit_jointly(
     damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
-    pull = pull_at and pull_at(state, p)
+    pull = _with_decays(rows, state, p, pull_at and pull_at(state, p))
     for done in range(iterations):
         before = _loss(e, pull)
         least = max(TOLERANCE * before, enough * e.size)
@@ -206,7 +207,7 @@ def fit_jointly(
             except ModelError:
                 damping *= WORSE ** (failed + 1)
                 continue
-            new = pull_at and pull_at(trial, p)
+            new = _with_decays(rows, trial, p, pull_at and pull_at(trial, p))
             after = _loss(left, new)
             if np.isfinite(after) and after < before:
                 better = trial
@@ -230,7 +231,7 @@ def fit_jointly(
     E = e[:, None]
     known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
     equations = with_columns(rows, known, base.columns, moving, E).only(free)
-    own, firm = pull and pull.only(free), _firm(prior, moving)
+    own, firm = pull and pull.only(free), _firm(rows, state, prior, moving)
     return Fitted(
         state=state,
         base=base,
@@ -258,13 +259,15 @@ def _loss(e: Array, pull: Pull | None) -> float:
     return float(e @ e) + (0.0 if pull is None else pull.s)
 
 
-def _firm(prior: Array, moving: Array) -> Array:
+def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     """
     Return a prior that keeps parameters which only a kind of excitation left out can tell.
 
     A limit of the slew rate that nothing but a multisine reaches would be anything without it.
+    What creeps on as a record begins is told by the motion there, and by no other.
     """
     firm = prior.copy()
+    firm[_places_of_decays(state)] += rows.n / FIRM
     firm[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
     return firm
 
@@ -277,9 +280,30 @@ def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     plays = 0 if state.law is None else state.law.thresholds.size
     spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
     prior[: spread.size] = float(e @ e) / count / spread**2
-    fading = slice(spread.size + state.offsets.size, spread.size + state.only_adds.size)
-    prior[fading] = rows.n * EARLIER_COST**2
+    prior[_places_of_decays(state)] = _cost_of_decays(rows)
     return prior
+
+
+def _places_of_decays(state: State) -> slice:
+    """Return the places of what creeps on from before, behind H and the offsets."""
+    first = state.coefficients.size + state.offsets.size
+    return slice(first, first + state.earlier.size)
+
+
+def _cost_of_decays(rows: Rows) -> float:
+    return rows.n * EARLIER_COST**2
+
+
+def _with_decays(rows: Rows, state: State, p: int, pull: Pull | None) -> Pull | None:
+    """Return a pull with that of decays towards zero; `_prior` holds their diagonal."""
+    if not state.fading:
+        return pull
+    size, b = state.earlier.ravel(), np.zeros(p)
+    b[_places_of_decays(state)] = -_cost_of_decays(rows) * size
+    s = _cost_of_decays(rows) * float(size @ size)
+    if pull is None:
+        return Pull(np.zeros((p, p)), b, s)
+    return Pull(pull.A, pull.b + b, pull.s + s)
 
 
 def _derivatives(

@@ -71,13 +71,13 @@ def warnings_of(
     findings: Findings,
     floor: NoiseFloor,
     bent: float,
-    stroke: float,
+    crept: float,
 ) -> list[str]:
     """
     Return what a user of the refined model must know.
 
-    `bent` is the share of the explainable part that goes with a retuned G alone, and `stroke` that
-    of the records, normalised.
+    `bent` is the share of the explainable part that goes with a retuned G alone, and `crept` the
+    most that crept on from before a record, % of stroke.
     """
     state = refined.state
     found = []
@@ -92,12 +92,11 @@ def warnings_of(
             'the dynamics were retuned in the band that the data drive'
             f'{why if bent >= LEAST_GAIN else ""}'
         )
-    crept = 100.0 * float(np.abs(state.earlier.sum(axis=-1)).max(initial=0.0)) / stroke
     if state.fading:
         found.append(
-            f'the stage still crept when a record began, by up to {crept:.2g} % of stroke; this '
-            'was fitted and is no part of any error, but a prediction of such a record starts '
-            'from rest and errs by it'
+            f'the stage still crept from motion before a record, by up to {crept:.2g} % of '
+            'stroke; this was fitted and is no part of any error, but a prediction of such a '
+            'record starts from rest and errs by it'
         )
     stay = bool(lasting(findings.effects))
     found += [

@@ -40,19 +40,20 @@ def without_needless(
     """
     dropped: list[int] = []
     for i in range(len(fitted.state.effects) - 1 - last, stay - 1, -1):
-        rest = tuple(added for k, added in enumerate(fitted.state.effects) if k != i)
-        state = replace(fitted.state, effects=rest)
+        state, base = fitted.state.without(i), fitted.base
+        if state.only_adds.size < fitted.state.only_adds.size:
+            base = base_at(simulator, state)
         # whether it is needed shows before the end
         without = fit_jointly(
             simulator,
             state,
-            fitted.base,
+            base,
             enough=criteria.OF_LEAST * least,
             goal=fitted.mean_square + least,
         )
         if without.reached - fitted.mean_square >= least:
             continue
-        without = fit_jointly(simulator, without.state, fitted.base)
+        without = fit_jointly(simulator, without.state, base)
         if without.reached - fitted.mean_square >= least:
             continue
         # what the others make up for by values that cannot be, they do not explain

@@ -112,7 +112,7 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     kept = [_elsewhere(added) for added in state.effects]
     if not any(added.name == WANDERS for added in kept):
         return state
-    others = tuple(added for added in kept if added.name != WANDERS)
+    others, state = tuple(added for added in kept if added.name != WANDERS), state.from_rest()
     of_record = simulator.rows.of_record
     x, known = (
         centred(simulator.run(s), of_record) for s in (replace(state, effects=others), given)

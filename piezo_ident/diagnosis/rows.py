@@ -150,10 +150,14 @@ class Rows:
         return run.piece.time(0, run.u.size) - float(self.begin[i])
 
     def fading(self, i: int, times: Sequence[float]) -> Array:
-        """Return decays with some time constants [s] from the start of a run's record."""
-        first = min(r.piece.start_time for r in self.runs if r.record == self.runs[i].record)
+        """Return decays with some time constants [s] of a run; 1 until its record counts."""
         run = self.runs[i]
-        t = run.piece.time(0, run.u.size) - first
+        starts = [
+            r.piece.start_time + int(np.argmax(keep)) * self.m / r.piece.sample_rate
+            for r, keep in zip(self.runs, self.keep, strict=True)
+            if r.record == run.record and keep.any()
+        ]
+        t = np.maximum(run.piece.time(0, run.u.size) - min(starts, default=0.0), 0.0)
         return np.exp(-t / np.asarray(times, np.float64)[:, None])
 
     @property

@@ -17,9 +17,12 @@ from piezo_ident.effects.trials import with_number
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['Added', 'State']
+__all__ = ['CREEP', 'Added', 'State']
 
 Array = NDArray[np.float64]
+
+#: effect that goes on when the motion has ended
+CREEP = 'creep'
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,15 @@ class State:
         """Return the state with another H of a family."""
         theta = np.maximum(coefficients, law.lower)
         return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
+
+    def without(self, i: int) -> State:
+        """Return the state without an effect; what creeps on from before goes with creep."""
+        rest = replace(self, effects=self.effects[:i] + self.effects[i + 1 :])
+        return rest if any(a.name == CREEP for a in rest.effects) else rest.from_rest()
+
+    def from_rest(self) -> State:
+        """Return the state without what creeps on from before."""
+        return replace(self, fading=(), earlier=np.empty(0))
 
     def with_effect(self, added: Added) -> State:
         """Return the state with one more effect."""

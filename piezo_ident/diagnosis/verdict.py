@@ -133,7 +133,14 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         bent = selected.bent.contenders[:1] if selected.bent and i == 0 else ()
         contenders = (*this.contenders, *bent)
         # what the effects after it account for is held against none of them
-        rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0) + noise
+        rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0)
+        if selected.fitted.state.fading:
+            # all were fitted without what crept on from before
+            later = selected.taken[i + 1 :]
+            rest = min(
+                rest, sum(x.before.mean_square - x.contenders[0].mean_square for x in later)
+            )
+        rest += noise
         whole = (base if i == 0 else this.before).mean_square
         rivals = rivals_of(rows, contenders, rest, whole - rest, plays=plays)
         # of a G that changed none of the laws need be the cause

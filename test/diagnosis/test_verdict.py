@@ -46,7 +46,7 @@ def fitted(mean_square, shape=FLAT, parameters=3):
     return SimpleNamespace(
         errors=errors,
         mean_square=errors.sum() / (BLOCKS * SIZE),
-        state=SimpleNamespace(law=None),
+        state=SimpleNamespace(law=None, fading=()),
         parameters=(None,) * parameters,
     )
 
@@ -165,10 +165,11 @@ def test_standard_errors_pair_the_blocks():
 # -- the verdict -------------------------------------------------------------------------------
 
 
-def verdict(rows, taken, left, bent=None):
+def verdict(rows, taken, left, bent=None, fading=()):
     selected = SimpleNamespace(
         fitted=fitted(left * WHOLE), taken=taken, bent=bent, left_out=frozenset(), linear=()
     )
+    selected.fitted.state.fading = fading
     return judge(rows, fitted(WHOLE), selected, 0.0)
 
 
@@ -191,6 +192,13 @@ def test_what_a_later_effect_explains_is_held_against_no_candidate_of_the_first(
     assert verdict(rows, [first], 0.07).verdict == 'named'
     close = a_round(contender('creep', 0.06), contender('thermal_drift', 0.08))
     assert verdict(rows, [close], 0.06).group.names == ('creep', 'thermal_drift')
+
+
+@pytest.mark.parametrize(('fading', 'said'), [((), 'named'), ((0.1, 1.0), 'class')])
+def test_what_creeps_on_from_before_is_held_against_a_rival_and_creep_alike(rows, fading, said):
+    """Both were fitted without it; what the last fit gained, only creep did."""
+    this = a_round(contender('creep', 0.03), contender('thermal_drift', 0.035))
+    assert verdict(rows, [this], 0.001, fading=fading).verdict == said
 
 
 def test_what_explains_a_part_may_be_a_class_too(rows):
@@ -247,6 +255,7 @@ def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
     rows = SimpleNamespace(**(vars(rows) | {'passes': 9.0, 'kinds': kinds}))
     search._simulator = SimpleNamespace(rows=rows)
     search._noise, search._smallest, search._given, search._most = 0.0, 0.05, np.inf, 4
+    search._worth = 0.0
     search._candidates, search.retuned = [], lambda fitted: fitted
     best = contender('even_nonlinearity', 0.02)
     plays, wide, as_given = (
@@ -272,7 +281,8 @@ def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
 def test_what_is_needless_shows_when_the_rest_is_fitted_to_its_end(
     rows, monkeypatch, end, reached, dropped
 ):
-    added = SimpleNamespace(effect=SimpleNamespace(is_plausible=lambda _: True), values=({},))
+    effect = SimpleNamespace(is_plausible=lambda _: True)
+    added = SimpleNamespace(name='backlash', effect=effect, values=({},))
     state = State(None, np.zeros(1), effects=(added, added))
     whole = SimpleNamespace(**(vars(fitted(0.1 * WHOLE)) | {'state': state}), base=None)
     fits = iter([fitted(0.1005 * WHOLE), fitted(end * WHOLE)])
