@@ -21,9 +21,10 @@ import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.base_refit import effects_beside, refits, with_refit
+from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.found_effects import found_effects
-from piezo_ident.diagnosis.joint_fit import Fitted
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.messages import (
     left_over,
     part_judged,
@@ -205,6 +206,8 @@ def _diagnosed(
     # a sensor may have been set to zero again since: an offset of each record is no error
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
+    as_given = fit_jointly(simulator, given, base_at(simulator, given))
+    given = with_earlier_motion(simulator, as_given).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
     # 3. lines and noise of what it leaves

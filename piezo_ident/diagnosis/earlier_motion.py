@@ -11,14 +11,14 @@ a few numbers of each record, in which the prediction is linear.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 
@@ -34,14 +34,15 @@ def with_earlier_motion(
     """
     Return a fit in which creep goes on from before each record.
 
-    Without creep nothing does.  It must predict held-out blocks clearly better, and be no more
-    than earlier motion can leave.  `tick` is called between the steps of a fit.
+    Without creep, found or in the model, nothing does.  It must predict held-out blocks clearly
+    better, and be no more than earlier motion can leave.  `tick` is called between the steps of a
+    fit.
     """
     state = fitted.state
-    creeping = [added for added in state.effects if added.name == CREEP]
-    if state.fading or not creeping:
+    creep = _creep_of(simulator, state)
+    if state.fading or creep is None:
         return fitted
-    times = tuple(map(float, creeping[0].values[0]['time_constant']))
+    times = tuple(map(float, creep['time_constant']))
     none = np.zeros((len(simulator.rows.names), len(times)))
     try:
         fitted = _settled(simulator, state, tick)
@@ -50,17 +51,24 @@ def with_earlier_motion(
         # what cannot be fitted is not there
         return fitted
     is_better = crept.mean_square <= criteria.EARLIER_LEAVES**2 * fitted.mean_square
-    return crept if is_better and _is_possible(simulator.rows, crept.state) else fitted
+    return crept if is_better and _is_possible(simulator, crept.state) else fitted
 
 
-def _is_possible(rows: Rows, state: State) -> bool:
+def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any] | None:
+    """Return the parameters of creep in a state or else in its model."""
+    found = [added.values[0] for added in state.effects if added.name == CREEP]
+    found += [x.parameters for x in simulator.model.effects if x.name == CREEP]
+    return found[0] if found else None
+
+
+def _is_possible(simulator: Simulator, state: State) -> bool:
     """
     Return whether creep can have left as much as a record begins with.
 
     Each element has followed voltages of the range.  A record that begins at the lowest one sinks
     at first; a drift may rise, and by more.
     """
-    (values,) = (added.values[0] for added in state.effects if added.name == CREEP)
+    rows, values = simulator.rows, _creep_of(simulator, state) or {}
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
     gain, doubt = (
         float(gains[times > AT_ONCE].sum()),

@@ -106,7 +106,7 @@ class State:
     def without(self, i: int) -> State:
         """Return the state without an effect; what creeps on from before goes with creep."""
         rest = replace(self, effects=self.effects[:i] + self.effects[i + 1 :])
-        return rest if any(a.name == CREEP for a in rest.effects) else rest.from_rest()
+        return rest.from_rest() if self.effects[i].name == CREEP else rest
 
     def from_rest(self) -> State:
         """Return the state without what creeps on from before."""

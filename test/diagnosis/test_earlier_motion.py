@@ -72,6 +72,12 @@ def test_creep_is_found_as_if_the_stage_had_rested(found):
     assert unseen(found.model) < 0.03 < 0.1 * unseen(slow_model())
 
 
+def test_a_model_that_creeps_lacks_nothing(moved):
+    result = diagnose(refined_model(), moved)
+    assert (result.verdict, result.effects) == ('none', ()) and result.before.overall < 0.01
+    assert any(STILL in w for w in result.warnings)
+
+
 def test_a_sensor_set_to_zero_since_makes_no_difference(moved, found):
     (piece,) = moved.pieces
     again = diagnose(slow_model(), Record((replace(piece, y=piece.y + 30e-6),), 'zero'))
