@@ -63,6 +63,8 @@ def _dragged(
             for i in range(tether.size):
                 along, across = end - start, bow[i] * (end - start) * (end + start)
                 way = math.sqrt(along * along + across * across)
+                if way == 0.0:
+                    continue
                 along, across = along / way, across / way
                 # from the moment to the field, on the way and to its left
                 dx, dy = start - x[i], bow[i] * start * start - y[i]
