@@ -21,11 +21,9 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
+from piezo_ident.effects.creep import AT_ONCE
 
 __all__ = ['with_earlier_motion']
-
-#: elements that are faster may make up for dynamics [s]
-AT_ONCE = 0.05
 
 
 def with_earlier_motion(
@@ -70,10 +68,9 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
     """
     rows, values = simulator.rows, _creep_of(simulator, state) or {}
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
-    gain, doubt = (
-        float(gains[times > AT_ONCE].sum()),
-        np.sqrt(rows.square(criteria.SMALLEST_EFFECT)),
-    )
+    # faster elements make up for dynamics
+    gain = float(gains[times > AT_ONCE].sum())
+    doubt = np.sqrt(rows.square(criteria.SMALLEST_EFFECT))
     starts = {k: run.u[0] for run, k in reversed([*zip(rows.runs, rows.record, strict=True)])}
     ends = gain * (np.array(rows.reach) - np.array([[starts[k]] for k in sorted(starts)]))
     left = state.earlier.sum(axis=1)
