@@ -18,7 +18,12 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.cross_validation import (
+    held_out_errors,
+    normal_equations,
+    with_columns,
+)
+from piezo_ident.diagnosis.joint_fit import base_at, cost_of_decays, fit_jointly, Fitted
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
@@ -42,14 +47,27 @@ def with_earlier_motion(
         return fitted
     times = tuple(map(float, creep['time_constant']))
     none = np.zeros((len(simulator.rows.names), len(times)))
+    start = replace(state, fading=times, earlier=none)
+    if not _may_help(simulator, fitted, start):
+        return fitted
     try:
         fitted = _settled(simulator, state, tick)
-        crept = _settled(simulator, replace(state, fading=times, earlier=none), tick)
+        crept = _settled(simulator, start, tick)
     except IdentificationError:
         # what cannot be fitted is not there
         return fitted
     is_better = crept.mean_square <= criteria.EARLIER_LEAVES**2 * fitted.mean_square
     return crept if is_better and _is_possible(simulator, crept.state) else fitted
+
+
+def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
+    """Return whether a first step towards decays gains half of what they must gain."""
+    rows, E, M = simulator.rows, fitted.e[:, None], fitted.J
+    C = simulator.added_columns(start)[:, start.offsets.size :]
+    both = with_columns(rows, normal_equations(rows, M, E), M, C, E)
+    prior = np.append(fitted.prior[fitted.free], np.full(C.shape[1], cost_of_decays(rows)))
+    left = float(held_out_errors(both, rows.fold, prior).sum())
+    return left <= 0.5 * (1.0 + criteria.EARLIER_LEAVES**2) * float(fitted.errors.sum())
 
 
 def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any] | None:

@@ -35,6 +35,7 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 __all__ = [
     'Fitted',
     'base_at',
+    'cost_of_decays',
     'fit_base',
     'fit_jointly',
 ]
@@ -133,7 +134,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
-    prior[_places_of_decays(state)] = _cost_of_decays(rows)
+    prior[_places_of_decays(state)] = cost_of_decays(rows)
     step = FitStep(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return state.with_only_added(theta[m:]).with_coefficients(law, theta[:m]), base
@@ -280,7 +281,7 @@ def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     plays = 0 if state.law is None else state.law.thresholds.size
     spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
     prior[: spread.size] = float(e @ e) / count / spread**2
-    prior[_places_of_decays(state)] = _cost_of_decays(rows)
+    prior[_places_of_decays(state)] = cost_of_decays(rows)
     return prior
 
 
@@ -290,7 +291,8 @@ def _places_of_decays(state: State) -> slice:
     return slice(first, first + state.earlier.size)
 
 
-def _cost_of_decays(rows: Rows) -> float:
+def cost_of_decays(rows: Rows) -> float:
+    """Return the weight of the pull of what creeps on from before towards zero."""
     return rows.n * EARLIER_COST**2
 
 
@@ -299,8 +301,8 @@ def _with_decays(rows: Rows, state: State, p: int, pull: Pull | None) -> Pull | 
     if not state.fading:
         return pull
     size, b = state.earlier.ravel(), np.zeros(p)
-    b[_places_of_decays(state)] = -_cost_of_decays(rows) * size
-    s = _cost_of_decays(rows) * float(size @ size)
+    b[_places_of_decays(state)] = -cost_of_decays(rows) * size
+    s = cost_of_decays(rows) * float(size @ size)
     if pull is None:
         return Pull(np.zeros((p, p)), b, s)
     return Pull(pull.A, pull.b + b, pull.s + s)
