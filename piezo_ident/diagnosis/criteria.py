@@ -40,7 +40,7 @@ WEIGHT_SPREAD = 0.1
 WIDE_SPREAD = 1.0
 #: what creeps on from before a record costs a fit as much as an error of so much of it, and the
 #: share of the rms error of held-out blocks that may be left with it
-EARLIER_COST, EARLIER_LEAVES = 0.003, 0.8
+EARLIER_COST, EARLIER_LEAVES = 0.003, 0.5
 #: share of the model's voltage range that data must cover for a refitted H to hold in all of it
 COVERED = 0.95
 #: share of the voltage range below which the command is at rest but for noise
