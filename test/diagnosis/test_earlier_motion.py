@@ -95,6 +95,16 @@ def test_a_drift_that_no_creep_leaves_is_a_drift():
     assert unseen(result.model) < 0.03
 
 
+def test_decays_count_from_where_the_record_does(moved):
+    """Of a record that starts anywhere they would be of any size by then."""
+    (piece,) = moved.pieces
+    rows = make_rows(slow_model(), [Record((piece.cut(round(4.2 * SLOW), piece.n),), 'cut')])
+    assert not rows.keep[0][0]
+    decay = rows.of([rows.fading(0, (0.02,))[0]])
+    assert decay[0] > 0.9 and np.all(np.diff(decay) <= 0.0)
+    assert rows.fading(0, (0.02,)).max() == 1.0
+
+
 def test_creep_takes_with_it_what_creeps_on():
     state = State(slow_model().hysteresis, np.zeros(2), (Added('creep', (CREEP,)),))
     state = replace(state, fading=(0.1, 1.0), earlier=np.ones((2, 2)))
