@@ -93,9 +93,10 @@ def _selected(
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
     known = found.fitted.state
     start = replace(given, effects=known.effects, fading=known.fading, earlier=known.earlier)
+    start = replace(start, retuning=(0.0,) * len(RETUNING))
     as_given = fit_jointly(
         simulator,
-        replace(start, retuning=(0.0,) * len(RETUNING)),
+        start,
         base_at(simulator, start),
         # whether it leaves little shows before the end
         enough=criteria.OF_LEAST * simulator.rows.square(criteria.SMALLEST_EFFECT),

@@ -40,7 +40,7 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, means
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
@@ -206,8 +206,9 @@ def _diagnosed(
     # a sensor may have been set to zero again since: an offset of each record is no error
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
-    as_given = fit_jointly(simulator, given, base_at(simulator, given))
-    given = with_earlier_motion(simulator, as_given).state
+    if any(setting.name == CREEP for setting in model.effects):
+        as_given = fit_jointly(simulator, given, base_at(simulator, given))
+        given = with_earlier_motion(simulator, as_given).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
     # 3. lines and noise of what it leaves

@@ -24,6 +24,7 @@ from piezo_ident.diagnosis.cross_validation import (
     with_columns,
 )
 from piezo_ident.diagnosis.joint_fit import base_at, cost_of_decays, fit_jointly, Fitted
+from piezo_ident.diagnosis.polishing import with_fresh_columns
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
@@ -43,7 +44,7 @@ def with_earlier_motion(
     """
     state = fitted.state
     creep = _creep_of(simulator, state)
-    if state.fading or creep is None:
+    if state.fading or not creep:
         return fitted
     times = tuple(map(float, creep['time_constant']))
     none = np.zeros((len(simulator.rows.names), len(times)))
@@ -70,11 +71,11 @@ def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
     return left <= 0.5 * (1.0 + criteria.EARLIER_LEAVES**2) * float(fitted.errors.sum())
 
 
-def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any] | None:
-    """Return the parameters of creep in a state or else in its model."""
+def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any]:
+    """Return the parameters of creep in a state or else in its model; nothing without creep."""
     found = [added.values[0] for added in state.effects if added.name == CREEP]
     found += [x.parameters for x in simulator.model.effects if x.name == CREEP]
-    return found[0] if found else None
+    return found[0] if found else {}
 
 
 def _is_possible(simulator: Simulator, state: State) -> bool:
@@ -84,7 +85,7 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
     Each element has followed voltages of the range.  A record that begins at the lowest one sinks
     at first; a drift may rise, and by more.
     """
-    rows, values = simulator.rows, _creep_of(simulator, state) or {}
+    rows, values = simulator.rows, _creep_of(simulator, state)
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
     # faster elements make up for dynamics
     gain = float(gains[times > AT_ONCE].sum())
@@ -96,12 +97,6 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
 
 
 def _settled(simulator: Simulator, state: State, tick: Callable[[], None]) -> Fitted:
-    """Return a fit with fresh columns, as long as that gains."""
+    """Return a fit to its end."""
     fitted = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-    for _ in range(criteria.POLISHING):
-        state = fitted.state
-        again = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-        if again.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
-            break
-        fitted = again
-    return fitted
+    return with_fresh_columns(simulator, fitted, tick)

@@ -28,7 +28,7 @@ def found_effects(
         return ()
     std = _standard_deviations(rows, last)
     ends = [this.contenders[0].mean_square for this in selected.taken[:-1]]
-    starts = list(ends)
+    starts = ends
     if last.state.fading:
         # what crept on from before is no gain of an effect that was added after it
         starts = [this.before.mean_square for this in selected.taken[1:]]

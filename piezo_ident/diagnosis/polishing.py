@@ -17,7 +17,7 @@ from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
-__all__ = ['good_enough', 'least_gain', 'polished', 'without_needless']
+__all__ = ['good_enough', 'least_gain', 'polished', 'with_fresh_columns', 'without_needless']
 
 
 def least_gain(rows: Rows, noise: float) -> float:
@@ -86,9 +86,16 @@ def polished(
                 fitted = fresh
     if fitted.mean_square < done:
         return fitted
+    return with_fresh_columns(simulator, fitted, tick, enough=least)
+
+
+def with_fresh_columns(
+    simulator: Simulator, fitted: Fitted, tick: Callable[[], None], *, enough: float = 0.0
+) -> Fitted:
+    """Fit again with the columns of H in the state reached, as long as that gains."""
     for _ in range(criteria.POLISHING):
         state = fitted.state
-        fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=least, tick=tick)
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=enough, tick=tick)
         if fresh.mean_square > (1.0 - criteria.POLISH) * fitted.mean_square:
             break
         fitted = fresh
