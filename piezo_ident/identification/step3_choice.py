@@ -29,7 +29,7 @@ from piezo_ident.identification.step3_hysteresis import (
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
 __all__ = [
     'PAPER_COUNT',
@@ -213,7 +213,6 @@ def choose_law(
     excerpts: Sequence[Excerpt],
     dynamics: Dynamics,
     delay: Delay,
-    laws: Sequence[LawName] = LAWS,
     tick: Callable[[float], None] = lambda share: None,
     others: Sequence[Excerpt] = (),
 ) -> Choice:
@@ -225,8 +224,6 @@ def choose_law(
     excerpts : sequence of Excerpt
     dynamics, delay
         As in `piezo_ident.identification.step3_hysteresis.factorise`.
-    laws : sequence of str, optional
-        Those to choose from, plays first.
     tick : callable, optional
         Called with the share of the work done; may raise to stop it.
     others : sequence of Excerpt, optional
@@ -237,8 +234,8 @@ def choose_law(
     high = max(float(e.u[e.use].max()) for e in excerpts)
     swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
     r = even_thresholds(swing, FINE)
-    law_of = {name: HysteresisLaw(name, r, (low, high)) for name in laws}
-    all_terms = HysteresisLaw('any' if 'duhem' in laws else 'static', r, (low, high))
+    law_of = {name: HysteresisLaw(name, r, (low, high)) for name in LAWS}
+    all_terms = HysteresisLaw('any', r, (low, high))
     parts = _parts(excerpts, all_terms, dynamics, delay)
     tick(0.3)
     whole = triangular_factor(parts, parts[0].shape[1])
@@ -256,12 +253,12 @@ def choose_law(
         found = [fitted(_but(parts, j), law).coefficients for j in range(len(parts))]
         both = zip(parts, found, strict=True)
         losses[name] = np.array([_left_out(R, x, law, all_terms) for R, x in both])
-        tick(0.3 + 0.7 * (i + 1) / len(laws))
+        tick(0.3 + 0.7 * (i + 1) / len(LAWS))
     logs = {name: 0.5 * np.log(loss) for name, loss in losses.items()}
     errors = {name: float(np.exp(log.mean())) for name, log in logs.items()}
     better = [
         name
-        for name in laws[1:]
+        for name in LAWS[1:]
         if _upper(logs[name] - logs['plays']) < np.log(1.0 - WORTH)
         and fitted(whole, law_of[name]).hysteresis.lowest_slope() > 0
     ]
@@ -339,7 +336,7 @@ def third_step(
     settings: Settings,
     progress: Progress,
     whole: Sequence[Excerpt] | None = None,
-    laws: Sequence[LawName] = LAWS,
+    plays: bool = False,
     others: Sequence[Excerpt] = (),
 ) -> HysteresisFit:
     """
@@ -351,8 +348,8 @@ def third_step(
         The same runs in the same order with the fitted and the held-out samples.
     whole : sequence of Excerpt, optional
         What the weights are fitted to in the end; `fit` when absent.
-    laws : sequence of str, optional
-        What H may be.
+    plays : bool, optional
+        Whether H has to be a sum of plays.
     others : sequence of Excerpt, optional
         Small motion, which can speak against a wider law.
     """
@@ -360,9 +357,9 @@ def third_step(
     fitted = whole or fit
     swing = max(float(np.ptp(e.u[e.use])) for e in fitted)
     choice = Choice(None)
-    if settings.thresholds is None and settings.solver == 'least_squares':
+    if settings.thresholds is None and settings.solver == 'least_squares' and not plays:
         choice = choose_law(
-            fitted, G, delay, laws, lambda share: progress('hysteresis', 0.2 * share), others
+            fitted, G, delay, lambda share: progress('hysteresis', 0.2 * share), others
         )
     law: HysteresisLaw | NDArray[np.float64]
     if choice.law is not None:

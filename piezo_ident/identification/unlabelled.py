@@ -357,9 +357,7 @@ def _again(
     """Return the same law fitted to more data, which may carry more plays."""
     if fit.law != 'plays':
         return fit_again(fit, excerpts, G, delay)
-    found = third_step(
-        *_divided(excerpts, rate), G, delay, settings, silent, excerpts, laws=('plays',)
-    )
+    found = third_step(*_divided(excerpts, rate), G, delay, settings, silent, excerpts, plays=True)
     return replace(found, errors_of_laws=fit.errors_of_laws)
 
 

@@ -9,8 +9,7 @@ Families of H that are linear in their coefficients, for given thresholds.
     bias       square, and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
     preisach   square, and hat_j(r_i) times Bernstein polynomials in F_i as densities
     duhem      preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates
-    static     the terms of all but duhem, from which theirs can be taken
-    any        all of these terms
+    any        all of these terms, from which those of each can be taken
 
 hat_j are piecewise linear functions of the threshold on a few even nodes.  All but lags and powers
 of v have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  `preisach` is a
@@ -37,7 +36,7 @@ from scipy.optimize import lsq_linear
 
 __all__ = ['LAWS', 'HysteresisLaw', 'LawName']
 
-LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'static', 'any']
+LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'any']
 #: those that a stage may have, from the narrowest to the widest
 LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach', 'duhem')
 #: nodes of the hats over the threshold, and degree of the density in the place of a play
@@ -53,7 +52,7 @@ class HysteresisLaw:
 
     Parameters
     ----------
-    name : {'plays', 'square', 'bias', 'preisach', 'duhem', 'static', 'any'}
+    name : {'plays', 'square', 'bias', 'preisach', 'duhem', 'any'}
     thresholds : array_like, shape (m,)
         Ascending, above zero, normalised.
     span : tuple of float, optional
@@ -78,7 +77,7 @@ class HysteresisLaw:
     span: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if self.name not in (*LAWS, 'static', 'any'):
+        if self.name not in (*LAWS, 'any'):
             raise ModelError(f'hysteresis: unknown law {self.name!r}; known are {", ".join(LAWS)}')
         object.__setattr__(self, 'thresholds', frozen_array(self.thresholds))
 
@@ -115,12 +114,12 @@ class HysteresisLaw:
         plays[:, 0] = np.eye(m)
         more: list[NDArray[np.float64]] = []
         low, high = self.span
-        for hat in self._hats() if self.name in ('bias', 'static', 'any') else ():
+        for hat in self._hats() if self.name in ('bias', 'any') else ():
             for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
                 part = np.zeros((POWERS + 2, m))
                 part[0], part[-1] = q * hat, kappa * hat
                 more.append(part)
-        for hat in self._hats() if self.name in ('preisach', 'duhem', 'static', 'any') else ():
+        for hat in self._hats() if self.name in ('preisach', 'duhem', 'any') else ():
             width = np.maximum(high - low - self.thresholds, 0.0)
             for density in _bernstein():
                 part = np.zeros((POWERS + 2, m))
@@ -173,8 +172,8 @@ class HysteresisLaw:
             float(p1),
             float(p2),
             float(p0),
-            curves=plays[1:-1].T if self.name in ('preisach', 'duhem', 'static', 'any') else None,
-            bias=plays[-1] if self.name in ('bias', 'static', 'any') else None,
+            curves=plays[1:-1].T if self.name in ('preisach', 'duhem', 'any') else None,
+            bias=plays[-1] if self.name in ('bias', 'any') else None,
             span=self.span,
             relaxations=lags,
         )
@@ -256,7 +255,7 @@ class HysteresisLaw:
         m, n = self.thresholds.size, wider.densities
         middle = n - NODES * (DEGREE + 1)
         inner = {'bias': (m, middle), 'preisach': (middle, n), 'duhem': (middle, n)}
-        start, stop = inner.get(self.name, (m, n if self.name in ('any', 'static') else m))
+        start, stop = inner.get(self.name, (m, n if self.name == 'any' else m))
         powers = range(wider.size - (2 if self.name == 'plays' else 3), wider.size)
         lags = range(n, n + self.lags)
         return np.array([*range(m), *range(start, stop), *lags, *powers])
