@@ -184,8 +184,8 @@ class ForwardSelection:
         for name in self._certain:
             this = self._round(fitted, [e for e in self._candidates if e.name == name])
             # what one leaves by its form is no line of its own
-            form = (1.0 - criteria.LAW_FITS) * max(map(self._gain, shown), default=0.0)
-            if this.contenders and (not shown or self._gain(this) > max(form, self._indistinct)):
+            form = (1.0 - criteria.LAW_FITS) * max((one.gain for one in shown), default=0.0)
+            if this.contenders and (not shown or this.gain > max(form, self._indistinct)):
                 shown.append(this)
                 fitted = this.contenders[0]
         return shown, fitted
@@ -311,10 +311,6 @@ class ForwardSelection:
         """Mean square of a difference that means nothing."""
         return self._simulator.rows.square(criteria.INDISTINCT)
 
-    @staticmethod
-    def _gain(this: Round) -> float:
-        return this.before.mean_square - this.contenders[0].mean_square
-
     def _beyond_noise(self, fitted: Fitted) -> float:
         return max(fitted.mean_square - self._noise, 0.0)
 
@@ -353,7 +349,7 @@ class ForwardSelection:
         while self._takes(this, explainable, first=len(taken) == len(shown)):
             taken.append(this)
             # it stays worth most of what it was taken for, where that is little
-            self._worth = min(self._worth, criteria.TOGETHER * self._gain(this))
+            self._worth = min(self._worth, criteria.TOGETHER * this.gain)
             fitted, dropped = without_needless(
                 self._simulator, this.contenders[0], self._worth, len(shown)
             )

@@ -65,7 +65,12 @@ class Round:
     contenders: tuple[Fitted, ...]
     chance: dict[str, float]
     visible: dict[str, float]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
+
+    @property
+    def gain(self) -> float:
+        """Mean square that the best contender gains."""
+        return self.before.mean_square - self.contenders[0].mean_square
 
 
 def search_round(
@@ -307,7 +312,7 @@ def stands_out(rows: Rows, this: Round) -> bool:
         return False
     others = [gain for name, gain in gains_of(rows, this).items() if name != best.name]
     most = max(others, default=0.0)
-    return before.mean_square - best.mean_square >= criteria.STANDS_OUT * most
+    return this.gain >= criteria.STANDS_OUT * most
 
 
 def gains_of(rows: Rows, this: Round) -> dict[str, float]:

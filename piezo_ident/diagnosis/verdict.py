@@ -136,10 +136,7 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         rest = max(this.contenders[0].mean_square - selected.fitted.mean_square, 0.0)
         if selected.fitted.state.fading:
             # all were fitted without what crept on from before
-            later = selected.taken[i + 1 :]
-            rest = min(
-                rest, sum(x.before.mean_square - x.contenders[0].mean_square for x in later)
-            )
+            rest = min(rest, sum(later.gain for later in selected.taken[i + 1 :]))
         rest += noise
         whole = (base if i == 0 else this.before).mean_square
         rivals = rivals_of(rows, contenders, rest, whole - rest, plays=plays)

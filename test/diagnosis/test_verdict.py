@@ -56,7 +56,9 @@ def contender(name, share_left, **kwargs):
 
 
 def a_round(*contenders, before=WHOLE):
-    return SimpleNamespace(before=fitted(before), contenders=contenders, chance={}, best={})
+    start, best = fitted(before), contenders[0]
+    gain = start.mean_square - best.mean_square
+    return SimpleNamespace(before=start, contenders=contenders, gain=gain, chance={}, best={})
 
 
 def rivals(rows, *contenders, plays=True):
