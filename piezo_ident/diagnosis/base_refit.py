@@ -46,8 +46,7 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
     """
     if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
-    plays, wide = (_refit(simulator, given, name) for name in ('plays', LAWS[-1]))
-    return plays, wide
+    return _refit(simulator, given, 'plays'), _refit(simulator, given, LAWS[-1])
 
 
 def base_thresholds(swing: float) -> NDArray[np.float64]:

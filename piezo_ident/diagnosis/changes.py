@@ -67,7 +67,7 @@ class Behind:
         *,
         new: bool = False,
     ) -> None:
-        self._rests, self._blocks, self._m, self._new = rests, blocks, m, new
+        self._rests, self._blocks, self._m = rests, blocks, m
         self._n = n = blocks[0].x.size // m * m
         group = group_of(m) * m
         step = max(1, STRETCH // group) * group

@@ -86,11 +86,11 @@ class ForwardSelection:
         settings: DiagnosisSettings,
         progress: Progress,
         *,
-        certain: Sequence[str] = (),
-        smallest: float = criteria.SMALLEST_EFFECT,
-        missed: float = 0.0,
-        misfit: float = 0.0,
-        given: float = np.inf,
+        certain: Sequence[str],
+        smallest: float,
+        missed: float,
+        misfit: float,
+        given: float,
     ) -> None:
         self._simulator = simulator
         self._lines, self._noise, self._certain, self._given = lines, noise, certain, given
@@ -200,12 +200,10 @@ class ForwardSelection:
         if linear is None:
             return self._from(retuned, self._round(retuned), shown)
         # a linear change is the larger part: is it the whole of it?
-        bent = None
         is_linear = self._takes(linear, self._explainable(base), first=True)
-        if not is_linear or self._left(linear) > self._least:
-            bent = self._round(retuned)
-        if bent is None:
+        if is_linear and self._left(linear) <= self._least:
             return self._from(base, linear, shown)
+        bent = self._round(retuned)
         is_bent = self._takes(bent, self._explainable(bent.before), first=True)
         if not is_linear or (is_bent and self._left(bent) < criteria.BENT * self._left(linear)):
             return self._from(retuned, bent, shown)

@@ -281,8 +281,6 @@ def takes(
     `explainable` what there was to be explained before anything was added, `smallest` the least
     size [% of stroke].
     """
-    if not this.contenders:
-        return False
     best = this.contenders[0]
     # nothing is gained below the noise
     gain, left = before - max(best.mean_square, noise), max(before - noise, 1e-300)
