@@ -236,34 +236,29 @@ class _Search:
 
     def sine(self, frequency: float, record: str, best: int) -> tuple[float, float]:
         """Return amplitude and phase of A sin(2 pi f t + phase)."""
-        a, _ = self._fit(frequency, record, best, least=FAINT)
+        a, _ = self._fit(frequency, record, best)
         return float(abs(a)), float(np.angle(1j * a))
 
     def is_steady(self, frequency: float, best: int) -> bool:
         """Return whether both halves of the stretches see the same sine; a transient does not."""
         for name in self.records:
-            whole, information = self._fit(frequency, name, best, least=FAINT)
+            whole, information = self._fit(frequency, name, best)
             if abs(whole) ** 2 * information < 12.0:
                 continue
             for half in (0, 1):
-                a, own = self._fit(frequency, name, best, half, least=FAINT)
+                a, own = self._fit(frequency, name, best, half)
                 spread = 3.0 / np.sqrt(max(own, 1e-300))
                 if abs(a - whole) > (1.0 - STEADY) * abs(whole) + spread:
                     return False
         return True
 
     def _fit(
-        self,
-        frequency: float,
-        record: str,
-        k: int,
-        half: int | None = None,
-        least: float = 0.0,
+        self, frequency: float, record: str, k: int, half: int | None = None
     ) -> tuple[complex, float]:
         """
         Return the best common amplitude of a record's stretches, and the information on it.
 
-        The noise is that at index k; stretches with less than the `least` gain do not count.
+        The noise is that at index k; stretches with a faint gain do not count.
         """
         top, bottom = 0j, 0.0
         for spectrum in self._spectra:
@@ -276,7 +271,7 @@ class _Search:
             t = s.t + ((part.start or 0) + np.arange(x.size)) / s.rate
             z = complex(np.sum(x * np.exp(-2j * np.pi * frequency * t)))
             gain = complex(s.gain(np.array(frequency)))
-            if abs(gain) < least:
+            if abs(gain) < FAINT:
                 continue
             response = gain * 0.5 * float(s.window[part].sum())
             top += np.conj(response) * z / spectrum.noise[k]
