@@ -51,15 +51,12 @@ class ChannelTest:
     channel : str
     significant : bool
         A channel without a bearing on the residual is so in one of 100,000 cases.
-    rms : float
-        Of what it adds [m].
     added : tuple of ndarray or None
         What it adds to the residual of each part [m]; empty when it was not tested.
     """
 
     channel: str
     significant: bool = False
-    rms: float = 0.0
     added: tuple[Array | None, ...] = field(default=(), repr=False, compare=False)
 
 
@@ -180,11 +177,9 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     kept = _held_out(E, P) / max(float(np.sum((P.T @ E) ** 2)), 1e-300)
     coefficients = made @ (P.T @ E)
     of_part = {id(p): p.channel @ coefficients for p in found}
-    added = np.concatenate([_centred(of_part[id(p)][p.use]) for p in found])
     return ChannelTest(
         channel=name,
         significant=chance < SIGNIFICANT and gain > bound and kept > KEPT,
-        rms=float(np.sqrt(np.mean(added**2))),
         added=tuple(
             None if p is None or id(p) not in of_part else _at_all(part, of_part[id(p)])
             for part, p in zip(parts, every, strict=True)

@@ -53,16 +53,14 @@ class FaultSearch:
     Faults found.
 
     `bad` are for each part the samples that are missed, outliers or clipped, `out` the clipped
-    and those of a sensor that hangs among them, which no bridge can replace; `jitter` is the rms
-    of the sampling instants [s] and `quantum` the step of the readings [m], each 0 when there is
-    none.
+    and those of a sensor that hangs among them, which no bridge can replace; `quantum` is the step
+    of the readings [m], 0 when there is none.
     """
 
     faults: tuple[Fault, ...]
     bad: tuple[Mask, ...]
     out: tuple[Mask, ...]
-    jitter: float = 0.0
-    quantum: float = 0.0
+    quantum: float
 
     def left_out(self, share: float) -> list[Mask | None]:
         """Return for each part the samples to leave out: `out`, and all bad ones up to a share."""
@@ -78,14 +76,14 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     faults: list[Fault] = []
     bad: list[Mask] = []
     out: list[Mask] = []
-    largest_jitter = largest_quantum = 0.0
+    quantum = 0.0
     strokes = strokes_of(parts)
     for part in parts:
         stroke = strokes[part.record]
         missed = clipped = outliers = stuck = np.zeros(part.piece.n, dtype=bool)
         if part.piece.n >= 100 and stroke > 0.0:
             noise = _noise_of(part)
-            largest_quantum = max(largest_quantum, noise.quantum)
+            quantum = max(quantum, noise.quantum)
             clipped = _clipped(part, noise)
             stuck = _stuck(part, noise, stroke) & ~clipped
             missed = _missed(part, noise, stuck) | stuck
@@ -98,13 +96,12 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             if jitter > 0.0 and outliers.any():
                 # most of them may be readings at the wrong moment
                 outliers = _outliers(part, noise, wide | clipped, jitter)
-            largest_jitter = max(largest_jitter, jitter)
             faults += _masked(part, missed, outliers, clipped, stuck)
             faults += _of_all(part, stroke, noise, jitter, growth)
             faults += _knocks(part, stroke, noise, missed | outliers | clipped)
         bad.append(missed | outliers | clipped)
         out.append(clipped | stuck)
-    return FaultSearch(tuple(faults), tuple(bad), tuple(out), largest_jitter, largest_quantum)
+    return FaultSearch(tuple(faults), tuple(bad), tuple(out), quantum)
 
 
 def _masked(
