@@ -41,18 +41,12 @@ class LineResponse:
 
     lines: NDArray[np.intp]
     samples: int
-    rate: float
     g: NDArray[np.complex128]
 
     @property
     def z(self) -> NDArray[np.complex128]:
         """The lines on the unit circle."""
         return np.asarray(np.exp(2j * np.pi * self.lines / self.samples))
-
-    @property
-    def frequency(self) -> NDArray[np.float64]:
-        """The lines in Hz."""
-        return np.asarray(self.lines * (self.rate / self.samples))
 
 
 def excited_lines(records: Sequence[PeriodicRecord]) -> NDArray[np.intp]:
@@ -64,11 +58,7 @@ def excited_lines(records: Sequence[PeriodicRecord]) -> NDArray[np.intp]:
 
 
 def frequency_response(
-    records: Sequence[PeriodicRecord],
-    *,
-    lines: NDArray[np.intp] | None = None,
-    half_width: int = 4,
-    degree: int = 2,
+    records: Sequence[PeriodicRecord], *, half_width: int = 4, degree: int = 2
 ) -> LineResponse:
     """
     Fit the response at each excited line by a local polynomial over its neighbours.
@@ -77,8 +67,6 @@ def frequency_response(
     ----------
     records : sequence of PeriodicRecord
         Of one rate and one number of samples.
-    lines : ndarray of int, optional
-        The lines; otherwise those that are excited.
     half_width : int
         Neighbours on either side.
     degree : int
@@ -87,7 +75,7 @@ def frequency_response(
     shapes = {(r.u.shape[1:], r.y.shape[1:], r.rate) for r in records}
     if len(shapes) != 1:
         raise DataError(f'the records differ in samples, channels or rate: {sorted(shapes)}')
-    lines = excited_lines(records) if lines is None else lines
+    lines = excited_lines(records)
     u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
     y = np.array([np.fft.rfft(r.mean_y, axis=0)[lines] for r in records])
     inputs, outputs = u.shape[2], y.shape[2]
@@ -106,5 +94,4 @@ def frequency_response(
         columns = (u[:, near, None, :] * powers[None, :, :, None]).reshape(-1, unknown)
         solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
         g[i] = solution[:inputs].T
-    (shape,) = shapes
-    return LineResponse(lines, shape[0][0], shape[2], g)
+    return LineResponse(lines, len(records[0].mean_u), g)

@@ -69,20 +69,12 @@ def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Mo
     return model
 
 
-def linear_error(
-    model: Modal, record: PeriodicRecord, lines: NDArray[np.intp] | None = None
-) -> float:
-    """
-    Return 100 rms(y - yhat) / rms(y) of a linear model over the last period, in steady state.
-
-    `lines` keeps the model to those lines; otherwise it answers whatever the voltages hold.
-    """
+def linear_error(model: Modal, record: PeriodicRecord) -> float:
+    """Return 100 rms(y - yhat) / rms(y) of a linear model over the last period, settled."""
     samples = record.u.shape[1]
-    lines = np.arange(samples // 2 + 1) if lines is None else lines
     u, y = (np.fft.rfft(x[-1], axis=0) for x in (record.u, record.y))
-    answer = np.zeros_like(y)
-    response = model.response(np.exp(2j * np.pi * lines / samples))
-    answer[lines] = np.einsum('kpm,km->kp', response, u[lines])
+    response = model.response(np.exp(2j * np.pi * np.arange(len(u)) / samples))
+    answer = np.einsum('kpm,km->kp', response, u)
     answer[0] = 0
     error = np.fft.irfft(y - answer, samples, axis=0)
     return 100 * float(np.linalg.norm(error) / np.linalg.norm(record.y[-1]))

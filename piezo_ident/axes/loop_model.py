@@ -113,22 +113,14 @@ class LoopModel:
         levels = (self.range[0], 1.0, self.range[1]) if self.levels else (1.0,)
         return max(float(np.abs(np.linalg.eigvals(self.a_at(s))).max()) for s in levels)
 
-    def simulate(
-        self, u: NDArray[np.float64], *, periodic: bool = True, warm_up: int | None = None
-    ) -> NDArray[np.float64]:
+    def simulate(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """
-        Return the displacements under voltages u, shape (samples, inputs), in free run.
+        Return the displacements under one period of voltages, in free run and about their mean.
 
-        Parameters
-        ----------
-        periodic : bool
-            Whether u is one period: it is then run through once, or for `warm_up` samples,
-            before, and the mean of the displacements is taken off.  Otherwise the stage rests.
+        The period, shape (samples, inputs), is run through once before.
         """
-        u = np.asarray(u, dtype=float)
-        before = (len(u) if warm_up is None else warm_up) if periodic else 0
-        y = self.run(np.concatenate([u[len(u) - before :], u])).y[before:]
-        return y - y.mean(axis=0) if periodic else y
+        y = self.run(np.concatenate([u, u])).y[len(u) :]
+        return np.asarray(y - y.mean(axis=0))
 
     def run(self, u: NDArray[np.float64]) -> Passage:
         """Return what passes in the loop under voltages u from rest."""
