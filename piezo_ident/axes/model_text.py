@@ -16,6 +16,7 @@ from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.modal import Modal
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import load_yaml, write_text
+from piezo_ident.model.files import plain
 import yaml
 
 __all__ = ['AxesModel', 'axes_model_to_text']
@@ -108,7 +109,7 @@ def axes_model_to_text(held: AxesModel) -> str:
         'linear': {f.name: getattr(model.linear, f.name) for f in fields(Modal)},
         'loop': arrays,
     }
-    return yaml.safe_dump(_plain(data), sort_keys=False, default_flow_style=None, width=99)
+    return yaml.safe_dump(plain(data), sort_keys=False, default_flow_style=None, width=99)
 
 
 def _model_of(data: Mapping[str, Any], name: str) -> AxesModel:
@@ -145,12 +146,3 @@ def _model_of(data: Mapping[str, Any], name: str) -> AxesModel:
         raise ModelError(
             f'{name}: no model of several axes ({error!r}); see docs/two_axes.md'
         ) from None
-
-
-def _plain(x: Any) -> Any:
-    """Return arrays and tuples as lists, NumPy's numbers as Python's."""
-    if isinstance(x, Mapping):
-        return {key: _plain(value) for key, value in x.items()}
-    if isinstance(x, (np.ndarray, np.generic)):
-        return x.tolist()
-    return [*x] if isinstance(x, tuple) else x
