@@ -44,24 +44,20 @@ def with_softening(
     loudness = np.array([np.sqrt(np.mean(r.u**2)) for r in records])
     middle = loudness[np.abs(loudness - np.median(loudness)).argmin()]
     at = [r for r, x in zip(records, loudness, strict=True) if abs(x - middle) < 0.05 * middle]
-    new = _with(model, *_extension(model), at, THRESHOLDS, plays=False)
+    new = _with(model, *_extension(model), at, plays=False)
     return replace(new, levels=new.signals, memory=memory)
 
 
-def with_loop_plays(
-    model: LoopModel,
-    records: Sequence[PeriodicRecord],
-    thresholds: Sequence[float] = THRESHOLDS,
-) -> LoopModel:
+def with_loop_plays(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
     """Add plays of the extensions of the actuators: hysteresis inside the mechanics."""
-    return _with(model, *_extension(model), records, thresholds)
+    return _with(model, *_extension(model), records)
 
 
 def with_input_plays(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
     """Add plays of the voltages."""
     inputs = model.linear.b.shape[1]
     f, g = np.zeros((inputs, model.linear.order)), np.eye(inputs)
-    return _with(model, f, g, records, THRESHOLDS)
+    return _with(model, f, g, records)
 
 
 def _extension(model: LoopModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -76,7 +72,6 @@ def _with(
     f: NDArray[np.float64],
     g: NDArray[np.float64],
     records: Sequence[PeriodicRecord],
-    thresholds: Sequence[float],
     *,
     plays: bool = True,
 ) -> LoopModel:
@@ -86,9 +81,7 @@ def _with(
         z = model.run(np.concatenate([u, u])).x[len(u) :] @ f.T + u @ g.T
         squares.append(z.var(axis=0))
     size = np.sqrt(np.mean(squares, axis=0))[:, None]
-    r = np.asarray(thresholds, dtype=float)
-    if model.signals > model.levels and not np.array_equal(model.r, r):
-        raise ModelError(f'the plays share their thresholds, {model.r.tolist()}')
+    r = np.array(THRESHOLDS)
     # each play as if the thresholds were spread evenly, as Rayleigh's law has it
     weights = np.diff(r, prepend=0.0) if plays else np.zeros(len(r))
     old = np.zeros((model.signals, len(r)))

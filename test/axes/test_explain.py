@@ -78,7 +78,7 @@ def test_modes_are_followed_through_the_amplitudes():
         assert (np.diff(found.frequency[:, i]) < 0).all()
 
 
-def test_softening_comes_first_and_plays_share_their_thresholds():
+def test_softening_comes_first():
     rng = np.random.default_rng(5)
     records = [stage.record(stage.linear_stage(), rng, 1.0)]
     plain = LoopModel.of(stage.linear_stage())
@@ -89,5 +89,3 @@ def test_softening_comes_first_and_plays_share_their_thresholds():
     ) == pytest.approx(1, rel=0.05)
     with pytest.raises(ModelError, match='before the plays'):
         with_softening(played, records)
-    with pytest.raises(ModelError, match='share their thresholds'):
-        with_loop_plays(played, records, (0.3, 0.5))
