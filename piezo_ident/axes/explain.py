@@ -162,16 +162,14 @@ def explain(
     weights = [1.0] * len(taught) if weights is None else list(weights)
     if not set(groups(held_out)) <= set(groups(taught)):
         raise DataError('records of a group were held out of which none was taught')
-    by_group: dict[str, list[tuple[float, PeriodicRecord]]] = {}
-    for record, weight in zip(taught, weights, strict=True):
-        by_group.setdefault(record.group, []).append((weight, record))
-    chosen = [
-        pair
+    by_group = groups(taught)
+    weight = {id(record): x for record, x in zip(taught, weights, strict=True)}
+    small = [
+        record
         for members in by_group.values()
-        for pair in sorted(members, key=lambda pair: -pair[0])[:FEW]
+        for record in sorted(members, key=lambda r: -weight[id(r)])[:FEW]
     ]
-    small = [record for _, record in chosen]
-    small_weights = [weight for weight, _ in chosen]
+    small_weights = [weight[id(record)] for record in small]
     found: list[Rival] = []
 
     def judged(name: str, models: dict[str, LoopModel], since: float) -> None:
@@ -206,8 +204,8 @@ def explain(
 
     since = time.monotonic()
     each = {}
-    for group, members in groups(taught).items():
-        good = [r for r in members if weights[taught.index(r)] == 1] or members
+    for group, members in by_group.items():
+        good = [r for r in members if weight[id(r)] == 1] or members
         own = refined(linear, frequency_response(good), iterations=iterations)
         each[group] = LoopModel.of(own)
     judged('changed_dynamics', each, since)
