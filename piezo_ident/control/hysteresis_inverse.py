@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.kernels import curve, held
+from piezo_ident.operators.kernels import curve, curve_slope, held
 
 __all__ = ['HysteresisInverse']
 
@@ -78,8 +78,7 @@ def _wide_plays(
         after[i] = f
         t = f - low
         w += q[i] * f + c[3, i] * (u - low) * t + curve(c, i, t)
-        bent = t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
-        rise = q[i] + c[3, i] * (u - low) + (bent if 0.0 < t < c[4, i] else 0.0)
+        rise = q[i] + c[3, i] * (u - low) + curve_slope(c, i, t)
         slope += c[3, i] * t + (0.0 if f == memory[i] else rise)
     return w, slope
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.operators.kernels import curve_slope
 from scipy.sparse.linalg import LinearOperator
 
 __all__ = ['tangent']
@@ -87,9 +88,7 @@ def _edges(
             if c.shape[0]:
                 t = memory[i] - low
                 line[k] += c[3, i] * t
-                weight[k, i] += c[3, i] * (x - low)
-                if 0.0 < t < c[4, i]:
-                    weight[k, i] += t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
+                weight[k, i] += c[3, i] * (x - low) + curve_slope(c, i, t)
 
 
 @ordered_kernel
