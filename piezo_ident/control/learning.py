@@ -130,11 +130,7 @@ class Learning:
         self._invert = partial(
             invert, model, limits=limits, slew=slew, clip=True, channels=channels
         )
-        self.drive = (
-            self._invert(wanted)
-            if clip
-            else invert(model, wanted, limits=limits, slew=slew, channels=channels)
-        )
+        self.drive = self._invert(wanted, clip=clip)
         self._wanted = self._reference = self._best_reference = self.drive.wanted[
             self.drive.lead :
         ]
