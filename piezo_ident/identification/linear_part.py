@@ -203,7 +203,7 @@ def _refined(
     motion: FastMotion,
     G: Dynamics,
     delay: int,
-    tick: Callable[[], None] | None = None,
+    tick: Callable[[], None] = lambda: None,
 ) -> tuple[OutputErrorFit, float] | None:
     """Return G by output error without slow poles and pairs, and its held-out error."""
     stretches = _moved(motion.fitted, delay)

@@ -189,14 +189,12 @@ class OrderTable:
         Akaike's and Schwarz's criterion.
     held_out : ndarray
         Free-run rms error on the held-out part, infinite for an unstable model.
-    dynamics : tuple of tuple of Dynamics
     """
 
     loss: NDArray[np.float64]
     aic: NDArray[np.float64]
     bic: NDArray[np.float64]
     held_out: NDArray[np.float64]
-    dynamics: tuple[tuple[Dynamics, ...], ...]
 
     def best(self, criterion: str) -> tuple[int, int]:
         """Return (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
@@ -242,7 +240,7 @@ def scan_orders(
     nb_max: int,
     u_held: NDArray[np.float64],
     y_held: NDArray[np.float64],
-    tick: Callable[[float], None] | None = None,
+    tick: Callable[[float], None] = lambda share: None,
 ) -> OrderTable:
     """
     Fit all orders up to (na_max, nb_max), and judge each by free run on held-out data.
@@ -261,24 +259,18 @@ def scan_orders(
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
     size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
-    models = []
     for na in range(1, shape[0] + 1):
-        row = []
         for nb, (theta, one_step) in enumerate(factor.fits(na, nb_max, d), 1):
             loss[na - 1, nb - 1] = one_step
             model = Dynamics(a=theta[:na], b=theta[na:])
-            row.append(model)
             held[na - 1, nb - 1] = free_run_error(model, d, u_held, y_held)
-        models.append(tuple(row))
-        if tick is not None:
-            tick(na / shape[0])
+        tick(na / shape[0])
     log_loss = factor.n * np.log(np.maximum(loss, np.finfo(float).tiny))
     return OrderTable(
         loss=loss,
         aic=log_loss + 2.0 * size,
         bic=log_loss + np.log(factor.n) * size,
         held_out=held,
-        dynamics=tuple(models),
     )
 
 

@@ -105,7 +105,7 @@ def choose_thresholds(
     swing: float,
     dynamics: Dynamics,
     delay: Delay,
-    tick: Callable[[float], None] | None = None,
+    tick: Callable[[float], None] = lambda share: None,
 ) -> NDArray[np.float64]:
     """
     Refine the thresholds until the held-out error stops falling.
@@ -128,8 +128,7 @@ def choose_thresholds(
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)
     misses = 0
     for i, count in enumerate(COUNTS[1:]):
-        if tick is not None:
-            tick(i / len(COUNTS))
+        tick(i / len(COUNTS))
         even = even_thresholds(swing, count)
         loss, places = _held_loss(fit, held, even, dynamics, delay)
         candidates = [(loss, even)]

@@ -43,13 +43,10 @@ class OutputErrorFit:
     dynamics : Dynamics
     covariance : ndarray, shape (na + nb, na + nb)
         Of (a, b), for white output noise.
-    rms : float
-        Root mean square of the simulation error.
     """
 
     dynamics: Dynamics
     covariance: NDArray[np.float64]
-    rms: float
 
     @property
     def normalised_covariance(self) -> NDArray[np.float64]:
@@ -239,7 +236,7 @@ def output_error(
     stretches: Sequence[Excerpt],
     start: Dynamics,
     maxiter: int = 30,
-    tick: Callable[[], None] | None = None,
+    tick: Callable[[], None] = lambda: None,
 ) -> OutputErrorFit:
     """
     Refine dynamics by free-run simulation error.
@@ -264,8 +261,7 @@ def output_error(
     errors = problem.errors(model)
     loss, damping = problem.loss(errors), 1e-3
     for _ in range(maxiter):
-        if tick is not None:
-            tick()
+        tick()
         H, g = problem.normal(model, errors)
         diagonal = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         scaled = H / np.outer(diagonal, diagonal)
@@ -291,4 +287,4 @@ def output_error(
     covariance = np.asarray(
         loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
     )
-    return OutputErrorFit(model, covariance, float(np.sqrt(loss)))
+    return OutputErrorFit(model, covariance)
