@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __version__ = '0.1.0'
 
-# public name: where it is defined, and its name there where that differs
+# public name: where it is defined
 _HOMES = {
     'Axes': 'record.channels',
     'AxesModel': 'axes.model_text',
@@ -138,9 +138,9 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    home, _, other = _HOMES[name].partition(':')
+    home = _HOMES[name]
     module = importlib.import_module(f'{__name__}.{home}')
-    value = module if name == home else getattr(module, other or name)
+    value = module if name == home else getattr(module, name)
     globals()[name] = value
     return value
 
