@@ -21,6 +21,7 @@ from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 
 __all__ = [
+    'KINDS',
     'DelayResult',
     'DynamicsResult',
     'ErrorRow',
@@ -34,6 +35,8 @@ __all__ = [
     'silent',
 ]
 
+#: kinds of data, in the order in which they are shown and in which a headline prefers them
+KINDS = ('validation', 'held out', 'selection', 'fitted')
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = dict[tuple[str, float], NDArray[np.float64]]
 #: called with the name of the step and the share of it that is done; raises `Cancelled` to stop
@@ -384,8 +387,7 @@ class Identification(Showable):
     @property
     def headline(self) -> Headline:
         """The errors to quote: on data for validation if there are any, else on the next best."""
-        kinds = ('validation', 'held out', 'selection', 'fitted')
-        data = next((kind for kind in kinds if self._driven(kind)), 'fitted')
+        data = next((kind for kind in KINDS if self._driven(kind)), 'fitted')
         rows = self._driven(data)
         return Headline(
             data=data,

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.identification.results import ErrorRow, Identification
+from piezo_ident.identification.results import ErrorRow, Identification, KINDS
 from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.sines import SineError
@@ -28,7 +28,6 @@ from piezo_ident.report.table import (
 )
 
 __all__ = [
-    'KINDS',
     'brief_table',
     'headline',
     'identification_page',
@@ -36,8 +35,6 @@ __all__ = [
     'table_one',
 ]
 
-#: kinds of data, in the order in which they are shown and in which a headline prefers them
-KINDS = ('validation', 'held out', 'selection', 'fitted')
 #: how a headline begins, by the kind of data that it is about
 ABOUT = {
     'validation': 'On {records}, recorded for validation',

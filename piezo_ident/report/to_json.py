@@ -20,6 +20,7 @@ from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     Identification,
+    KINDS,
     Steps,
 )
 from piezo_ident.model import metrics
@@ -28,7 +29,7 @@ from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
-from piezo_ident.report.identification import headline, KINDS
+from piezo_ident.report.identification import headline
 
 __all__ = ['diagnosis_schema', 'json_text', 'steps_to_json', 'to_json']
 
