@@ -92,8 +92,6 @@ class Periodicity:
     ----------
     difference : float
         rms of the difference between the last two periods in % of rms(y).
-    noise : float
-        The same as noise of one period, smaller by the square root of two.
     weight : float
         Factor for the errors of this record in a fit, 1 where it repeats as the others do.
     band : tuple of float or None
@@ -101,9 +99,7 @@ class Periodicity:
     """
 
     name: str
-    group: str
     difference: float
-    noise: float
     weight: float
     band: tuple[float, float] | None
 
@@ -154,9 +150,7 @@ def periodicity(records: Sequence[PeriodicRecord]) -> tuple[Periodicity, ...]:
         found.append(
             Periodicity(
                 record.name,
-                record.group,
                 100 * float(total) * np.sqrt(2),
-                100 * float(total),
                 1.0 if band is None else float(np.median(totals) / total),
                 band,
             )

@@ -49,7 +49,7 @@ def test_periodicity_finds_the_record_that_changed_between_periods(noisy):
     assert 684 <= found.band[1] < 760
     assert found.difference == pytest.approx(10, rel=0.1)
     assert found.weight == pytest.approx(0.14, rel=0.15) and tested[0].weight == 1
-    assert tested[0].noise == pytest.approx(1.0, rel=0.1)
+    assert tested[0].difference == pytest.approx(np.sqrt(2), rel=0.1)
     assert 'changed' in str(found) and 'counts 0.14' in str(found)
 
 
