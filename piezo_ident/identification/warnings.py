@@ -138,11 +138,7 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
             f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
             f'{line:.3g} %: it explains little of these data'
         )
-    easy = [
-        row.percent
-        for row in result.errors
-        if row.data == 'held out' and row.segment.partition(':')[0] in ('idle', 'ramp')
-    ]
+    easy = [row.percent for row in result.errors if row.data == 'held out' and not row.driven]
     if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
         warnings.append(
             f'where the stage only rests or is moved over, the model errs by up to '
