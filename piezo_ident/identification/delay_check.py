@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from piezo_ident.identification.results import DelayResult
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
-    delayed,
+    free_run_error,
     instrumental_variables,
 )
-from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
 __all__ = ['upheld']
 
@@ -45,24 +44,17 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     fitted, held : (ndarray, ndarray)
         Input and output of noise, to fit and right behind that to judge by.
     """
-    whole = tuple(np.concatenate(pair) for pair in zip(fitted, held, strict=True))
-
-    def error(model: Dynamics, d: int) -> float:
-        if not model.is_stable:
-            return float('inf')
-        # what rings for long has died away where it is judged
-        e = whole[1] - filter_arx(model.a, model.b, delayed(whole[0], d), at_rest=False)
-        return float(e[-held[1].size :].std())
-
     asked = [d for d in (found.samples, found.scan) if d is not None]
     tried = sorted({*asked, *(d for d in DELAYS if d < max(asked))})
     u, y = fitted
     factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
+    # what rings for long has died away where it is judged
+    v, x = (np.concatenate(pair) for pair in zip(fitted, held, strict=True))
     errors = []
     for d in tried:
         models = [factor.dynamics(n, n, d) for n in ORDERS]
         models += [instrumental_variables(u, y, model, d) for model in models]
-        errors.append(min(error(model, d) for model in models))
+        errors.append(min(free_run_error(model, d, v, x, u.size) for model in models))
     least = min(errors)
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)

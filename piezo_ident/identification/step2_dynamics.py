@@ -221,17 +221,21 @@ def delayed(u: NDArray[np.float64], d: int) -> NDArray[np.float64]:
 
 
 def free_run_error(
-    model: Dynamics, d: int, u: NDArray[np.float64], y: NDArray[np.float64]
+    model: Dynamics,
+    d: int,
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    first: int | None = None,
 ) -> float:
     """
     Return the rms free-run error but for an offset, infinite for an unstable model.
 
-    The first fifth is left for the transient.
+    What comes before the `first` sample, or a fifth of all, is left for the transient.
     """
     if not model.is_stable:
         return float('inf')
     e = y - filter_arx(model.a, model.b, delayed(u, d), at_rest=False)
-    return float(e[y.size // 5 :].std())
+    return float(e[y.size // 5 if first is None else first :].std())
 
 
 def scan_orders(
