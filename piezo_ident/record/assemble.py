@@ -194,27 +194,18 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
 
 
 def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: str) -> None:
-    for key, v in table.columns.items():
-        if limits is not None and (key == 'v' or role_of(key) == 'v'):
-            _check_voltage(table, key, v, limits, name)
-
-
-def _check_voltage(
-    table: OrderedRows,
-    key: str,
-    v: NDArray[np.float64],
-    limits: tuple[float, float],
-    name: str,
-) -> None:
-    low, high = limits
-    if low <= v.min() and v.max() <= high:
+    if limits is None:
         return
-    outside = np.flatnonzero((v < low) | (v > high))
-    worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (low + high)))]
-    raise DataError(
-        f'{name}: {outside.size} samples leave the voltage limits {low:g}..{high:g} V, worst '
-        f'{v[worst]:g} V at {table.t[worst]:.6g} s; check the limits or the unit of {key}'
-    )
+    low, high = limits
+    for key, v in table.columns.items():
+        if (key != 'v' and role_of(key) != 'v') or (low <= v.min() and v.max() <= high):
+            continue
+        outside = np.flatnonzero((v < low) | (v > high))
+        worst = outside[np.argmax(np.abs(v[outside] - 0.5 * (low + high)))]
+        raise DataError(
+            f'{name}: {outside.size} samples leave the voltage limits {low:g}..{high:g} V, worst '
+            f'{v[worst]:g} V at {table.t[worst]:.6g} s; check the limits or the unit of {key}'
+        )
 
 
 def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
