@@ -6,28 +6,24 @@
 from piezo_ident.residual.analysis import analyse, ResidualAnalysis
 from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest, without_channels
 from piezo_ident.residual.dependence import Curve
-from piezo_ident.residual.faults import FaultSearch, find_faults
-from piezo_ident.residual.lines import find_lines, Line, LineSearch, without_lines
+from piezo_ident.residual.faults import find_faults
+from piezo_ident.residual.lines import find_lines, LineSearch, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.stretches import all_stretches, ResidualPart, Stretch, stretches_of
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
 __all__ = [
     'ChannelTest',
     'Curve',
-    'FaultSearch',
-    'Line',
     'LineSearch',
     'NoiseFloor',
     'ResidualAnalysis',
     'ResidualPart',
-    'Stretch',
     'all_stretches',
     'analyse',
     'channel_tests',
     'find_faults',
     'find_lines',
     'residual_noise_floor',
-    'stretches_of',
     'without_channels',
     'without_lines',
 ]
