@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -197,9 +197,6 @@ def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
         'duration': record.duration,
         'sample_rates': list(dict.fromkeys(p.sample_rate for p in record)),
         'labels': list(record.labels),
-        'faults': [
-            {'name': f.name, 'where': f.where, 'count': f.count, 'action': f.action}
-            for f in record.faults
-        ],
+        'faults': [asdict(fault) for fault in record.faults],
         'not_kept': list(losses),
     }
