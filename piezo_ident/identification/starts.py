@@ -133,6 +133,9 @@ def fit_starts(
     n = sum(t.x.size for t in thinned)
     pull = PULL * np.sqrt(n) * steps
     starts = {i: float(excerpts[i].u[0]) for i in sought}
+    # offsets and weights come first, the shares of each start behind them
+    known = k + m + 2
+    places = {i: slice(known + m * j, known + m * (j + 1)) for j, i in enumerate(sought)}
 
     def memory(i: int, shares: dict[int, Vector]) -> Vector:
         if i in shares:
@@ -143,46 +146,35 @@ def fit_starts(
         shares: dict[int, Vector], weights: Vector | None, prior: dict[int, Vector]
     ) -> tuple[Vector, dict[int, Vector], float]:
         """Return weights and changes of the shares, and the loss of the weights before."""
-        free_columns = [] if weights is None else sought
-        width = k + m + 2 + m * len(free_columns) + 1
+        free = {} if weights is None else places
+        width = known + m * len(free) + 1
         blocks = []
         for i, part in enumerate(thinned):
-            plays, free = part.columns(r, memory(i, shares))
+            plays, still = part.columns(r, memory(i, shares))
             block = np.zeros((part.x.size, width))
             block[:, i] = 1.0
             u = part.u[part.rows]
-            block[:, k : k + m + 2] = np.column_stack([plays, u**3, u])
+            block[:, k:known] = np.column_stack([plays, u**3, u])
             block[:, -1] = part.x
-            if weights is not None and i in free_columns:
-                at = k + m + 2 + m * free_columns.index(i)
-                still = free * weights[k : k + m]
-                block[:, at : at + m] = -steps * np.cumsum(still[:, ::-1], axis=1)[:, ::-1]
+            if weights is not None and i in free:
+                moved = still * weights[k : k + m]
+                block[:, free[i]] = -steps * np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
             blocks.append(block)
         loss = 0.0
         if weights is not None:
-            loss = sum(
-                float(np.sum((b[:, : k + m + 2] @ weights - b[:, -1]) ** 2)) for b in blocks
-            )
-        for j, i in enumerate(free_columns):
+            loss = sum(float(np.sum((b[:, :known] @ weights - b[:, -1]) ** 2)) for b in blocks)
+        lower, upper = np.full(width - 1, -np.inf), np.full(width - 1, np.inf)
+        lower[k : k + m] = 0.0
+        for i, at in free.items():
             ridge = np.zeros((m, width))
-            at = k + m + 2 + m * j
-            ridge[:, at : at + m] = np.diag(pull)
+            ridge[:, at] = np.diag(pull)
             ridge[:, -1] = pull * (prior[i] - shares[i])
             loss += float(np.sum(ridge[:, -1] ** 2))
             blocks.append(ridge)
-        R = triangular_factor(blocks, width)
-        lower, upper = np.full(width - 1, -np.inf), np.full(width - 1, np.inf)
-        lower[k : k + m] = 0.0
-        for j, i in enumerate(free_columns):
-            at = k + m + 2 + m * j
-            lower[at : at + m] = -shares[i] - 1e-9
-            upper[at : at + m] = 1.0 - shares[i] + 1e-9
-        theta, after = bounded_least_squares(R, lower, upper)
-        change = {
-            i: theta[k + m + 2 + m * j : k + m + 2 + m * (j + 1)]
-            for j, i in enumerate(free_columns)
-        }
-        return theta[: k + m + 2], change, after if weights is None else loss
+            lower[at], upper[at] = -shares[i] - 1e-9, 1.0 - shares[i] + 1e-9
+        theta, after = bounded_least_squares(triangular_factor(blocks, width), lower, upper)
+        change = {i: theta[at] for i, at in free.items()}
+        return theta[:known], change, after if weights is None else loss
 
     guesses = [{i: _guesses(starts[i], r)[g] for i in sought} for g in range(3)]
     tried = [solve(guess, None, guess) for guess in guesses]
