@@ -24,6 +24,8 @@ LOST = 2e-14
 #: difference of the static gain of sections from that of G, and of their products from B and A, as
 #: shares, beyond which their roots are not to be trusted
 NEAR, SAME = 1e-2, 1e-12
+#: share of the largest b up to which the first counts as zero: its roots overflow
+NOTHING = 1e-300
 #: samples after which a state that has died away is set to zero
 STRETCH = 1024
 
@@ -64,7 +66,8 @@ def sections_of(
     ndarray, shape (n, 5), or None
         b_0, b_1, b_2, a_1 and a_2 of each.
     """
-    if b[0] == 0.0 or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:
+    begins = abs(b[0]) > NOTHING * np.abs(b).max()
+    if not begins or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:
         return None
     # few models need it, and it takes half a second to import
     from scipy.signal import zpk2sos
