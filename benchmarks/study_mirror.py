@@ -25,10 +25,10 @@ import time
 # the fits run on threads of their own
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from amplitude_dependence import amplitude_dependence, AmplitudeDependence
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.amplitude import amplitude_dependence, AmplitudeDependence
 from piezo_ident.axes.explain import explain, Explanation, groups, Rival, Score, scores
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.loop_fit import loop_fit

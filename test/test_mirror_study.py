@@ -47,3 +47,16 @@ def test_spectra_hold_the_whole_error(study):
     assert 100 * np.sqrt(found.sum()) == pytest.approx(error, rel=0.01)
     edges = np.array([0.0, 400.0, 3200.0])
     assert np.hypot(*study.in_bands(found, edges)) == pytest.approx(error, rel=0.01)
+
+
+def test_modes_are_followed_through_the_amplitudes(study):
+    rng = np.random.default_rng(4)
+    found = study.amplitude_dependence(
+        stage.linear_stage(), stage.records(stage.loop_stage(plays=0.0), rng, count=3)
+    )
+    assert found.groups == ('0.5', '1', '1.5')
+    assert found.voltage == pytest.approx([0.5, 1.0, 1.5], rel=1e-6)
+    # softening takes 4 % of the stiffness at s = 1.5 and gives it back at 0.5
+    for i, frequency in enumerate((190.0, 310.0)):
+        assert found.frequency[1, i] == pytest.approx(frequency, rel=0.01)
+        assert (np.diff(found.frequency[:, i]) < 0).all()

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import axes_stage as stage
 import numpy as np
-from piezo_ident.axes.amplitude import amplitude_dependence
 from piezo_ident.axes.explain import explain, scores
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.signals import with_loop_plays, with_softening
@@ -63,19 +62,6 @@ def test_a_group_that_was_not_taught_is_refused():
     truth = stage.linear_stage()
     with pytest.raises(DataError, match='none was taught'):
         explain(truth, [stage.record(truth, rng, 1.0)], [stage.record(truth, rng, 2.0)])
-
-
-def test_modes_are_followed_through_the_amplitudes():
-    rng = np.random.default_rng(4)
-    found = amplitude_dependence(
-        stage.linear_stage(), stage.records(stage.loop_stage(plays=0.0), rng, count=3)
-    )
-    assert found.groups == ('0.5', '1', '1.5')
-    assert found.voltage == pytest.approx([0.5, 1.0, 1.5], rel=1e-6)
-    # softening takes 4 % of the stiffness at s = 1.5 and gives it back at 0.5
-    for i, frequency in enumerate((190.0, 310.0)):
-        assert found.frequency[1, i] == pytest.approx(frequency, rel=0.01)
-        assert (np.diff(found.frequency[:, i]) < 0).all()
 
 
 def test_softening_comes_first():
