@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
 import logging
-import math
 import shutil
 import signal
 import sys
@@ -77,9 +76,9 @@ class Console:
     def result(self, data: Any) -> None:
         """Write the result for programs; nothing as text."""
         if self.as_json:
-            from piezo_ident.model.files import plain
+            from piezo_ident.model.files import finite, plain
 
-            text = json.dumps(_finite(plain(data)), indent=2, ensure_ascii=False, allow_nan=False)
+            text = json.dumps(finite(plain(data)), indent=2, ensure_ascii=False, allow_nan=False)
             sys.stdout.write(f'{text}\n')
 
     @contextmanager
@@ -140,12 +139,3 @@ class _Lines(logging.Handler):
 def _harmless(text: str) -> str:
     """Return lines without control characters: names in files must not steer a terminal."""
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
-
-
-def _finite(value: Any) -> Any:
-    """Return plain data with None for numbers that JSON cannot write."""
-    if isinstance(value, dict):
-        return {key: _finite(x) for key, x in value.items()}
-    if isinstance(value, list):
-        return [_finite(x) for x in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

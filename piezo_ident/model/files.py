@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 import difflib
+import math
 import os
 import reprlib
 from typing import Any
@@ -23,6 +24,7 @@ import yaml
 __all__ = [
     'SCHEMA_VERSION',
     'check_keys',
+    'finite',
     'load',
     'model_from_dict',
     'model_to_dict',
@@ -75,6 +77,15 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return value
+
+
+def finite(value: Any) -> Any:
+    """Return plain data with None for the numbers that JSON cannot hold."""
+    if isinstance(value, dict):
+        return {key: finite(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [finite(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _part(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:

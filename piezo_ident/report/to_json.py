@@ -24,7 +24,7 @@ from piezo_ident.identification.results import (
     Steps,
 )
 from piezo_ident.model import metrics
-from piezo_ident.model.files import plain
+from piezo_ident.model.files import finite, plain
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
@@ -54,8 +54,7 @@ def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -
         ``-inf``, and the overall error of a model that diverged the largest number there is.
     """
     data = _diagnosis(result) if isinstance(result, Diagnosis) else _identified(result, runs)
-    strict: dict[str, Any] = _strict(plain({**VERSION, **data}))
-    return strict
+    return dict(finite(plain({**VERSION, **data})))
 
 
 def json_text(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> str:
@@ -89,18 +88,7 @@ def steps_to_json(
         data['delay'] = _delay(steps.delay, steps.delay.samples / sample_rate)
     if steps.dynamics is not None:
         data['dynamics'] = _dynamics(*steps.dynamics, sample_rate)
-    strict: dict[str, Any] = _strict(plain(data))
-    return strict
-
-
-def _strict(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _strict(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return dict(finite(plain(data)))
 
 
 def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, Any]:
