@@ -152,13 +152,23 @@ class Rows:
     def fading(self, i: int, times: Sequence[float]) -> Array:
         """Return decays with some time constants [s] of a run; 1 until its record counts."""
         run = self.runs[i]
-        starts = [
-            r.piece.start_time + int(np.argmax(keep)) * self.m / r.piece.sample_rate
-            for r, keep in zip(self.runs, self.keep, strict=True)
-            if r.record == run.record and keep.any()
-        ]
-        t = np.maximum(run.piece.time(0, run.u.size) - min(starts, default=0.0), 0.0)
+        begin, _ = self._counted.get(int(self.record[i]), (0.0, 0.0))
+        t = np.maximum(run.piece.time(0, run.u.size) - begin, 0.0)
         return np.exp(-t / np.asarray(times, np.float64)[:, None])
+
+    @property
+    def judged(self) -> float:
+        """From the first row to the last of a record, of the longest one [s]."""
+        return max(end - begin for begin, end in self._counted.values())
+
+    @functools.cached_property
+    def _counted(self) -> dict[int, tuple[float, float]]:
+        """When the rows of each record begin and end [s]."""
+        found: dict[int, list[float]] = {}
+        for run, keep, k in zip(self.runs, self.keep, self.record, strict=True):
+            t = run.piece.start_time + np.flatnonzero(keep) * self.m / run.piece.sample_rate
+            found.setdefault(int(k), []).extend(t[[0, -1]] if t.size else ())
+        return {k: (min(t), max(t)) for k, t in found.items() if t}
 
     @property
     def longest(self) -> int:

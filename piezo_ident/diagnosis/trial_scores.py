@@ -191,4 +191,5 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
         max_frequency=rows.highest_frequency,
         thresholds=model.hysteresis.thresholds,
+        judged=rows.judged,
     )

@@ -42,6 +42,8 @@ class View:
         Highest frequency at which the command has power [Hz].
     thresholds : ndarray, shape (m,)
         Thresholds of H.
+    judged : float
+        From the first sample to the last of a record that counts, of the longest one [s].
     """
 
     sample_rate: float
@@ -54,6 +56,7 @@ class View:
     modes: tuple[tuple[float, float], ...] = ()
     max_frequency: float = 100.0
     thresholds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    judged: float = np.inf
 
     @property
     def span(self) -> float:

@@ -394,9 +394,17 @@ def test_the_page_has_a_row_for_each_name_with_what_it_needs():
     assert all(imitated for _, _, _, imitated in rows)
 
 
-def test_a_slew_limit_is_tried_little_below_the_fastest_motion():
+def test_creep_is_tried_up_to_the_time_that_is_judged():
+    for judged, longest in ((1.5, 1.5), (np.inf, 8.0)):
+        view = View(FS, 0.0, 1.0, np.ones(5), 8.0, judged=judged)
+        trials = find_effect('creep').trials(view)
+        assert max(max(x.values['time_constant']) for x in trials) == pytest.approx(longest)
+
+
+def test_a_slew_limit_is_tried_from_the_slowest_motion_to_little_below_the_fastest():
     speeds = np.array([1.0, 2.0, 5.0, 100.0])
     view = View(FS, 0.0, 0.0, speeds, 1.0)
     tried = [trial.values['limit'] for trial in find_effect('slew_limit').trials(view)]
+    assert min(tried) == speeds[0]
     assert {70.0, 80.0, 90.0} <= {round(limit, 9) for limit in tried}
     assert max(tried) >= 0.5 * view.span * FS
