@@ -132,7 +132,8 @@ class ForwardSelection:
         if shown and self._beyond_noise(retuned) < self._least:
             # they were there at the identification, too: it takes no more for G to be off
             return self._from(retuned, self._round(retuned), shown)
-        news = [effect for effect in self._allowed if effect.in_dynamics]
+        # a limit of the speed acts on fast motion, too, and a retuned G takes much of it
+        news = [e for e in self._allowed if e.in_dynamics or e.name == 'slew_limit']
         gain = base.mean_square - retuned.mean_square
         if gain < criteria.LINEAR * explainable:
             return self._from(retuned, self._round(retuned), shown)

@@ -69,14 +69,14 @@ class SlewLimit(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return limits at the faster half of the speeds seen, and on the way to a jump."""
+        """Return limits at the speeds seen, the lowest too, and on the way to a jump."""
         speeds = np.unique(view.speeds[view.speeds > 0])
         if speeds.size == 0:
             return ()
         fastest = float(speeds[-1])
         # jumps are too few to show in the quantiles; a limit that never acts changes nothing
         jump = max(fastest, 0.5 * view.span * view.sample_rate)
-        limits = [*speeds[speeds.size // 2 : -1].tolist(), *(np.array([0.7, 0.8, 0.9]) * fastest)]
+        limits = [*speeds[:-1].tolist(), *(np.array([0.7, 0.8, 0.9]) * fastest)]
         limits += ladder(fastest, jump, 6)[1:]
         return tuple(cls.trial({'limit': limit}) for limit in limits)
 

@@ -16,6 +16,8 @@ import sys
 from types import SimpleNamespace
 
 from diagnosis_examples import measured as example_record
+from diagnosis_examples import played, with_effects
+from diagnosis_examples import refined_model as creeping_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
 from piezo_ident.diagnosis import base_refit, diagnose, DiagnosisSettings, refined_model, search
@@ -568,6 +570,17 @@ def test_a_limit_that_one_kind_of_excitation_reaches_is_kept(truths):
     assert found.after.overall < 0.2 * found.before.overall
     before, after = unseen_errors(found, unseen)
     assert after < 0.3 * before
+
+
+@pytest.mark.parametrize('limit', [20.0, 60.0])
+def test_a_limit_below_most_speeds_is_no_lag(limit):
+    record = played(with_effects(slew_limit={'limit': limit}), 'limited')
+    few = DiagnosisSettings(effects=('slew_limit', 'amplifier_lag', 'changed_dynamics'))
+    found = diagnose(slow_model(), record, few)
+    assert found.verdict == 'named', found.sentence
+    assert [effect.name for effect in found.effects] == ['slew_limit']
+    assert found.effects[0].parameters['limit'].value == pytest.approx(limit, rel=1e-3)
+    assert found.after.overall < 0.01 < 5.0 < found.before.overall
 
 
 def test_columns_near_the_optimum_are_derivatives(truths):
