@@ -92,7 +92,8 @@ def _selected(
         beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
     known = found.fitted.state
     start = replace(given, effects=known.effects, fading=known.fading, earlier=known.earlier)
-    start = replace(start, retuning=(0.0,) * len(RETUNING))
+    if simulator.is_fast:
+        start = replace(start, retuning=(0.0,) * len(RETUNING))
     as_given = fit_jointly(
         simulator,
         start,

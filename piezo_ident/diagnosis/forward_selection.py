@@ -260,8 +260,8 @@ class ForwardSelection:
         return replace(found, taken=(*taken, this), fitted=fitted)
 
     def retuned(self, fitted: Fitted) -> Fitted:
-        """Return a fit with G retuned, too."""
-        if fitted.state.retuning:
+        """Return a fit with G retuned, too, where the data could show it."""
+        if fitted.state.retuning or not self._simulator.is_fast:
             return fitted
         for one, again in self._retunings:
             if one is fitted:

@@ -21,6 +21,7 @@ from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.identification.spectra import highest_frequency
 from piezo_ident.model.initial_memory import fit_memory, is_at_rest
 from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.sines import sine_frequency
@@ -119,7 +120,12 @@ class Rows:
     @functools.cached_property
     def highest_frequency(self) -> float:
         """The frequency below which all but a millionth of the moving power of any run lies."""
-        return max(_highest_frequency(run.u, run.piece.sample_rate) for run in self.runs)
+        found = [0.0]
+        for run, keep in zip(self.runs, self.keep, strict=True):
+            if (rows := np.flatnonzero(keep)).size:
+                u = run.u[rows[0] * self.m : (rows[-1] + 1) * self.m]
+                found.append(highest_frequency(u, run.piece.sample_rate))
+        return max(found)
 
     @functools.cached_property
     def reach(self) -> tuple[float, float]:
@@ -380,21 +386,3 @@ def _memory(model: StageModel, run: Run) -> Memory:
 
 def _extremes(signals: Sequence[Array]) -> tuple[float, float]:
     return min(float(x.min()) for x in signals), max(float(x.max()) for x in signals)
-
-
-def _highest_frequency(u: Array, rate: float) -> float:
-    """Return the frequency below which all but a millionth of the moving power lies."""
-    du = np.diff(u)
-    if du.size == 0:
-        return 0.0
-    size = min(du.size, 1 << 17)
-    power = np.zeros(size // 2 + 1)
-    for start in range(0, du.size - size + 1, size):
-        power += np.abs(np.fft.rfft(du[start : start + size])) ** 2
-    # power of u, not of its derivative
-    frequency = np.fft.rfftfreq(size, 1.0 / rate)
-    power[1:] /= frequency[1:] ** 2
-    total = np.cumsum(power)
-    if total[-1] == 0.0:
-        return rate / 2.0
-    return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+import functools
 from functools import partial
 import os
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.changes import Behind
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.retuning import (
     BEYOND,
     retuned,
@@ -103,6 +105,13 @@ class Simulator:
     def _band(self) -> float:
         """What a retuned G does not grow beyond [Hz]."""
         return BEYOND * self.rows.highest_frequency
+
+    @functools.cached_property
+    def is_fast(self) -> bool:
+        """Whether the data are driven so fast that a G that is a tenth off would be an effect."""
+        G, delay = self.model.dynamics, self.model.total_delay
+        lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
+        return 0.1 * self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
 
     def holds_retuning(self, state: State) -> bool:
         """Return whether one filter can stand for G and its factor."""

@@ -18,6 +18,7 @@ __all__ = [
     'cross_spectra',
     'excited_band',
     'frequency_response',
+    'highest_frequency',
     'prefilter',
 ]
 
@@ -209,3 +210,21 @@ def _response(
         coherence=coherence,
         std=np.sqrt((1.0 - coherence) / (2.0 * np.maximum(coherence, 1e-12) * averages)),
     )
+
+
+def highest_frequency(u: NDArray[np.float64], rate: float) -> float:
+    """Return the frequency [Hz] below which all but a millionth of the moving power lies."""
+    du = np.diff(u)
+    if du.size == 0:
+        return 0.0
+    size = min(du.size, 1 << 17)
+    power = np.zeros(size // 2 + 1)
+    for start in range(0, du.size - size + 1, size):
+        power += np.abs(np.fft.rfft(du[start : start + size])) ** 2
+    # power of u, not of its derivative
+    frequency = np.fft.rfftfreq(size, 1.0 / rate)
+    power[1:] /= frequency[1:] ** 2
+    total = np.cumsum(power)
+    if total[-1] == 0.0:
+        return rate / 2.0
+    return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])

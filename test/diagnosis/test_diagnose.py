@@ -42,7 +42,7 @@ from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Piece, Record, Segment
-from programs import identification_program, slow_model
+from programs import identification_program, SLOW, slow_model
 import pytest
 
 # the name of the package is that of the function
@@ -308,6 +308,31 @@ def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
     before, after = unseen_errors(result, unseen)
     # the zero of the given model is a little off: it met creep when it was identified
     assert after < 0.7 * before
+
+
+def test_a_zero_that_moved_shows_behind_a_large_effect():
+    """It is less than the given model errs, and far more than the refined one does."""
+    (piece,) = played(with_effects(amplifier_lag={'time_constant': 2e-3}), 'lag').pieces
+    moved = Record((replace(piece, y=piece.y + 1e-6),), 'moved')
+    result = diagnose(slow_model(), moved, DiagnosisSettings(effects=('amplifier_lag',)))
+    assert [effect.name for effect in result.effects] == ['amplifier_lag']
+    (shift,) = [w for w in result.warnings if 'zero of the displacement has moved by' in w]
+    assert 'by 1 um' in shift and result.before.overall > 1.0 > 0.02 > result.after.overall
+    assert result.model.scaling.y0 == pytest.approx(slow_model().scaling.y0, abs=10e-9)
+
+
+def test_slow_motion_does_not_retune_g():
+    t = np.arange(round(16 * SLOW)) / SLOW
+    v = np.interp(t, [0, 1, 2, 3, 7, 7.5, 11, 12, 13], [0, 10, 0, 8, 8, 2, 2, 9, 0])
+    y = creeping_model().simulate(v) + 4e-9 * np.random.default_rng(1).standard_normal(v.size)
+    slow = Record((Piece(v, y, SLOW),), 'slow')
+    assert not Simulator(slow_model(), make_rows(slow_model(), [slow])).is_fast
+    fast = example_record()
+    assert Simulator(slow_model(), make_rows(slow_model(), [fast])).is_fast
+    result = diagnose(slow_model(), slow, DiagnosisSettings(effects=('creep',)))
+    assert [effect.name for effect in result.effects] == ['creep'], result.sentence
+    assert result.after.overall < 0.01 < 0.5 < result.before.overall
+    assert result.model.dynamics == slow_model().dynamics
 
 
 def test_a_refit_of_h_is_kept_beside_hum(truths):
