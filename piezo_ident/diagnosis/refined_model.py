@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain, takes_shape
+from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds, takes_shape
+from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
@@ -18,6 +19,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
+from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['WANDERS', 'Refined', 'lasting', 'moved_zeros', 'refine']
@@ -79,6 +81,10 @@ def refine(
     if fitted.transfer.sum() > (1.0 - criteria.WORTH_REFIT) ** 2 * (e @ e):
         # of a kind of excitation that was not fitted the given model knows as much
         return Refined(model, given, metres, is_given=True)
+    # beside an effect that was found, a smaller shift shows, too
+    hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
+    shifts = np.where(shifts == 0.0, hidden, shifts)
+    metres = shifts * model.scaling.Y
     if shifts.any():
         offsets = fitted.state.offsets - shifts
         fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
@@ -162,6 +168,35 @@ def _harms_the_whole(simulator: Simulator, given: State, fitted: State) -> bool:
         for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True):
             squares[i] += float(run.use.sum()) * float(np.var((run.x - x)[run.use]))
     return bool(squares[1] > squares[0])
+
+
+def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: Array) -> Array:
+    """
+    Return by how much the sensor's zero has moved in each record, normalised; zero where not.
+
+    Behind an effect that the given model misses, its mean error over a record and the displacement
+    at rest beside its own must both say so, as it was off in one of them where it met the effect
+    when it was identified.  Neither what is left nor what it missed then may be as large.
+    `before` are the mean squares that the given model leaves of each record, shape (records,).
+    """
+    rows, model, state = simulator.rows, simulator.model, fitted.state
+    left = np.sqrt(means(fitted.e**2, rows.of_record))
+    missed = np.sqrt(rows.square(expected_error(model) or 0.0))
+    limit = criteria.MOVED_ZERO * np.minimum(np.sqrt(before), np.maximum(left, missed))
+    state = replace(state, effects=tuple(map(_elsewhere, state.effects)))
+    models = [simulator.model_of(state, k) for k in range(limit.size)]
+    rest = state.offsets + [_at_rest(m) - _at_rest(model) for m in models]
+    agreed = np.where(
+        given.offsets * rest > 0.0, np.minimum(np.abs(given.offsets), np.abs(rest)), 0
+    )
+    return np.where(agreed > limit, np.copysign(agreed, rest), 0.0)
+
+
+def _at_rest(model: StageModel) -> float:
+    """Return the displacement at rest at the lowest voltage, hum and other axes left out."""
+    own = tuple(x for x in model.effects if x.name not in TESTED)
+    y = replace(model, effects=own).simulate([model.scaling.range[0]])
+    return float(model.scaling.x(y)[0])
 
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
