@@ -129,6 +129,8 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
     """Return the first of the effects added that others explain as well, with those."""
     law = selected.fitted.state.law
     plays = law is None or law.name == 'plays'
+    # two changes of one G, of which no law fits alone, need not be two
+    changes = [name for one in selected.taken if _is_linear(name := one.contenders[0].name)]
     for i, this in enumerate(selected.taken):
         bent = selected.bent.contenders[:1] if selected.bent and i == 0 else ()
         contenders = (*this.contenders, *bent)
@@ -142,11 +144,16 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         rivals = rivals_of(rows, contenders, rest, whole - rest, plays=plays)
         # of a G that changed none of the laws need be the cause
         like = selected.linear if contenders[0].name in selected.linear else ()
+        like = (*changes, *like) if contenders[0].name in changes else like
         names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
             return _class((*names, *untried)[: criteria.CLASS_SIZE], untried)
     return None
+
+
+def _is_linear(name: str) -> bool:
+    return find_effect(name).in_dynamics
 
 
 def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:

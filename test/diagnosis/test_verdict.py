@@ -203,6 +203,17 @@ def test_what_creeps_on_from_before_is_held_against_a_rival_and_creep_alike(rows
     assert verdict(rows, [this], 0.001, fading=fading).verdict == said
 
 
+def test_two_changes_of_one_g_may_be_one(rows):
+    first = a_round(contender('changed_dynamics', 0.1))
+    second = a_round(contender('amplifier_lag', 0.001), before=0.1 * WHOLE)
+    found = verdict(rows, [first, second], 0.001)
+    assert found.verdict == 'class' and found.effects == ('changed_dynamics', 'amplifier_lag')
+    assert found.group.names == ('changed_dynamics', 'amplifier_lag')
+    # one of them beside something else is one
+    other = a_round(contender('creep', 0.001), before=0.1 * WHOLE)
+    assert verdict(rows, [first, other], 0.001).verdict == 'named'
+
+
 def test_what_explains_a_part_may_be_a_class_too(rows):
     this = a_round(contender('creep', 0.09), contender('thermal_drift', 0.12))
     found = verdict(rows, [this], 0.09)
