@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import refit_holds, taken_by_gain
+from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
@@ -151,21 +151,23 @@ def with_refit(
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs
             return unsettled
-        if _is_gain(simulator, given, refit) and not selected.linear:
+        other = _gain(simulator, given, refit)
+        if other is not None and not selected.linear:
             # of another record a gain that wanders says nothing
-            return unsettled.hiding(('gain_drift', *look_alikes('gain_drift')[:1]))
+            wanders = replace(unsettled, gain=other)
+            return wanders.hiding(('gain_drift', *look_alikes('gain_drift')[:1]))
         findings = findings.refitted(rows.percent(refit.mean_square - noise))
     elif misfit < criteria.REFIT_FINDING and not selected.linear:
         return findings
     return findings.hiding(_hidden(simulator, given, selected))
 
 
-def _is_gain(simulator: Simulator, given: State, refit: Fitted) -> bool:
-    """Return whether a plain gain takes most of what a refit takes: no other loop is one."""
+def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
+    """Return the gain that takes most of what a refit takes, if one does: no other loop is one."""
     rows, x = simulator.rows, simulator.run(given)
     e = centred(rows.x - x, rows.of_record)
-    taken, whole = taken_by_gain(rows, x, e), float(e @ e)
-    return taken > criteria.ADDED * (whole - float(refit.errors.sum()))
+    gain, taken = fitted_gain(rows, x, e)
+    return gain if taken > criteria.ADDED * (float(e @ e) - float(refit.errors.sum())) else None
 
 
 def _hidden(simulator: Simulator, given: State, selected: Selected) -> tuple[str, ...]:

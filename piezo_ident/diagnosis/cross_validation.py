@@ -25,6 +25,7 @@ __all__ = [
     'NormalEquations',
     'Pull',
     'block_products',
+    'fitted_gain',
     'held_out_errors',
     'held_out_residual',
     'normal_equations',
@@ -33,7 +34,6 @@ __all__ = [
     'solve',
     'standard_errors',
     'summed',
-    'taken_by_gain',
     'takes_shape',
     'with_columns',
 ]
@@ -222,10 +222,15 @@ def standard_errors(difference: Array) -> float:
     return total / deviation if deviation > 0.0 else float(np.copysign(np.inf, total))
 
 
-def taken_by_gain(rows: Rows, x: Array, e: Array) -> float:
-    """Return the sum of squares that a gain of x takes off e, both without their means."""
+def fitted_gain(rows: Rows, x: Array, e: Array) -> tuple[float, float]:
+    """
+    Return the gain of x that lowers its error e most, and the sum of squares that it takes off e.
+
+    Both without the means of the records.
+    """
     h, e = centred(x, rows.of_record), centred(e, rows.of_record)
-    return float((h @ e) ** 2 / (h @ h))
+    share = float(h @ e) / float(h @ h)
+    return 1.0 + share, share * float(h @ e)
 
 
 def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:

@@ -157,15 +157,17 @@ def sentence(
         fall += '' if is_given else f', with the refit alone to {refit:.3g} %'
     share = f'{100.0 * findings.share:.0f} % of {missed}'
     names = ' and '.join(name.replace('_', ' ') for name in findings.effects)
+    was, explains = ('was', 'explains') if len(findings.effects) == 1 else ('were', 'explain')
     tail = '' if is_given else f'; after a refit of the hysteresis {fall}'
     if findings.verdict == 'named':
-        verb = 'explains' if len(findings.effects) == 1 else 'explain'
-        text = f'{names} {verb} {share}; {fall}.'
+        text = f'{names} {explains} {share}; {fall}.'
     elif findings.verdict == 'class':
-        text = f'{_or(findings.group)}: these data do not tell which; {names} was added and '
-        text += f'explains {share}; {fall}.'
+        text = f'{_or(findings.group)}: these data do not tell which; {names} {was} added and '
+        text += f'{explains} {share}; {fall}.'
     elif findings.verdict == 'partly_explained':
-        text = f'{names} explains {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
+        text = (
+            f'{names} {explains} {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
+        )
         text += f'{fall}.'
         if findings.group:
             text += f' Whether it is {_or(findings.group)}, these data do not tell.'
@@ -181,7 +183,7 @@ def sentence(
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'
         if findings.keeps_given and findings.group:
-            why = ', most of it by a gain that is not that of its identification'
+            why = f', most of it by a gain that is {findings.gain:.4g} times what it was'
         elif findings.keeps_given:
             why = (
                 f': a refit of the hysteresis leaves {refit:.3g} % of these data, but does not '

@@ -143,7 +143,7 @@ def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     before, after = float(np.mean(e * e)), float(fitted.transfer.sum()) / rows.n
     if rows.percent(before - after) < criteria.REFIT_FINDING or after > 0.5 * before:
         return False
-    by_gain = taken_by_gain(rows, x, e) / rows.n
+    by_gain = fitted_gain(rows, x, e)[1] / rows.n
     return by_gain <= criteria.ADDED * (before - after) and refit_holds(rows, e, fitted.transfer)
 
 

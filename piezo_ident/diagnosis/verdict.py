@@ -65,6 +65,8 @@ class Findings:
         Beyond the noise, rms in % of stroke.
     keeps_given : bool
         Whether the model stays as it was given, whatever a refit would bring.
+    gain : float
+        Of the stage over that of the model, where that is most of what the model misses.
     """
 
     verdict: str
@@ -73,6 +75,7 @@ class Findings:
     group: Class | None
     left: float
     keeps_given: bool = False
+    gain: float = 1.0
 
     def unsettled(self, left: float) -> Findings:
         """Return that what a refit of H would take need not last, or hold on other motion."""
