@@ -116,6 +116,8 @@ OF_LEAST = 0.01
 #: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
 #: round are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
+#: ratio to what the last of those leaves up to which another one is fitted to the end, too
+LEVEL = 1.05
 #: passes with fresh columns at the end, at most, and the gain that makes another worth it
 POLISHING, POLISH = 6, 0.02
 #: retuning of G that is worth a warning: samples of delay, or a share of the fast motion

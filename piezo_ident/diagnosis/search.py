@@ -201,7 +201,9 @@ def _contenders(
     contenders.sort(key=lambda c: c.mean_square)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
-    for i, contender in enumerate(contenders[: criteria.FINAL]):
+    # a few iterations do not tell which of two that are level gets further
+    level = [c for c in contenders if c.mean_square <= criteria.LEVEL * _last(contenders)]
+    for i, contender in enumerate(level):
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
         # one that stays further behind the first is no rival of it
@@ -224,6 +226,11 @@ def _contenders(
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
+
+
+def _last(contenders: Sequence[Fitted]) -> float:
+    """Return what the last of those leaves that are fitted to the end anyway."""
+    return max((c.mean_square for c in contenders[: criteria.FINAL]), default=0.0)
 
 
 def _begun(
