@@ -33,6 +33,8 @@ LEAST, FAR, AROUND = 2e-3, 8.0, 8
 HELD = 10
 #: samples in which the step of a converter is looked for, in rows of so many
 MOST, MOST_ROW = 2**17, 2**10
+#: share of that step by which numbers in a file may be rounded
+ROUNDED = 0.07
 #: where more of a record than this looks wrong, it is the way of the data
 MAX_FAULTY = 0.05
 
@@ -271,12 +273,17 @@ def quantum_of(y: Vector) -> float:
     small = jumps[: max(20, jumps.size // 10)]
     step = float(small[0])
     for _ in range(4):
-        ratio = small / step
-        off = np.abs(ratio - np.rint(ratio))
-        near = np.rint(ratio) < 50
-        if near.sum() >= 2 and np.mean(off[near] < 0.03) > 0.97:
-            whole = np.rint(ratio)[near]
-            return float(np.sum(small[near] * whole) / np.sum(whole * whole))
+        fitted = step
+        # rounded numbers tell the step the better the further they are apart
+        for most in (1.5, 5.0, 15.0, 50.0):
+            near = small < most * fitted
+            whole = np.rint(small[near] / fitted)
+            if not whole.any():
+                continue
+            fitted = float(np.sum(small[near] * whole) / np.sum(whole * whole))
+        off = np.abs(small[near] / fitted - whole)
+        if near.sum() >= 2 and np.mean(off < ROUNDED) > 0.97:
+            return fitted
         # a code in between was never hit: the step divides the differences of differences
         gaps = np.diff(small)
         gaps = gaps[gaps > 0.03 * step]

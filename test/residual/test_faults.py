@@ -201,6 +201,16 @@ def test_clipping(truth):
     assert found.bad[0].sum() > 0.5 * np.sum(read > end)
 
 
+@pytest.mark.parametrize('decimals', [3, 4, 6])
+def test_quantum_of_numbers_that_were_rounded_again(decimals):
+    """A 12-bit converter over 70 um, written in um: its codes are 17.09 nm apart."""
+    step = 70e-6 / 4096
+    t = np.arange(20_000) / 5000
+    y = 30e-6 * np.sin(2 * np.pi * t) + 6e-9 * np.random.default_rng(1).standard_normal(t.size)
+    read = 1e-6 * np.round(1e6 * step * np.round(y / step), decimals)
+    assert quantum_of(read) == pytest.approx(step, rel=1e-2)
+
+
 def test_quantum_of_plain_numbers_and_of_nothing():
     rng = np.random.default_rng(8)
     assert quantum_of(rng.standard_normal(10_000)) == 0.0
