@@ -379,4 +379,5 @@ def diagnosis_text(result: Diagnosis) -> str:
 
 def brief_table(result: Diagnosis) -> Table:
     """Return the facts for a notebook."""
-    return Table('Diagnosis', ('', ''), [*facts(result), *remains(result)[1:]])
+    warnings = [('warning', warning) for warning in result.warnings]
+    return Table('Diagnosis', ('', ''), [*facts(result), *remains(result)[1:], *warnings])
