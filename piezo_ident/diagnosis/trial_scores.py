@@ -192,4 +192,5 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         max_frequency=rows.highest_frequency,
         thresholds=model.hysteresis.thresholds,
         judged=rows.judged,
+        is_fast=simulator.is_fast,
     )

@@ -97,7 +97,8 @@ class Creep(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return elements spread over all times that the data hold, many and few."""
-        shortest = max(5.0 / view.sample_rate, 0.01)
+        # faster elements make up for dynamics, where those matter, and else for a gain of H
+        shortest = max(5.0 / view.sample_rate, 0.01 if view.is_fast else AT_ONCE)
         # a time far beyond what is judged would pass for a drift
         longest = max(min(view.duration, view.judged), 10.0 * shortest)
         # single times would fit a decade better and the next one worse

@@ -44,6 +44,8 @@ class View:
         Thresholds of H.
     judged : float
         From the first sample to the last of a record that counts, of the longest one [s].
+    is_fast : bool
+        Whether dynamics matter in these data.
     """
 
     sample_rate: float
@@ -57,6 +59,7 @@ class View:
     max_frequency: float = 100.0
     thresholds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     judged: float = np.inf
+    is_fast: bool = True
 
     @property
     def span(self) -> float:

@@ -399,6 +399,10 @@ def test_creep_is_tried_up_to_the_time_that_is_judged():
         view = View(FS, 0.0, 1.0, np.ones(5), 8.0, judged=judged)
         trials = find_effect('creep').trials(view)
         assert max(max(x.values['time_constant']) for x in trials) == pytest.approx(longest)
+        assert min(min(x.values['time_constant']) for x in trials) == pytest.approx(0.01)
+    # elements that look like a gain of H in slow motion are none
+    trials = find_effect('creep').trials(replace(view, is_fast=False))
+    assert min(min(x.values['time_constant']) for x in trials) == pytest.approx(0.05)
 
 
 def test_a_slew_limit_is_tried_from_the_slowest_motion_to_little_below_the_fastest():
