@@ -108,10 +108,10 @@ class Simulator:
 
     @functools.cached_property
     def is_fast(self) -> bool:
-        """Whether the data are driven so fast that a G that is a tenth off would be an effect."""
+        """Whether the data are so fast that what G does to them is as large as an effect."""
         G, delay = self.model.dynamics, self.model.total_delay
         lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
-        return 0.1 * self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
+        return self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
 
     def holds_retuning(self, state: State) -> bool:
         """Return whether one filter can stand for G and its factor."""
