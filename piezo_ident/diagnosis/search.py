@@ -202,7 +202,8 @@ def _contenders(
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
     # a few iterations do not tell which of two that are level gets further
-    level = [c for c in contenders if c.mean_square <= criteria.LEVEL * _last(contenders)]
+    last = max((c.mean_square for c in contenders[: criteria.FINAL]), default=0.0)
+    level = [c for c in contenders if c.mean_square <= criteria.LEVEL * last]
     for i, contender in enumerate(level):
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
@@ -226,11 +227,6 @@ def _contenders(
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
-
-
-def _last(contenders: Sequence[Fitted]) -> float:
-    """Return what the last of those leaves that are fitted to the end anyway."""
-    return max((c.mean_square for c in contenders[: criteria.FINAL]), default=0.0)
 
 
 def _begun(

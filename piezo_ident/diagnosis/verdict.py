@@ -133,7 +133,8 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
     law = selected.fitted.state.law
     plays = law is None or law.name == 'plays'
     # two changes of one G, of which no law fits alone, need not be two
-    changes = [name for one in selected.taken if _is_linear(name := one.contenders[0].name)]
+    taken = [this.contenders[0].name for this in selected.taken]
+    changes = [name for name in taken if find_effect(name).in_dynamics]
     for i, this in enumerate(selected.taken):
         bent = selected.bent.contenders[:1] if selected.bent and i == 0 else ()
         contenders = (*this.contenders, *bent)
@@ -153,10 +154,6 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         if len(names) > 1 or untried:
             return _class((*names, *untried)[: criteria.CLASS_SIZE], untried)
     return None
-
-
-def _is_linear(name: str) -> bool:
-    return find_effect(name).in_dynamics
 
 
 def _class(names: tuple[str, ...], untried: Sequence[str]) -> Class:
