@@ -16,12 +16,12 @@ from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import StepDelay
 from piezo_ident.identification.step2_dynamics import OrderTable
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
+from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 
 __all__ = [
-    'KINDS',
     'DelayResult',
     'DynamicsResult',
     'ErrorRow',
@@ -35,8 +35,6 @@ __all__ = [
     'silent',
 ]
 
-#: kinds of data, in the order in which they are shown and in which a headline prefers them
-KINDS = ('validation', 'held out', 'selection', 'fitted')
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = dict[tuple[str, float], NDArray[np.float64]]
 #: called with the name of the step and the share of it that is done; raises `Cancelled` to stop

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     'FORMULA',
+    'KINDS',
     'REVERSED',
     'expected_error',
     'fit_percent',
@@ -30,6 +31,8 @@ __all__ = [
 
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
+#: kinds of data, in the order in which they are shown and in which an error is quoted of them
+KINDS = ('validation', 'held out', 'selection', 'fitted')
 #: what to say where `runs_against`
 REVERSED = 'the displacement runs against the model: is a sign reversed, or are columns exchanged?'
 #: correlation below which that is no matter of a poor model
@@ -152,7 +155,7 @@ def expected_error(model: StageModel) -> float | None:
     diagnosis = found.get('diagnosis')
     places = (
         (diagnosis.get('errors') if isinstance(diagnosis, Mapping) else None, ('after', 'before')),
-        (found.get('errors'), ('validation', 'held_out', 'selection', 'fitted')),
+        (found.get('errors'), [kind.replace(' ', '_') for kind in KINDS]),
     )
     for errors, kinds in places:
         known = errors if isinstance(errors, Mapping) else {}

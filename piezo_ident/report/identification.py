@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.identification.results import ErrorRow, Identification, KINDS
+from piezo_ident.identification.results import ErrorRow, Identification
 from piezo_ident.identification.warnings import LAW_WORDS
-from piezo_ident.model.metrics import FORMULA, percent
+from piezo_ident.model.metrics import FORMULA, KINDS, percent
 from piezo_ident.model.sines import SineError
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.table import (

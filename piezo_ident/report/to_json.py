@@ -20,7 +20,6 @@ from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     Identification,
-    KINDS,
     Steps,
 )
 from piezo_ident.model import metrics
@@ -106,7 +105,7 @@ def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, A
         'errors': {
             'unit': '% of stroke',
             'formula': metrics.FORMULA,
-            **{kind.replace(' ', '_'): result.error(kind) for kind in KINDS},
+            **{kind.replace(' ', '_'): result.error(kind) for kind in metrics.KINDS},
             'rows': [asdict(row) for row in result.errors],
         },
         'sines': [asdict(row) for row in sines_of(runs)],
