@@ -29,8 +29,9 @@ from distributed import LocalCluster
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from side_by_side import markdown, ratio, show, take_turns

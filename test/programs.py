@@ -6,7 +6,8 @@
 from functools import cache
 
 import numpy as np
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 

@@ -55,7 +55,8 @@ from piezo_ident.identification.three_steps import (
 from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.metrics import FORMULA, percent
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record, records_of
 import scipy

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
-from piezo_ident.model.stage_model import Scaling
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults

@@ -57,7 +57,8 @@ from piezo_ident.identification.step3_hysteresis import (
     fit_hysteresis,
     HysteresisFit,
 )
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal

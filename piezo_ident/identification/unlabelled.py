@@ -47,7 +47,7 @@ from piezo_ident.identification.step3_hysteresis import (
 )
 from piezo_ident.identification.three_steps import model_of, within
 from piezo_ident.identification.warnings import warn_of_range, warn_of_starts, warn_of_zeros
-from piezo_ident.model.stage_model import Scaling
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.residual.stretches import true_runs

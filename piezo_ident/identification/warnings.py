@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import DynamicsResult, Identification
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record

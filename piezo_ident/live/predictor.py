@@ -17,7 +17,8 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind
-from piezo_ident.model.stage_model import Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis

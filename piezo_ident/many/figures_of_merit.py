@@ -63,7 +63,7 @@ def figures_of_merit(model: StageModel) -> FiguresOfMerit:
     --------
     >>> from piezo_ident.operators.dynamics import Delay, Dynamics
     >>> from piezo_ident.operators.hysteresis import Hysteresis
-    >>> from piezo_ident.model.stage_model import Scaling
+    >>> from piezo_ident.model.scaling import Scaling
     >>> scaling = Scaling(0.0, 10.0, 0.0, 70e-6, (0.0, 10.0))
     >>> line = Hysteresis([], [], 0.0, 1.0)
     >>> stage = figures_of_merit(StageModel(1e4, scaling, line, Dynamics.unit(), Delay(3)))

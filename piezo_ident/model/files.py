@@ -16,7 +16,8 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import load_yaml
-from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 import yaml

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
@@ -31,57 +32,10 @@ from piezo_ident.record.record import Piece, Record
 if TYPE_CHECKING:
     from piezo_ident import Inverse
 
-__all__ = ['EffectSetting', 'Scaling', 'StageModel']
+__all__ = ['EffectSetting', 'StageModel']
 
 #: share of the identified range below which a wrong unit is likelier than a small signal
 FAINT = 2e-3
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """
-    Signed affine normalisation: u = (v - v0)/V and (y - y0)/Y.
-
-    Attributes
-    ----------
-    v0, V : float
-        Voltage at u = 0 and span [V].
-    y0, Y : float
-        Displacement at zero and span [m]; Y is negative for a stage that retracts.
-    range : tuple of float
-        Voltages between which the model was identified [V].
-    """
-
-    v0: float
-    V: float
-    y0: float
-    Y: float
-    range: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        numbers = (self.v0, self.V, self.y0, self.Y, *self.range)
-        if not np.all(np.isfinite(numbers)):
-            raise ModelError('scaling: v0, V, y0, Y and range must be finite numbers')
-        if self.V <= 0 or self.Y == 0:
-            raise ModelError('scaling: V must be positive and Y not zero')
-        if self.range[0] >= self.range[1]:
-            raise ModelError('scaling: range must be [lowest, highest] voltage')
-
-    def u(self, v: ArrayLike) -> NDArray[np.float64]:
-        """Return the normalised input."""
-        return (np.asarray(v, dtype=np.float64) - self.v0) / self.V
-
-    def v(self, u: float) -> float:
-        """Return volts from the normalised input."""
-        return self.v0 + self.V * float(u)
-
-    def y(self, x: ArrayLike) -> NDArray[np.float64]:
-        """Return metres from the normalised output."""
-        return self.y0 + self.Y * np.asarray(x, dtype=np.float64)
-
-    def x(self, y: ArrayLike) -> NDArray[np.float64]:
-        """Return the normalised output from metres."""
-        return (np.asarray(y, dtype=np.float64) - self.y0) / self.Y
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,9 @@ from piezo_ident.identification.step1_delay import delay_from_steps
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
-from piezo_ident.model.stage_model import EffectSetting, Scaling
+from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program

@@ -9,7 +9,8 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import TurningPoints
 from piezo_ident.live.monitor import LiveError, Matcher, Preview
 from piezo_ident.live.predictor import Predictor
-from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import weighted_plays

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import ModelError
 from piezo_ident.model.free_run import free_run, piece_runs
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.sines import sine_errors, sine_frequency
-from piezo_ident.model.stage_model import EffectSetting, Scaling, StageModel
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record, Segment

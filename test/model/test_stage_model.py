@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.stage_model import EffectSetting, Scaling
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record
