@@ -43,7 +43,7 @@ from piezo_ident.diagnosis import diagnose
 from piezo_ident.effects import find_effect
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
-from piezo_ident.model.free_run import free_run
+from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from study_rows import all_rows, section
@@ -260,11 +260,10 @@ def case_records(case: Case, forms: bool = True) -> Records:
     )
 
 
-def unseen_errors(model: StageModel, record: Record) -> tuple[float, float]:
-    """Return the error on a record behind its unknown start, and without its mean."""
-    run = free_run(model, record)
-    errors = run.errors_after_start or run.errors
-    return errors.percent, errors.percent_without_offset
+def unseen_errors(record: Record, *models: StageModel) -> list[tuple[float, float]]:
+    """Return the errors on a record behind its unknown start, and without its mean."""
+    errors = same_part_errors(*(free_run(model, record) for model in models))
+    return [(e.percent, e.percent_without_offset) for e in errors]
 
 
 def judged(case: Case) -> Row:
@@ -273,7 +272,7 @@ def judged(case: Case) -> Row:
         records = case_records(case)
         model = identify(records.identification).model
         result = diagnose(model, records.diagnosis)
-        errors = [unseen_errors(m, records.unseen) for m in (model, result.model)]
+        errors = unseen_errors(records.unseen, model, result.model)
         return Row(
             key=case.key,
             verdict=result.verdict,

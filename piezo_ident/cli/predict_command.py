@@ -17,7 +17,13 @@ from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.model.files import load
-from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
+from piezo_ident.model.free_run import (
+    free_run,
+    FreeRun,
+    FreeRunErrors,
+    predict,
+)
+from piezo_ident.model.initial_memory import unknown_starts
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Record
@@ -59,7 +65,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
             )
         with naming(str(args.model)):
             pieces = predict(model, record)
-        warnings = model.extrapolation(record)
+        warnings = (*unknown_starts(model, record), *model.extrapolation(record))
         console.say(f'{args.model} on {record.name}, which has no displacement: no error is known')
         for warning in warnings:
             console.say(f'  warning: {warning}')

@@ -95,8 +95,8 @@ def warnings_of(
     if state.fading:
         found.append(
             f'the stage still crept from motion before a record, by up to {crept:.2g} % of '
-            'stroke; this was fitted and is no part of any error, but a prediction of such a '
-            'record starts from rest and errs by it'
+            'stroke; this was fitted and is no part of any error. A free run of such a record '
+            'estimates it from the early part; from the voltage alone nothing tells it'
         )
     stay = bool(lasting(findings.effects))
     found += [

@@ -22,7 +22,7 @@ from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.spectra import highest_frequency
-from piezo_ident.model.initial_memory import fit_memory, is_at_rest
+from piezo_ident.model.initial_memory import fit_start, is_at_rest
 from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
@@ -376,10 +376,11 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
 
 def _memory(model: StageModel, run: Run) -> Memory:
     u0 = float(run.u[0])
-    if is_at_rest(model, run.piece):
+    start = None if is_at_rest(model, run.piece) else fit_start(model, run.piece)
+    if start is None or start.memory is None:
         return lambda r: initial_memory(u0, r)
     at = np.concatenate([[0.0], model.hysteresis.thresholds])
-    value = np.concatenate([[u0], fit_memory(model, run.piece)[: at.size - 1]])
+    value = np.concatenate([[u0], np.asarray(start.memory)[: at.size - 1]])
     # a play output falls by at most its threshold; between known ones it is interpolated
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
@@ -80,9 +81,32 @@ class Creep(Effect):
 
     def prepare(self) -> None:
         """Leave out elements without a share."""
-        seen = np.flatnonzero(self.array('gain'))
-        self._c = self.array('gain')[seen]
-        self._share = -np.expm1(-1.0 / (self.sample_rate * self.array('time_constant')[seen]))
+        self._seen = np.flatnonzero(self.array('gain'))
+        self._c = self.array('gain')[self._seen]
+        times = self.array('time_constant')[self._seen]
+        self._share = -np.expm1(-1.0 / (self.sample_rate * times))
+        self._beyond = np.zeros(self._c.size)
+
+    def start_from(self, beyond: NDArray[np.float64]) -> None:
+        """
+        Say how far each element is beyond its rest when it is reset.
+
+        Parameters
+        ----------
+        beyond : ndarray, shape (c,)
+            Empty for elements at rest.
+
+        Raises
+        ------
+        ModelError
+            When there are more or fewer than elements.
+        """
+        if beyond.size not in (0, self.array('gain').size):
+            raise ModelError(
+                f'creep: a start of {beyond.size} elements for {self.array("gain").size}; '
+                'take the start from this model'
+            )
+        self._beyond = beyond[self._seen] if beyond.size else np.zeros(self._c.size)
 
     @classmethod
     def section(
@@ -119,9 +143,9 @@ class Creep(Effect):
         return bool(-steps[steps < 0.0].sum() <= BACK * steps[steps > 0.0].sum())
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: every element has caught up."""
-        self._state = np.full(self._c.size, x0)
-        return float(x0 * (1.0 + self._c.sum()))
+        """Come to rest, where every element has caught up, or to where `start_from` says."""
+        self._state = x0 + self._beyond
+        return float(x0 + self._c @ self._state)
 
     def process(self, block: Block) -> Block:
         """Return the block with the crept part added."""

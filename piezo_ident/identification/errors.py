@@ -19,9 +19,10 @@ from piezo_ident.identification.step3_hysteresis import (
     fine_thresholds,
     fit_hysteresis,
 )
-from piezo_ident.model.initial_memory import forgetting, forgotten, start_memory
+from piezo_ident.model.initial_memory import early_part, fit_start
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import StartLike
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
@@ -65,15 +66,16 @@ def predictions_of(
     """Return the free run over each run; a memory at the start that is not given is estimated."""
     static, found = model.without_dynamics(), []
     for run in runs:
-        memory, judged = (memories or {}).get(key_of(run)), run.use
-        if memory is None:
-            memory, judged = start_memory(model, run.piece), run.known
-            if memory is not None:
-                late = forgotten(run.piece.v, way=forgetting(model))
+        start: StartLike = (memories or {}).get(key_of(run))
+        judged = run.use
+        if start is None:
+            start, judged = fit_start(model, run.piece), run.known
+            if start is not None:
+                late = early_part(model, run.piece)
                 judged = judged & (np.arange(judged.size) >= late)
         # a sensor may be set to zero between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
-        y_hat, y_static = (m.predict_piece(run.piece, memory) + zero for m in (model, static))
+        y_hat, y_static = (m.predict_piece(run.piece, start) + zero for m in (model, static))
         found.append(Prediction(run, y_hat, y_static, judged))
     return found
 

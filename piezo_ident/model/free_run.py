@@ -4,13 +4,13 @@
 """
 Free runs: the displacement that a model predicts from the voltage of a record, and its errors.
 
-The unknown memory at the start of a record is estimated from its early part.  Over a short gap
-the run goes on along a straight line of voltage.
+What the stage keeps of its motion before a record is estimated from the early part.  Over a short
+gap the run goes on along a straight line of voltage.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,12 +20,16 @@ from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import (
     connected_pieces,
+    crept,
+    EARLY,
+    early_part,
+    fit_start,
     forgetting,
     forgotten,
-    start_memory,
 )
 from piezo_ident.model.metrics import BLOCK, nrmse_fit, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
 
@@ -37,6 +41,7 @@ __all__ = [
     'piece_runs',
     'predict',
     'run_pieces',
+    'same_part_errors',
 ]
 
 Vector = NDArray[np.float64]
@@ -90,11 +95,13 @@ class FreeRun(Showable):
     pieces : tuple of ndarray
         Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
-        For each piece, whether its memory at the start was estimated from its early part.
+        For each piece, whether its start was estimated from its early part.
+    late : tuple of int
+        Of each piece, the first sample at which its start is forgotten, or was known.
     errors : FreeRunErrors
         Of every sample.
     errors_after_start : FreeRunErrors or None
-        Of the samples at which the start is forgotten, or was known; None when there are none.
+        Of the samples from `late` on; None when there are none.
     warnings : tuple of str
         What limits the trust in the prediction.
 
@@ -110,6 +117,7 @@ class FreeRun(Showable):
     record: Record
     pieces: tuple[Vector, ...]
     estimated: tuple[bool, ...]
+    late: tuple[int, ...]
     errors: FreeRunErrors
     errors_after_start: FreeRunErrors | None
     warnings: tuple[str, ...] = ()
@@ -130,7 +138,8 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     Predict a record in free run, and compare it with what was measured.
 
     A record that does not start at the lowest voltage starts from an unknown memory, which is
-    estimated from its early part; nothing is fitted to the samples after that part.
+    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
+    shows.  Nothing is fitted to the samples after that part.
 
     Parameters
     ----------
@@ -162,29 +171,17 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     record = without_faults(record)
     groups = connected_pieces(record)
     _check_rates(model, record)
-    memories = [start_memory(model, pieces[0]) for pieces in groups]
-    predicted = _predicted(model, record, groups, memories)
+    starts = [fit_start(model, pieces[0]) for pieces in groups]
+    predicted = _predicted(model, record, groups, starts)
     estimated: list[bool] = []
-    starts: list[int] = []  # the sample of each piece from which its start is forgotten
-    for pieces, memory in zip(groups, memories, strict=True):
-        estimated += [memory is not None, *[False] * (len(pieces) - 1)]
-        start = 0
-        if memory is not None:
-            parts = [piece.v for piece in pieces]
-            v = parts[0] if len(parts) == 1 else np.concatenate(parts)
-            # a voltage that rests forgets nothing
-            start = forgotten(v, way=forgetting(model)) if v.min() < v.max() else v.size
+    late: list[int] = []
+    for pieces, start in zip(groups, starts, strict=True):
+        estimated += [start is not None, *[False] * (len(pieces) - 1)]
+        left = 0 if start is None else _late(model, pieces, start)
         for piece in pieces:
-            starts.append(min(start, piece.n))
-            start -= starts[-1]
-    has_more = sum(starts) < record.n
-    warnings = []
-    if any(estimated):
-        warnings.append(
-            f'{record.name}: {sum(estimated)} of {len(estimated)} pieces do not start at the '
-            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
-            'estimated from their early part'
-        )
+            late.append(min(left, piece.n))
+            left -= late[-1]
+    warnings = list(_on_starts(model, record, starts))
     pairs = ((piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True))
     if runs_against(pairs, model.scaling.Y):
         warnings.append(f'{record.name}: {REVERSED}')
@@ -192,10 +189,23 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
         record=record,
         pieces=tuple(predicted),
         estimated=tuple(estimated),
-        errors=_errors(record, predicted, [0] * len(starts)),
-        errors_after_start=_errors(record, predicted, starts) if has_more else None,
+        late=tuple(late),
+        errors=_errors(record, predicted, [0] * len(late)),
+        errors_after_start=_errors(record, predicted, late) if sum(late) < record.n else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
+
+
+def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
+    """
+    Return the errors of runs over one record, of the samples behind the starts of all of them.
+
+    Of the whole record where no such sample is.
+    """
+    late = [max(starts) for starts in zip(*(run.late for run in runs), strict=True)]
+    if sum(late) == runs[0].record.n:
+        return [run.errors for run in runs]
+    return [_errors(run.record, run.pieces, late) for run in runs]
 
 
 def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...]:
@@ -223,6 +233,35 @@ def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...
     return tuple(_predicted(model, record, groups, [None] * len(groups)))
 
 
+def _late(model: StageModel, pieces: Sequence[Piece], start: Start) -> int:
+    """Return the first sample of connected pieces that an estimate of their start leaves free."""
+    end = early_part(model, pieces[0]) if start.creep.size else 0
+    if start.memory is None:
+        return end
+    v = pieces[0].v if len(pieces) == 1 else np.concatenate([piece.v for piece in pieces])
+    # a voltage that rests forgets nothing
+    return max(end, forgotten(v, way=forgetting(model)) if v.min() < v.max() else v.size)
+
+
+def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:
+    """Yield what was estimated of the motion before a record."""
+    found = [start for start in starts if start is not None]
+    elsewhere = sum(start.memory is not None for start in found)
+    if elsewhere:
+        yield (
+            f'{record.name}: {elsewhere} of {len(record.pieces)} pieces do not start at the '
+            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
+            'estimated from their early part'
+        )
+    most = max((crept(model, start) for start in found), key=abs, default=0.0)
+    if most:
+        yield (
+            f'{record.name}: creep of earlier motion goes on, by '
+            f'{100.0 * abs(most) / record.stroke:.2g} % of stroke at the start; it is estimated '
+            f'from the first {EARLY:.0%}'
+        )
+
+
 def _check_rates(model: StageModel, record: Record) -> None:
     try:
         for piece in record:
@@ -235,19 +274,17 @@ def _predicted(
     model: StageModel,
     record: Record,
     groups: Sequence[Sequence[Piece]],
-    memories: Sequence[Vector | None],
+    starts: Sequence[Start | None],
 ) -> list[Vector]:
     predicted: list[Vector] = []
-    for pieces, memory in zip(groups, memories, strict=True):
-        predicted += run_pieces(model, pieces, memory)
+    for pieces, start in zip(groups, starts, strict=True):
+        predicted += run_pieces(model, pieces, start)
     if not all(np.isfinite(y_hat).all() for y_hat in predicted):
         raise ModelError(f'{record.name}: the model diverges on this record; identify it again')
     return predicted
 
 
-def run_pieces(
-    model: StageModel, pieces: Sequence[Piece], memory: ArrayLike | None
-) -> list[Vector]:
+def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> list[Vector]:
     """
     Return the predicted displacement [m] of pieces that follow each other over short gaps.
 
@@ -256,10 +293,10 @@ def run_pieces(
     model : StageModel
     pieces : sequence of Piece
         From `piezo_ident.model.initial_memory.connected_pieces`.
-    memory : array_like or None
-        Play outputs at the start of the first.
+    start : Start, array_like or None
+        Of the first, as of `StageModel.simulate`.
     """
-    stream = model.stream(memory)
+    stream = model.stream(start)
     predicted = [stream.follow(pieces[0])]
     for before, piece in pairwise(pieces):
         stream.bridge(before, piece)
@@ -339,10 +376,10 @@ def piece_runs(
         for pieces in connected_pieces(record):
             if not model.takes(pieces[0]):
                 continue
-            memory = known.get((record.name, pieces[0].start_time))
-            if memory is None:
-                memory = start_memory(model, pieces[0])
-            both = (run_pieces(m, pieces, memory) for m in (model, static))
+            start: StartLike = known.get((record.name, pieces[0].start_time))
+            if start is None:
+                start = fit_start(model, pieces[0])
+            both = (run_pieces(m, pieces, start) for m in (model, static))
             for piece, y_hat, y_static in zip(pieces, *both, strict=True):
                 runs.append(PieceRun(record.name, piece, y_hat, y_static))
     return runs

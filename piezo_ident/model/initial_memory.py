@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The memory of the plays at the start of a record.
+What a stage keeps of its motion before a record: the memory of the plays, and creep.
 
-It is known where the record starts at the lowest voltage.  Elsewhere each play keeps its unknown
-start F_r(0) as long as the voltage allows,
+The memory is known where the record starts at the lowest voltage.  Elsewhere each play keeps its
+unknown start F_r(0) as long as the voltage allows,
 
     max(v so far) - r   <=   F_r(0)   <=   min(v so far),
 
@@ -14,13 +14,19 @@ record.  Once the voltage has swept the width of a play, the play depends on its
 
 Lags along the path start anywhere between the least and the largest value that they follow.  What
 they add by it decays along the path, ``exp(-a_j s)``: they are more numbers of the same problem.
+
+So is what each element of creep still has to go, ``c_i d_i exp(-t / tau_i)``, of a model that has
+creep.  A sensor that was set to zero elsewhere looks like slow creep.  The zero is therefore free
+first; it is held where creep within the range explains the record as well without it.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.effects.creep import Creep
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.record.gaps import follows
 from piezo_ident.record.record import Piece, Record
@@ -28,11 +34,13 @@ from scipy.optimize import lsq_linear
 
 __all__ = [
     'connected_pieces',
-    'fit_memory',
+    'crept',
+    'early_part',
+    'fit_start',
     'forgetting',
     'forgotten',
     'is_at_rest',
-    'start_memory',
+    'unknown_starts',
 ]
 
 #: share of its range that the voltage must sweep until the start is forgotten
@@ -47,6 +55,18 @@ TRIALS = 20
 PULL = 1e-4
 #: the same of lags along the path: of several, together, far smaller sums are seen
 LAG_PULL = 1e-6
+#: the same of creep, for a start that is off by the range of H: some elements are hardly seen
+CREEP_PULL = 1e-8
+#: farthest that a sensor's zero may have moved, in spans
+FAR = 1e3
+#: share of a record from which creep of earlier motion is estimated, at least
+EARLY = 0.2
+#: rms that creep of earlier motion must leave there, over that without it, the zero free
+WORTH = 0.9
+#: and what it must gain, in spans
+FAINT = 1e-5
+#: rms that it may leave with the zero of the model, over that with a free zero
+SURE = 1.1
 
 
 def forgotten(u: NDArray[np.float64], share: float = SHARE, way: float = 0.0) -> int:
@@ -113,14 +133,37 @@ def connected_pieces(record: Record) -> list[list[Piece]]:
     return groups
 
 
-def start_memory(model: StageModel, piece: Piece) -> NDArray[np.float64] | None:
-    """Return the estimated memory at the start of a piece; None where it is known."""
-    return None if is_at_rest(model, piece) else fit_memory(model, piece)
+def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
+    """Return a warning where the voltage alone does not tell the memory at the start."""
+    v = [pieces[0].v[0] for pieces in connected_pieces(record) if not is_at_rest(model, pieces[0])]
+    if not v:
+        return ()
+    h, (low, high) = model.hysteresis, model.hysteresis.span
+    widths = []
+    for u in map(float, model.scaling.u(v)):
+        up, down = (h(np.array([*way, u]))[-1] for way in ([low], [low, high]))
+        widths.append(abs(float(model.dynamics.gain * (down - up))))
+    return (
+        f'{record.name}: starts at {v[int(np.argmax(widths))]:g} V; coming from below and from '
+        f'above the stage stands {100.0 * max(widths):.2g} % of its span apart there, and without '
+        'displacement nothing tells which. Start the record at '
+        f'{model.scaling.range[0]:g} V, or measure the displacement, too',
+    )
 
 
-def fit_memory(model: StageModel, piece: Piece) -> NDArray[np.float64]:
+def early_part(model: StageModel, piece: Piece) -> int:
+    """Return the number of samples from which what was before a piece is estimated."""
+    known = is_at_rest(model, piece)
+    # later, what was before the start is forgotten
+    end = 10 if known else max(forgotten(piece.v, way=forgetting(model)), 10)
+    if _creeps(model):
+        end = max(end, int(np.ceil(EARLY * piece.n)))
+    return min(end, piece.n)
+
+
+def fit_start(model: StageModel, piece: Piece) -> Start | None:
     """
-    Estimate the play outputs, and the lags along the path, before the first sample of a piece.
+    Estimate what a stage keeps of its motion before a piece.
 
     Parameters
     ----------
@@ -129,63 +172,115 @@ def fit_memory(model: StageModel, piece: Piece) -> NDArray[np.float64]:
 
     Returns
     -------
-    ndarray, shape (m + k,)
-        `start` of `StageModel.simulate`.
+    Start or None
+        None for a stage that was at rest at the lowest voltage, as far as the data tell.
     """
+    known = is_at_rest(model, piece)
+    creeps = _creeps(model)
+    if known and not creeps:
+        return None
+    still, e = _fit(model, piece, memory=not known)
+    if not creeps:
+        return still
+    free, left = _fit(model, piece, memory=not known, creep=True, zero=True)
+    if np.std(left) > WORTH * np.std(e) - FAINT:
+        return None if known else still
+    held, e = _fit(model, piece, memory=not known, creep=True)
+    return held if np.sqrt(np.mean(e**2)) <= SURE * np.std(left) else free
+
+
+def crept(model: StageModel, start: Start) -> float:
+    """Return what creep of earlier motion adds to the displacement at a start [m]."""
+    if not start.creep.size:
+        return 0.0
+    return float(model.scaling.Y * model.dynamics.gain * (_elements(model)[0] @ start.creep))
+
+
+def _elements(model: StageModel) -> NDArray[np.float64]:
+    """Return shares and time constants [s] of the creep of a model, shape (2, c)."""
+    found = [e.parameters for e in model.effects if e.name == Creep.name]
+    return np.array([found[0]['gain'], found[0]['time_constant']]) if found else np.empty((2, 0))
+
+
+def _creeps(model: StageModel) -> bool:
+    return bool(_elements(model)[0].any())
+
+
+def _fit(
+    model: StageModel, piece: Piece, *, memory: bool, creep: bool = False, zero: bool = False
+) -> tuple[Start, NDArray[np.float64]]:
+    """Return a start by least squares on the early part, and what it leaves of some samples."""
     h = model.hysteresis
-    # by then what was before the start is forgotten
-    end = min(max(forgotten(piece.v, way=forgetting(model)), 10), piece.n)
-    part = piece.cut(0, end)
+    part = piece.cut(0, early_part(model, piece))
     # the plays follow the voltage behind the effects of the input slot
     u = model.hysteresis_input(part)
-    x = model.scaling.x(part.y)
-    u0, m = float(u[0]), h.thresholds.size
-    rest = np.concatenate([h.initial_memory(u0), h.settled(u0)[:-1]])
-    if not (h.weights.any() or h.rise(np.full(m, u0)).any() or h.lag_range.any()):
-        return rest
-    top, bottom = np.maximum.accumulate(u), np.minimum.accumulate(u)
+    u0 = float(u[0])
     # rows are thinned: a few numbers do not need a hundred thousand samples
-    keep = slice(None, None, max(1, end // 5000))
+    keep = slice(None, None, max(1, part.n // 5000))
+    x = model.scaling.x(part.y)[keep]
+    m, k = (h.thresholds.size, h.lag_range.shape[1]) if memory else (0, 0)
+    gains, times = _elements(model) if creep else np.empty((2, 0))
+    c, z = gains.size, int(zero)
+    rest = np.concatenate([h.initial_memory(u0)[:m], h.settled(u0)[:k], np.zeros(c + z)])
+
+    def start(state: NDArray[np.float64]) -> Start:
+        return Start(state[: m + k] if memory else None, state[m + k : m + k + c])
+
+    def error(state: NDArray[np.float64]) -> NDArray[np.float64]:
+        y_hat = model.scaling.x(model.predict_piece(part, start(state)))
+        return np.asarray(x - y_hat[keep] - (state[-1] if zero else 0.0))
+
+    forgets = h.weights.any() or h.rise(np.full(h.thresholds.size, u0)).any() or h.lag_range.any()
+    if not ((memory and forgets) or creep):
+        return start(rest), error(rest)
+    top, bottom = np.maximum.accumulate(u), np.minimum.accumulate(u)
 
     def passed(signal: NDArray[np.float64]) -> NDArray[np.float64]:
         delayed = model.total_delay.apply(signal)
         return filter_arx(model.dynamics.a, model.dynamics.b, delayed)[keep]
 
-    def error(memory: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray((x - model.scaling.x(model.predict_piece(part, memory)))[keep])
-
     path = np.cumsum(np.abs(np.diff(u, prepend=u0)))
-    rates = np.empty(0) if h.relaxations is None else h.relaxations[:, 0]
-    lags = [passed(np.exp(-a * path)) for a in rates]
+    rates = h.relaxations[:, 0] if k and h.relaxations is not None else np.empty(0)
+    age = np.arange(part.n)[keep] / part.sample_rate
+    others = [passed(np.exp(-a * path)) for a in rates]
+    # creep goes on as it was, and so has passed G
+    pairs = zip(gains, times, strict=True)
+    others += [model.dynamics.gain * gain * np.exp(-age / tau) for gain, tau in pairs]
+    others += [np.ones(age.size)] * z
     # from one threshold to the next a play output falls by a share of the difference
-    falls = np.diff(h.thresholds, prepend=0.0)
+    falls = np.diff(h.thresholds, prepend=0.0)[:m]
     whole = np.eye(rest.size)
     whole[:m, :m] = -np.tril(np.ones((m, m))) * falls
-    low = np.concatenate([np.zeros(m), np.minimum(h.lag_range[0], rest[m:])])
-    high = np.concatenate([np.ones(m), np.maximum(h.lag_range[1], rest[m:])])
+    # creep has followed voltages of the range
+    reach = h(np.linspace(*h.span, 65)) - h(np.array([u0]))
+    far = np.repeat([[reach.min(), -FAR], [reach.max(), FAR]], [c, z], axis=1)
+    lags = h.lag_range[:, :k]
+    low = np.concatenate([np.zeros(m), np.minimum([*lags[0], *far[0]], rest[m:])])
+    high = np.concatenate([np.ones(m), np.maximum([*lags[1], *far[1]], rest[m:])])
     margin = 1e-9 * np.maximum(high - low, 1.0)
-    origin = np.append(np.full(m, u0), np.zeros(rates.size))
-    found: list[tuple[float, NDArray[np.float64]]] = []
+    weak = np.repeat(np.sqrt([LAG_PULL, CREEP_PULL, 0.0]), [k, c, z])
+    origin = np.append(np.full(m, u0), np.zeros(k + c + z))
+    found: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
     # a play that was caught at once tells nothing of where else it may have stood: both of its
     # ends are tried, those of a voltage that came up and of one that came down
     down = np.minimum(u0, max(u0, h.span[1]) - h.thresholds)
-    for plays in (rest[:m], down):
+    for plays in (rest[:m], down) if m else (rest[:m],):
         falls_of = np.diff(-plays, prepend=-u0) / falls
         number = np.clip(np.concatenate([falls_of, rest[m:]]), low, high)
-        memory = origin + whole @ number
-        e = error(memory)
+        state = origin + whole @ number
+        e = error(state)
         for _ in range(TRIALS):
             columns = []
-            rise = h.rise(memory[:m], u0)
-            for r, q, f in zip(h.thresholds, rise, memory[:m], strict=True):
+            rise = h.rise(state[:m], u0) if m else np.empty(0)
+            for r, q, f in zip(h.thresholds[:m], rise, state[:m], strict=True):
                 # the play follows its start only while neither bound has caught it
                 moved = np.clip(f, np.minimum(top - r, bottom), bottom)
                 free = ((np.abs(moved - f) < 1e-12) & (top - r < bottom)).astype(np.float64)
                 columns.append(q * passed(free))
             pull = np.sqrt(PULL) * np.maximum(rise, 1e-3)
-            pull = np.sqrt(e.size) * np.append(pull, np.full(rates.size, np.sqrt(LAG_PULL)))
-            A = np.vstack([np.array([*columns, *lags]).T, np.diag(pull)]) @ whole
-            target = np.concatenate([e, pull * (rest - memory)])
+            pull = np.sqrt(e.size) * np.append(pull, weak)
+            A = np.vstack([np.array([*columns, *others]).T, np.diag(pull)]) @ whole
+            target = np.concatenate([e, pull * (rest - state)])
             step = lsq_linear(A, target, (low - number - margin, high - number + margin)).x
             # a play may be caught sooner or later than before: then the full step goes too far
             for share in (1.0, 0.5, 0.25, 0.125):
@@ -196,8 +291,9 @@ def fit_memory(model: StageModel, piece: Piece) -> NDArray[np.float64]:
             else:
                 break
             moved_by = np.abs(trial - number).max()
-            number, e, memory = trial, new, origin + whole @ trial
+            number, e, state = trial, new, origin + whole @ trial
             if moved_by < 1e-6:
                 break
-        found.append((float(e @ e), memory))
-    return min(found, key=lambda one: one[0])[1]
+        found.append((float(e @ e), state, e))
+    _, state, e = min(found, key=lambda one: one[0])
+    return start(state), e

@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
+from piezo_ident.effects.creep import Creep
 from piezo_ident.model.scaling import Scaling
-from piezo_ident.model.stream import Stream
+from piezo_ident.model.stream import Start, StartLike, Stream
 from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
@@ -129,24 +130,34 @@ class StageModel:
         static = replace(Dynamics.unit(), b=np.array([self.dynamics.gain]))
         return replace(self, dynamics=static, delay=Delay(0), effects=())
 
-    def chain(self, memory: ArrayLike | None = None) -> Chain:
+    def chain(self, start: StartLike = None) -> Chain:
         """
         Return fresh operators in their order.
 
         Parameters
         ----------
-        memory : array_like, shape (m,) or (m + k,), optional
-            Play outputs at the start, normalised; behind them the lags along the path, if any.
+        start : Start or array_like, optional
+            As of `simulate`.
+
+        Raises
+        ------
+        ModelError
+            When the start is that of another model.
         """
-        core: Operator = HysteresisOperator(self.hysteresis, memory)
+        start = Start.of(start)
+        core: Operator = HysteresisOperator(self.hysteresis, start.memory)
         for setting in self.effects_in('hysteresis'):
             effect = find_effect(setting.name)
             core = effect(self.sample_rate, setting.parameters, self.hysteresis, core)
+        hidden = self._operators('hidden')
+        for operator in hidden:
+            if isinstance(operator, Creep):
+                operator.start_from(start.creep)
         return Chain(
             (
                 *self._operators('input'),
                 core,
-                *self._operators('hidden'),
+                *hidden,
                 DynamicsOperator(self.dynamics),
                 DelayOperator(self.total_delay),
                 *self._operators('output'),
@@ -197,7 +208,7 @@ class StageModel:
         v: ArrayLike,
         *,
         channels: Mapping[str, ArrayLike] | None = None,
-        start: ArrayLike | None = None,
+        start: StartLike = None,
     ) -> NDArray[np.float64]:
         """
         Return the displacement that a voltage causes, in free run; warn outside the range.
@@ -208,9 +219,10 @@ class StageModel:
             Voltage [V], sampled at `sample_rate`; the stage is at rest under the first sample.
         channels : mapping of str to array_like, shape (n,), optional
             Further signals that effects of the model depend on.
-        start : array_like, shape (m,) or (m + k,), optional
+        start : Start, or array_like of shape (m,) or (m + k,), optional
             Play outputs before the first sample, normalised, and behind them the lags along the
-            path; those of a stage that last came down to zero when absent.
+            path; those of a stage that last came down to zero when absent.  A
+            `piezo_ident.model.stream.Start` says also how far creep is from its rest.
 
         Returns
         -------
@@ -263,14 +275,14 @@ class StageModel:
 
         return invert(self, wanted, **options)
 
-    def stream(self, memory: ArrayLike | None = None) -> Stream:
+    def stream(self, start: StartLike = None) -> Stream:
         """
         Return a run of this model that takes the voltage block by block.
 
         Parameters
         ----------
-        memory : array_like, shape (m,) or (m + k,), optional
-            As `start` of `simulate`.
+        start : Start or array_like, optional
+            As of `simulate`.
 
         Examples
         --------
@@ -283,9 +295,9 @@ class StageModel:
         >>> bool(np.all(y == model.simulate(v)))
         True
         """
-        return Stream(self, memory)
+        return Stream(self, start)
 
-    def predict_piece(self, piece: Piece, memory: ArrayLike | None = None) -> NDArray[np.float64]:
+    def predict_piece(self, piece: Piece, start: StartLike = None) -> NDArray[np.float64]:
         """
         Return the predicted displacement of one piece [m], shape (n,).
 
@@ -295,7 +307,7 @@ class StageModel:
             When the piece has another sampling rate.
         """
         self.check_rate(piece)
-        return self.stream(memory).follow(piece)
+        return self.stream(start).follow(piece)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,22 +20,50 @@ from piezo_ident.record.record import Piece
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['CHUNK', 'Stream']
+__all__ = ['CHUNK', 'Start', 'StartLike', 'Stream']
 
 #: samples that pass the chain at once; small enough for the signals to stay in the cache
 CHUNK = 8192
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """
+    What a stage keeps of its motion before a run.
+
+    Attributes
+    ----------
+    memory : array_like, shape (m,) or (m + k,), or None
+        Play outputs, normalised, and behind them the lags along the path; None for those of a
+        stage that last came down to zero.
+    creep : ndarray, shape (c,)
+        How far each element of creep is beyond its rest, normalised; empty where all rest.
+    """
+
+    memory: ArrayLike | None = None
+    creep: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of(cls, start: StartLike) -> Start:
+        """Return a start of which the memory alone may be given."""
+        return start if isinstance(start, Start) else cls(start)
+
+
+#: where a run begins; of an array, the memory alone
+StartLike: TypeAlias = 'Start | ArrayLike | None'
 
 
 class Stream:
     """
     One run of a model, block by block, in volts and metres.
 
-    The stage is at rest under the first sample after construction or `reset`.
+    The stage is at rest under the first sample after construction or `reset`, but for what a
+    start says.
     """
 
-    def __init__(self, model: StageModel, memory: ArrayLike | None = None) -> None:
+    def __init__(self, model: StageModel, start: StartLike = None) -> None:
         self.model = model
-        self._chain = model.chain(memory)
+        self._chain = model.chain(start)
         self._count = 0
         self._started = False
         self._cascade: _Cascade | None = None

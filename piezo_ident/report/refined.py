@@ -12,7 +12,7 @@ import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.warnings import LAW_WORDS
-from piezo_ident.model.free_run import free_run
+from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
@@ -36,8 +36,7 @@ def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
 
 def _unseen(result: Diagnosis, record: Record) -> Unseen:
     models = (result.given, result.model)
-    runs = [free_run(model, record) for model in models]
-    before, after = (run.errors_after_start or run.errors for run in runs)
+    before, after = same_part_errors(*(free_run(model, record) for model in models))
     sines = zip(*(sine_errors(model, record) for model in models), strict=True)
     return Unseen(
         record=record.name,

@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import pty
+import re
 import shlex
 import signal
 import subprocess
@@ -191,6 +192,23 @@ def test_predict_from_a_voltage_alone(capsys, tmp_path, made, suffix):
     np.testing.assert_array_equal(table['y_hat'], y_hat)
     data = json.loads(succeed(capsys, *argv, '--json'))
     assert data['samples'] == piece.n and 'whole' not in data
+
+
+def test_predict_from_a_voltage_that_starts_in_its_middle(capsys, tmp_path, made):
+    v = pi.read(made / 'sine.csv').pieces[0].v
+    start = int(np.argmin(np.abs(v - v.mean())))
+    t = np.arange(v.size - start) / 2000.0
+    scan = tmp_path / 'scan.csv'
+    np.savetxt(scan, np.column_stack([t, v[start:]]), delimiter=',', header='t,v', comments='')
+    text = succeed(capsys, 'predict', made / 'model.yaml', scan)
+    (warning,) = (line for line in text.splitlines() if 'warning' in line)
+    width = float(re.search(r'stands (\S+) % of its span apart', warning)[1])
+    model = load(made / 'model.yaml')
+    # the same voltage from below and from above
+    up, down = (
+        model.simulate(np.repeat(way, 4000))[-1] for way in ([0, v[start]], [0, 10, v[start]])
+    )
+    assert width == pytest.approx(100 * abs((down - up) / model.scaling.Y), rel=0.05)
 
 
 def test_predict_warns_outside_the_identified_range(capsys, tmp_path, made):

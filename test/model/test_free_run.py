@@ -103,7 +103,7 @@ def test_another_rate_is_refused_for_sines_and_left_out_of_piece_runs():
 def test_free_run_of_a_piece_from_an_unknown_start():
     model = linear_stage(weights=(0.2, 0.2))
     v = sine(1.0, 3.0)
-    y = model.predict_piece(Piece(v, v, RATE), memory=np.array([0.4, 0.1]))
+    y = model.predict_piece(Piece(v, v, RATE), start=np.array([0.4, 0.1]))
     (run,) = piece_runs(model, Record((Piece(v, y, RATE),), 'r'))
     assert np.abs(run.y_hat - y).max() < 1e-8
 
