@@ -25,7 +25,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.inputs import checked_limits, checked_motion, padded
-from piezo_ident.control.linear_inverse import linear_inverse
+from piezo_ident.control.linear_inverse import linear_inverse, lowest_mode
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
 from piezo_ident.effects.creep import Creep
@@ -34,6 +34,7 @@ from piezo_ident.model.metrics import expected_error, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
+from scipy.signal import butter, sosfiltfilt
 
 __all__ = ['Inverse', 'invert']
 
@@ -252,6 +253,7 @@ def invert(
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
     warnings += _extrapolated(model, v, y)
+    warnings += _ringing(model, y)
     # the same of nearly the same motion
     warnings += (
         _creeping(model, float(v[0]))
@@ -330,6 +332,23 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
             f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
         )
     return told
+
+
+def _ringing(model: StageModel, y: Array) -> list[str]:
+    """Return a warning where a motion holds more above the lowest mode than the model errs."""
+    mode, expected = lowest_mode(model), expected_error(model)
+    if expected is None or not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
+        return []
+    sos = butter(4, mode, btype='highpass', fs=model.sample_rate, output='sos')
+    fast = sosfiltfilt(sos, np.pad(y - y[0], round(model.sample_rate / mode), mode='edge'))
+    share = percent_of_stroke(fast, np.zeros_like(fast), float(np.ptp(y)))
+    if share <= expected:
+        return []
+    return [
+        f'{share:.2g} % of the motion lie above {mode:.4g} Hz, where the stage rings: corners or '
+        'jumps. What the model does not know of that comes on top; round the corners, or let the '
+        'scan learn'
+    ]
 
 
 def _creeping(model: StageModel, v0: float) -> list[str]:

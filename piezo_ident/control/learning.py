@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import FAR, Inverse, invert
-from piezo_ident.control.linear_inverse import smoothed
+from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
 
@@ -42,8 +42,6 @@ SMALLEST = 0.2
 OF_MODE, OF_RATE = 0.7, 0.1
 #: share of the error that a run leaves where the corner holds it up, and by what it then grows
 SLOW, WIDER = 0.5, 2.0
-#: damping below which a mode rings
-RINGS = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +138,8 @@ class Learning:
         self._span = float(np.ptp(self._wanted)) or self._model_span
         self.repetitions: list[Repetition] = []
         self._step, self._missed = 1.0, np.zeros_like(self._wanted)
-        modes = (m for m in model.dynamics.modes(model.sample_rate) if m.damping < RINGS)
-        lowest = min((OF_MODE * mode.frequency for mode in modes), default=math.inf)
-        self.corner = min(lowest, OF_RATE * model.sample_rate) if corner is None else corner
+        own = min(OF_MODE * lowest_mode(model), OF_RATE * model.sample_rate)
+        self.corner = own if corner is None else corner
         if not 0.0 < self.corner < math.inf:
             raise DataError(f'learning: a corner of {corner} Hz; give one above zero')
         self._rate = model.sample_rate

@@ -8,11 +8,13 @@ The inverse of G and the delay, as a filter that looks ahead.
 
 G has zeros outside the unit circle, where a causal inverse grows without end, and a delay, which
 none makes up for; a filter that knows the wanted motion some time ahead has neither limit.  Where
-the stage hardly moves, above its modes, epsilon keeps the voltage small.  It is the stable
-inversion of S. Devasia, D. Chen and B. Paden, "Nonlinear inversion-based output tracking", IEEE
-Trans. Automatic Control 41(7), 1996, doi:10.1109/9.508898, for a linear system, with the weight on
-the voltage of S. Devasia, "Should model-based inverse inputs be used as feedforward under plant
-uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.804478.
+the stage hardly moves, above its modes, epsilon keeps the voltage small.  There a model from data
+knows little, too: a corner of a scan, made up for in full, makes the real stage ring.
+
+It is the stable inversion of S. Devasia, D. Chen and B. Paden, "Nonlinear inversion-based output
+tracking", IEEE Trans. Automatic Control 41(7), 1996, doi:10.1109/9.508898, for a linear system,
+with the weight on the voltage of S. Devasia, "Should model-based inverse inputs be used as
+feedforward under plant uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.804478.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import Effect, find_effect
+from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -35,15 +38,18 @@ __all__ = [
     'LinearInverse',
     'check_preview',
     'is_filter',
+    'least_gain',
     'least_preview',
     'linear_inverse',
+    'lowest_mode',
     'smoothed',
 ]
 
 Array = NDArray[np.float64]
 
-#: gain of G, as a share of the static one, below which it is not made up for
-EPSILON = 3e-2
+#: gain of G, as a share of the static one, below which it is not made up for: of a model that is
+#: exact, and of one from data, which knows little of what hardly moves
+EXACT, FROM_DATA = 3e-2, 0.1
 #: what may lie outside of the filter, as a share of the sum of its magnitudes
 OUTSIDE = 1e-7
 #: the same, where rounding leaves more
@@ -57,6 +63,8 @@ SHORTEST, LONGEST, OF_DELAY = 1 << 11, 1 << 19, 8
 #: what a shortened filter may miss before the present sample, as a share of the sum of its
 #: magnitudes, and its most samples there
 MISSED, MOST_BEHIND = 1e-6, 8192
+#: damping below which a mode rings
+RINGS = 0.2
 #: delays of the model that a preview must reach for the filter to be worth anything
 BEYOND = 1.2
 
@@ -121,7 +129,7 @@ def linear_inverse(model: StageModel) -> LinearInverse:
     left = np.inf
     while n <= LONGEST:
         G = _response(model, n)
-        Q = np.conj(G) / (np.abs(G) ** 2 + (EPSILON * np.abs(G[0])) ** 2)
+        Q = np.conj(G) / (np.abs(G) ** 2 + (least_gain(model) * np.abs(G[0])) ** 2)
         taps = np.roll(np.fft.irfft(Q, n), n // 2)
         size = np.abs(taps)
         before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
@@ -140,6 +148,17 @@ def linear_inverse(model: StageModel) -> LinearInverse:
         f'the inverse of G and its delay takes more than {LONGEST} samples; identify again with a '
         'lower order'
     )
+
+
+def lowest_mode(model: StageModel) -> float:
+    """Return the frequency of the lowest mode that rings [Hz]; infinite where none does."""
+    modes = model.dynamics.modes(model.sample_rate)
+    return min((mode.frequency for mode in modes if mode.damping < RINGS), default=math.inf)
+
+
+def least_gain(model: StageModel) -> float:
+    """Return the gain of G, as a share of the static one, below which it is not made up for."""
+    return EXACT if expected_error(model) is None else FROM_DATA
 
 
 def least_preview(model: StageModel) -> float:

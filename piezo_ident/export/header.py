@@ -30,8 +30,8 @@ from piezo_ident.control.inputs import checked_limits
 from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
-    EPSILON,
     is_filter,
+    least_gain,
     linear_inverse,
     LinearInverse,
 )
@@ -230,8 +230,8 @@ def _says(
     )
     lacks = [
         'what the model does not know: noise, and its own error',
-        f'motion at which the gain of G is below {EPSILON:.0%} of the static one: there the '
-        'voltage is kept small',
+        f'motion at which the gain of G is below {least_gain(model):.0%} of the static one: there '
+        'the voltage is kept small',
     ]
     if Q.ahead < ahead:
         lacks.append(f'what the filter would take from samples {Q.ahead + 1} to {ahead} ahead')

@@ -4,10 +4,13 @@
 """The inverse of models as they come from identification and diagnosis, and what they expect."""
 
 from dataclasses import replace
+import re
 
 import numpy as np
 from paper_stage import FS, PAPER
 import piezo_ident as pi
+from piezo_ident.control import linear_inverse
+from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.stage_model import EffectSetting
@@ -71,3 +74,45 @@ def test_an_identified_model_brings_the_stage_where_it_is_told(name, request):
     assert error < (3.0 if name == 'refined' else 10.0) * drive.expected
     if name == 'refined':
         assert drive.expected < 0.5 * request.getfixturevalue('labelled').inverse(wanted).expected
+
+
+@pytest.fixture(scope='module')
+def behind_amplifier():
+    """Return a stage whose amplifier lags, and the model that has the lag in its G."""
+    lag = EffectSetting('amplifier_lag', {'time_constant': 8e-5})
+    stage = replace(pi.SimulatedStage.load('paper'), model=replace(PAPER, effects=(lag,)))
+    record = stage.play(parse_program(identification_program()), np.random.default_rng(0))
+    return stage.model, pi.identify(record, Settings(max_order=10)).model
+
+
+def scan(frequency, corners=0.0):
+    """Return lines of a scan [m], their corners rounded over a time [s], and a rise to them."""
+    t = np.arange(6000) / FS
+    lines = 1 - np.abs(1 - 2 * ((frequency * t) % 1.0))
+    rise = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, 2000))
+    y = 1e-6 * np.concatenate([20 * rise, 20 + 40 * lines])
+    return smoothed(y, 0.37 / corners, FS) if corners else y
+
+
+def test_corners_of_a_scan_are_not_made_up_for_in_full(behind_amplifier, monkeypatch):
+    truth, model = behind_amplifier
+
+    def missed(wanted):
+        drive = pi.invert(model, wanted)
+        error = truth.simulate(drive.v)[drive.lead :] - wanted
+        return 100 * np.sqrt(np.mean(error**2)) / np.ptp(wanted)
+
+    careful = missed(scan(60.0))
+    monkeypatch.setattr(linear_inverse, 'FROM_DATA', linear_inverse.EXACT)
+    assert careful < 0.12
+    # 0.2 % as of an exact model
+    assert careful < 0.6 * missed(scan(60.0))
+
+
+def test_corners_that_ring_are_told(behind_amplifier):
+    _, model = behind_amplifier
+    (warning,) = pi.invert(model, scan(60.0)).warnings
+    assert re.match(r'\S+ % of the motion lie above \d+ Hz, where the stage rings', warning)
+    assert not pi.invert(model, scan(60.0, corners=2e-3)).warnings
+    # of a model that is exact nothing is unknown
+    assert not pi.invert(PAPER, scan(60.0)).warnings
