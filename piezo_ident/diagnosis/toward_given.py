@@ -11,8 +11,10 @@ The given H came from motion of its own, so it counts as data, too:
 
 with h and h_0 the new and the given H under loops over the range of the model, n the number of
 rows, and c the mean of the difference, which offsets make up for.  An effect of the voltage that
-was there at the identification has bent the given H, which then does not count.  Nor does it where
-the data cover a part of the range alone: the refined model holds there and nowhere else.
+was there at the identification has bent the given H, which then counts less: by what the fit
+leaves of the squares that the given model leaves.  It is enough to keep terms that these rows
+hardly tell from growing, which make up for one another here and nowhere else.  The given H does
+not count where the data cover a part of the range alone: the refined model holds there only.
 """
 
 from __future__ import annotations
@@ -56,14 +58,17 @@ def loops(low: float, high: float) -> Array:
 
 
 def toward_given(
-    simulator: Simulator, given: State, fitted: Fitted, tick: Callable[[], None] = lambda: None
+    simulator: Simulator,
+    given: State,
+    fitted: Fitted,
+    tick: Callable[[], None] = lambda: None,
 ) -> Fitted:
     """Return a fit of rows without kinds of motion, drawn towards the H as given."""
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     is_bent = any(
         not added.effect.time_driven and added.name not in TESTED for added in fitted.state.effects
     )
-    if law is None or rows.kinds or is_bent or not rows.covers(scaling.range):
+    if law is None or rows.kinds or not rows.covers(scaling.range):
         return fitted
     u = loops(*map(float, scaling.u(scaling.range)))
     P = np.stack(list(law.columns(u)), axis=1)
@@ -72,6 +77,10 @@ def toward_given(
     h = h - h.mean()
     # as much as the rows: a smaller weight gained more here, and lost more under other motion
     weight = rows.n / u.size
+    if is_bent:
+        # it is off by what the effect made of it then, and may be by what it leaves now
+        e = rows.x - simulator.run(given)
+        weight *= min(1.0, float(fitted.errors.sum()) / float(e @ e))
     A = weight * (P.T @ P)
 
     def pull_at(state: State, size: int) -> Pull:
