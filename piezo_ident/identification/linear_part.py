@@ -25,7 +25,6 @@ from piezo_ident.identification.solvers.output_error import (
     OutputErrorFit,
     simulation_error,
 )
-from piezo_ident.identification.spectra import cross_spectra
 from piezo_ident.identification.step1_delay import delay_from_loss, MAX_DELAY, SCAN_ORDER
 from piezo_ident.identification.step2_dynamics import (
     ArxFactor,
@@ -35,6 +34,7 @@ from piezo_ident.identification.step2_dynamics import (
     stabilised,
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.residual.coherence import cross_spectra
 from scipy import optimize, signal
 
 __all__ = [

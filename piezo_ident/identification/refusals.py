@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.spectra import cross_spectra
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.residual.coherence import cross_spectra
 from piezo_ident.residual.stretches import block_means, true_runs
 from scipy import signal
 

@@ -10,20 +10,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.residual.coherence import cross_spectra
 from scipy import fft, signal
 
 __all__ = [
     'FrequencyResponse',
     'broadband_response',
-    'cross_spectra',
     'excited_band',
     'frequency_response',
     'highest_frequency',
     'prefilter',
 ]
 
-#: samples whose segments are transformed at once
-TOGETHER = 1 << 18
 #: longest segment of a frequency response [samples]
 SEGMENT = 8192
 #: a response of any motion keeps points of at most this relative standard deviation
@@ -61,46 +59,6 @@ def prefilter(x: NDArray[np.float64], sample_rate: float, cutoff: float) -> NDAr
         return centred
     sos = signal.butter(4, cutoff, fs=sample_rate, output='sos')
     return np.asarray(signal.sosfilt(sos, centred))
-
-
-def cross_spectra(
-    u: NDArray[np.float64], y: NDArray[np.float64], size: int, *, linear: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """
-    Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
-
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-    size : int
-        Length of the Hann segments, at most n; they overlap by half.
-    linear : bool, optional
-        Take a line out of each segment (default), or else its mean.
-
-    Returns
-    -------
-    tuple of ndarray, shape (size // 2 + 1,)
-        In no unit: only ratios of them tell anything.
-    """
-    window, step = signal.get_window('hann', size), size - size // 2
-    segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]
-    s_uu, s_yy = np.zeros((2, size // 2 + 1))
-    s_uy = np.zeros(size // 2 + 1, dtype=np.complex128)
-    rows = max(1, TOGETHER // size)
-    for start in range(0, len(segments[0]), rows):
-        U, Y = (fft.rfft(window * _detrended(x[start : start + rows], linear)) for x in segments)
-        s_uu += np.sum(np.abs(U) ** 2, axis=0)
-        s_yy += np.sum(np.abs(Y) ** 2, axis=0)
-        s_uy += np.sum(np.conj(U) * Y, axis=0)
-    return s_uu, s_yy, s_uy
-
-
-def _detrended(x: NDArray[np.float64], linear: bool) -> NDArray[np.float64]:
-    # as `scipy.signal.detrend`, without a least-squares problem for each segment
-    x = x - x.mean(axis=-1, keepdims=True)
-    t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
-    slope = (x @ t)[..., None] / max(float(t @ t), 1.0)
-    return np.asarray(x - slope * t) if linear else x
 
 
 @dataclass(frozen=True, eq=False)

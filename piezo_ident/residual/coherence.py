@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a residual follows the voltage: its coherence, with a bound."""
+"""Spectra of two signals, and whether a residual follows the voltage: coherence, with a bound."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from piezo_ident.residual.stretches import ResidualPart
 from scipy import fft, signal
 
-__all__ = ['Coherence', 'coherence']
+__all__ = ['Coherence', 'coherence', 'cross_spectra']
 
 Array = NDArray[np.float64]
 
+#: samples whose segments are transformed at once
+TOGETHER = 1 << 18
 #: of the bound
 CONFIDENCE = 0.99
 #: averages asked of a coherence, longest segment [samples]
@@ -52,6 +54,46 @@ class Coherence:
     share: float
 
 
+def cross_spectra(
+    u: Array, y: Array, size: int, *, linear: bool = True
+) -> tuple[Array, Array, NDArray[np.complex128]]:
+    """
+    Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+    size : int
+        Length of the Hann segments, at most n; they overlap by half.
+    linear : bool, optional
+        Take a line out of each segment (default), or else its mean.
+
+    Returns
+    -------
+    tuple of ndarray, shape (size // 2 + 1,)
+        In no unit: only ratios of them tell anything.
+    """
+    window, step = signal.get_window('hann', size), size - size // 2
+    segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]
+    s_uu, s_yy = np.zeros((2, size // 2 + 1))
+    s_uy = np.zeros(size // 2 + 1, dtype=np.complex128)
+    rows = max(1, TOGETHER // size)
+    for start in range(0, len(segments[0]), rows):
+        U, Y = (fft.rfft(window * _detrended(x[start : start + rows], linear)) for x in segments)
+        s_uu += np.sum(np.abs(U) ** 2, axis=0)
+        s_yy += np.sum(np.abs(Y) ** 2, axis=0)
+        s_uy += np.sum(np.conj(U) * Y, axis=0)
+    return s_uu, s_yy, s_uy
+
+
+def _detrended(x: Array, linear: bool) -> Array:
+    # as `scipy.signal.detrend`, without a least-squares problem for each segment
+    x = x - x.mean(axis=-1, keepdims=True)
+    t = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
+    slope = (x @ t)[..., None] / max(float(t @ t), 1.0)
+    return np.asarray(x - slope * t) if linear else x
+
+
 def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
     """Return the parts of the rate at which most was sampled."""
     rates: dict[float, int] = {}
@@ -78,19 +120,11 @@ def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
         return None
     n = int(2 ** np.floor(np.log2(max(64, 2 * total // AVERAGES))))
     n = min(n, SEGMENT)
-    window = signal.windows.hann(n, sym=False)
-    vv, ee, ve, count = np.zeros(n // 2 + 1), np.zeros(n // 2 + 1), 0j, 0
-    for part, start, stop in runs:
-        for k in range(start, stop - n + 1, n // 2):
-            v = window * signal.detrend(part.piece.v[k : k + n])
-            e = window * signal.detrend(part.e[k : k + n])
-            V, E = fft.rfft(v), fft.rfft(e)
-            vv += np.abs(V) ** 2
-            ee += np.abs(E) ** 2
-            ve = ve + np.conj(V) * E
-            count += 1
+    long = [(p.piece.v[a:b], p.e[a:b]) for p, a, b in runs if b - a >= n]
+    count = sum(1 + (v.size - n) // (n // 2) for v, _ in long)
     if count < 4:
         return None
+    vv, ee, ve = (sum(x) for x in zip(*(cross_spectra(v, e, n) for v, e in long), strict=True))
     averages = max(2.0, count * OVERLAP)
     tiny = np.finfo(float).tiny
     c = np.clip(np.abs(ve) ** 2 / np.maximum(vv * ee, tiny), 0.0, 1.0)

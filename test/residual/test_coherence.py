@@ -1,20 +1,21 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The coherence of voltage and residual: its bound and its share."""
+"""Spectra are those of SciPy; the coherence of voltage and residual, its bound and its share."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 from piezo_ident.record.record import Piece
 from piezo_ident.residual import ResidualPart
-from piezo_ident.residual.coherence import coherence
+from piezo_ident.residual.coherence import coherence, cross_spectra
 import pytest
-from scipy.signal import lfilter
+from scipy import signal
 
 N, RATE = 8000, 1000.0
 
 
 def noise():
-    return lfilter([0.1], [1, -0.9], np.random.default_rng(0).standard_normal(N))
+    return signal.lfilter([0.1], [1, -0.9], np.random.default_rng(0).standard_normal(N))
 
 
 def part(v, e):
@@ -39,3 +40,18 @@ def test_the_coherent_share_is_all_but_the_noise():
 
 def test_too_little_data_give_nothing():
     assert coherence([part(np.arange(40.0), np.zeros(40))]) is None
+
+
+@pytest.mark.parametrize('linear', [True, False])
+@pytest.mark.parametrize('size', [64, 65])
+def test_spectra_are_those_of_scipy(size, linear):
+    rng = np.random.default_rng(4)
+    u, y = rng.standard_normal((2, 1000)) + np.linspace(2, 5, 1000)
+    how = {'nperseg': size, 'detrend': 'linear' if linear else 'constant'}
+    ours, pairs = cross_spectra(u, y, size, linear=linear), ((u, u), (y, y), (u, y))
+    # twice the power but for the mean and, at an even size, half the sampling rate
+    for found, pair in zip(ours, pairs, strict=True):
+        theirs = signal.csd(*pair, **how)[1][1:-1]
+        assert_allclose(found[1:-1] / theirs, (found[1:-1] / theirs)[0], rtol=1e-9)
+    scale = [(a / signal.csd(*p, **how)[1])[1] for a, p in zip(ours, pairs, strict=True)]
+    assert_allclose(scale, scale[0], rtol=1e-9)
