@@ -4,28 +4,18 @@
 """The benchmarks' contract and the page that is made of them; no time is judged here."""
 
 import ast
-import importlib
 from pathlib import Path
-import sys
 
+import bench_growth as growth
+import bench_peers_arx as arx
+import bench_peers_swarm as swarm
 import numpy as np
 import pytest
+import run_all
+from side_by_side import seconds, take_turns, Turn
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'benchmarks'
-
-
-@pytest.fixture(scope='module')
-def load():
-    """Return a function that imports a file of the benchmarks."""
-    sys.path.insert(0, str(FOLDER))
-    yield importlib.import_module
-    sys.path.remove(str(FOLDER))
-
-
-@pytest.fixture(scope='module')
-def run_all(load):
-    return load('run_all')
 
 
 GOOD = """
@@ -57,7 +47,7 @@ def write(folder, **modules):
     return folder
 
 
-def test_every_benchmark_keeps_the_contract(run_all):
+def test_every_benchmark_keeps_the_contract():
     found = {path.stem for path in run_all.benchmarks()}
     assert {'bench_growth', 'bench_peers_arx', 'bench_peers_hysteresis'} <= found
     assert 'bench_live' not in found
@@ -75,7 +65,7 @@ def test_every_benchmark_keeps_the_contract(run_all):
         assert any('__main__' in ast.unparse(node.test) for node in guards), path.name
 
 
-def test_page_of_one_benchmark_that_works_and_one_that_does_not(run_all, tmp_path, capsys):
+def test_page_of_one_benchmark_that_works_and_one_that_does_not(tmp_path, capsys):
     folder = write(tmp_path, zebra=GOOD, ape=LACKING, cow=NONE)
     out = tmp_path / 'docs' / 'page.md'
     code = run_all.main(['--out', str(out), '--quick'], folder)
@@ -98,14 +88,14 @@ def test_page_of_one_benchmark_that_works_and_one_that_does_not(run_all, tmp_pat
     assert 'ape' not in text
 
 
-def test_unknown_benchmark_is_refused(run_all, tmp_path, capsys):
+def test_unknown_benchmark_is_refused(tmp_path, capsys):
     folder = write(tmp_path, zebra=GOOD)
     with pytest.raises(SystemExit, match='2'):
         run_all.main(['--out', str(tmp_path / 'page.md'), '--only', 'zebu'], folder)
     assert 'no benchmark zebu; there are zebra' in capsys.readouterr().err
 
 
-def test_a_benchmark_that_does_not_end_is_ended(run_all, tmp_path):
+def test_a_benchmark_that_does_not_end_is_ended(tmp_path):
     write(tmp_path, slow=ENDLESS)
     outcome = run_all.run(tmp_path / 'bench_slow.py', quick=True, limit=0.5)
     assert outcome.sections == ()
@@ -113,43 +103,38 @@ def test_a_benchmark_that_does_not_end_is_ended(run_all, tmp_path):
     assert outcome.seconds < 60.0
 
 
-def test_turns_are_taken_in_order_and_some_take_fewer(load):
-    side = load('side_by_side')
+def test_turns_are_taken_in_order_and_some_take_fewer():
     called = []
 
     def work(name):
         return lambda k: called.append((name, k)) or (name, k)
 
-    turns = side.take_turns({'a': work('a'), 'b': work('b')}, 3, fewer={'b': 2}, warm=['a'])
+    turns = take_turns({'a': work('a'), 'b': work('b')}, 3, fewer={'b': 2}, warm=['a'])
     assert called == [('a', 0), ('a', 0), ('b', 0), ('a', 1), ('b', 1), ('a', 2)]
     assert turns['a'].results == [('a', 0), ('a', 1), ('a', 2)]
     assert len(turns['b'].times) == 2
     assert turns['a'].over(turns['a']) == 1.0
 
 
-def test_ratio_of_two_works_is_the_median_over_pairs(load):
-    side = load('side_by_side')
-    one, other = side.Turn([2.0, 30.0, 4.0]), side.Turn([1.0, 10.0])
+def test_ratio_of_two_works_is_the_median_over_pairs():
+    one, other = Turn([2.0, 30.0, 4.0]), Turn([1.0, 10.0])
     assert one.over(other) == pytest.approx(2.5)
     assert one.median == 4.0
 
 
-def test_times_have_their_unit(load):
-    seconds = load('side_by_side').seconds
+def test_times_have_their_unit():
     texts = [seconds(t) for t in (2.345, 0.0123, 4.5e-6, 1.234e-8, 1234.4)]
     assert texts == ['2.35 s', '12.3 ms', '4.5 µs', '12.3 ns', '1234 s']
 
 
-def test_exponent_is_the_slope_at_the_large_end(load):
-    growth = load('bench_growth')
+def test_exponent_is_the_slope_at_the_large_end():
     sizes = [1.0, 10.0, 100.0, 1000.0]
     # a fixed cost bends the small end alone
     assert growth.exponent(sizes, [5.0, 1e2, 1e4, 1e6]) == pytest.approx(2.0)
     assert np.isnan(growth.exponent([1.0], [1.0]))
 
 
-def test_growth_measures_in_a_process_of_its_own(load, tmp_path):
-    growth = load('bench_growth')
+def test_growth_measures_in_a_process_of_its_own(tmp_path):
     took, n, peak = growth.measured('stream', 2.0, tmp_path)
     assert took > 0.0
     assert n == 40_000
@@ -158,8 +143,7 @@ def test_growth_measures_in_a_process_of_its_own(load, tmp_path):
         growth.measured('read', 2.0, tmp_path)
 
 
-def test_order_search_is_judged_on_data_of_its_own(load):
-    arx = load('bench_peers_arx')
+def test_order_search_is_judged_on_data_of_its_own():
     data = arx.data_of(0)
     assert data.u.size == 16_000
     assert data.u_test.size == data.y_test.size == 4_000
@@ -168,8 +152,7 @@ def test_order_search_is_judged_on_data_of_its_own(load):
     assert data.error((np.ones(1), np.array([-1.1]))) == float('inf')
 
 
-def test_swarm_problem_is_that_of_the_identification(load):
-    swarm = load('bench_peers_swarm')
+def test_swarm_problem_is_that_of_the_identification():
     task = swarm.problem()
     assert task.A.shape[1] == task.box.shape[0] == 11
     cost = swarm.Cost(task)

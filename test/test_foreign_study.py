@@ -5,23 +5,27 @@
 
 import ast
 from dataclasses import replace
-import importlib
 from itertools import pairwise
 from pathlib import Path
-import sys
 
+from foreign import (
+    case,
+    cores,
+    families,
+    fresh_cores,
+    make_stage,
+    record_motion,
+    references,
+    sealed_cores,
+    unseen_cores,
+)
+from foreign.sizes import size_of
+from foreign.stage import Linear, make_core
 import numpy as np
 import pytest
+import study_foreign as study
 
 FOLDER = Path(__file__).resolve().parents[1] / 'benchmarks'
-
-
-@pytest.fixture(scope='module')
-def load():
-    """Return a function that imports a file of the benchmarks."""
-    sys.path.insert(0, str(FOLDER))
-    yield importlib.import_module
-    sys.path.remove(str(FOLDER))
 
 
 def test_stages_know_nothing_of_what_is_judged():
@@ -36,8 +40,7 @@ def test_stages_know_nothing_of_what_is_judged():
             assert not [n for n in names if n.startswith('piezo_ident')], path.name
 
 
-def test_preisach_operator_is_the_sum_of_its_relays(load, monkeypatch):
-    cores = load('foreign.cores')
+def test_preisach_operator_is_the_sum_of_its_relays(monkeypatch):
     cells = 30
     monkeypatch.setattr(cores, 'CELLS', cells)
 
@@ -64,9 +67,7 @@ def test_preisach_operator_is_the_sum_of_its_relays(load, monkeypatch):
 
 
 @pytest.mark.parametrize('group', ['tuning', 'known', 'former', 'past', 'final'])
-def test_cores_are_those_of_piezos(load, group):
-    families, cores = load('foreign.families'), load('foreign.cores')
-    make_core = load('foreign.stage').make_core
+def test_cores_are_those_of_piezos(group):
     for name in dict.fromkeys(families.SETS[group]):
         core = make_core(name, np.random.default_rng(5))
         _, rise, fall = cores.steady_loop(core)
@@ -78,10 +79,9 @@ def test_cores_are_those_of_piezos(load, group):
         assert 0.0005 < cores.unlike_plays(core) < 0.01
 
 
-def test_laws_of_the_final_set_are_in_no_other(load):
-    sets = load('foreign.families').SETS
-    others = {name for group, names in sets.items() if group != 'final' for name in names}
-    assert not set(sets['final']) & others
+def test_laws_of_the_final_set_are_in_no_other():
+    others = {name for group, names in families.SETS.items() if group != 'final' for name in names}
+    assert not set(families.SETS['final']) & others
 
 
 def tour(levels, count=400, bend=1.0):
@@ -96,8 +96,7 @@ ROUND = [0.0, 1.0, 0.0, 0.6, 0.3, 0.6, 1.0, 0.0]
 
 
 @pytest.mark.parametrize('group', ['former', 'past', 'final'])
-def test_laws_know_no_time(load, group):
-    families = load('foreign.families')
+def test_laws_know_no_time(group):
     levels = [*ROUND, *np.random.default_rng(2).uniform(0.0, 1.0, 20)]
     for name in dict.fromkeys(families.SETS[group]):
         law = families.LAWS[name](np.random.default_rng(5))
@@ -106,12 +105,11 @@ def test_laws_know_no_time(load, group):
         assert law(fast)[then] == pytest.approx(z, abs=1e-5 * np.ptp(z)), name
 
 
-def test_strain_is_exponential_in_a_stress_that_fades(load):
-    cores, laws = load('foreign.cores'), load('foreign.unseen_cores')
+def test_strain_is_exponential_in_a_stress_that_fades():
     limit, most, fading = 0.1, 1.2, 3.0
     one = np.ones(1)
     u, at = tour(ROUND)
-    z = laws.back_stresses_of(
+    z = unseen_cores.back_stresses_of(
         0.0, limit * one, 0.0 * one, most * one[None], fading * one[None], one
     )(u)
     rise, turned = u[: at[1] + 1], np.maximum(u[at[1] : at[2] + 1] + limit, limit)
@@ -123,13 +121,12 @@ def test_strain_is_exponential_in_a_stress_that_fades(load):
     # every loop goes on
     assert z[at[5]] - z[at[3]] > 1e-3
     nothing = np.zeros((1, 1))
-    play = laws.back_stresses_of(0.0, limit * one, 2.0 * one, nothing, nothing, one)(u)
+    play = unseen_cores.back_stresses_of(0.0, limit * one, 2.0 * one, nothing, nothing, one)(u)
     own = 0.5 * (cores.play(u, 2 * limit) + limit)
     assert play[at[1] :] == pytest.approx(own[at[1] :], abs=1e-12)
 
 
-def test_domains_grow_cell_by_cell(load):
-    laws = load('foreign.unseen_cores')
+def test_domains_grow_cell_by_cell():
     rng, count = np.random.default_rng(7), 300
     middle, half = rng.uniform(0.0, 1.0, count), rng.uniform(0.02, 0.2, count)
     grow = np.stack([middle + half, middle - half])
@@ -146,14 +143,14 @@ def test_domains_grow_cell_by_cell(load):
                 falls = x <= np.where(fallen, grow[1], begin[1])
                 up = np.where(up, ~falls, rises)
             expected.append(up.mean())
-        z = laws.growing_domains_of(grow, begin)(u)
+        z = unseen_cores.growing_domains_of(grow, begin)(u)
         assert z == pytest.approx(np.array(expected), abs=1e-12)
         assert z[at[5]] == z[at[3]]
     # with one place to begin, and none to end, a domain comes as far as the first pins
     begin = np.stack([np.full(count, np.inf), np.full(count, -np.inf)])
     begin[0, 0] = 0.2
     grow[0, 0] = 0.2
-    z = laws.growing_domains_of(grow, begin)(np.array([0.0, 0.19, 0.6, 0.8]))
+    z = unseen_cores.growing_domains_of(grow, begin)(np.array([0.0, 0.19, 0.6, 0.8]))
     assert z[1] == 0.0
     for x, share in zip((0.6, 0.8), z[2:], strict=True):
         ahead = np.argmax(grow[0] > x)
@@ -161,10 +158,10 @@ def test_domains_grow_cell_by_cell(load):
         assert share == pytest.approx((ahead + behind) / count)
 
 
-def test_a_turn_scales_what_is_left_of_a_phase(load):
-    laws = load('foreign.unseen_cores')
+def test_a_turn_scales_what_is_left_of_a_phase():
     rise, fall, broad = 0.6, 0.35, 0.05
-    law = laws.phase_fractions_of(np.array([[rise], [fall]]), np.array([broad]), np.ones(1))
+    turns = np.array([[rise], [fall]])
+    law = unseen_cores.phase_fractions_of(turns, np.array([broad]), np.ones(1))
     u, at = tour([-1.0, 0.6, 0.3, 0.6])
     z = law(u)
     up, down = 1.0 / (1.0 + np.exp((rise - u) / broad)), 1.0 / (1.0 + np.exp((fall - u) / broad))
@@ -176,21 +173,20 @@ def test_a_turn_scales_what_is_left_of_a_phase(load):
     assert z[at[3]] - z[at[1]] > 0.05
 
 
-def test_moments_turn_to_the_field_and_jump(load):
-    laws = load('foreign.unseen_cores')
+def test_moments_turn_to_the_field_and_jump():
     one, reach = np.ones(1), (-2.0, 2.0)
     u, at = tour([-2.0, 2.0, -2.0, 0.5], 1000)
     # along the field a relay, across it no hysteresis
-    relay = laws.rotating_grains_of(0.0 * one, 0.8 * one, 0.1 * one, reach)(u)
+    relay = unseen_cores.rotating_grains_of(0.0 * one, 0.8 * one, 0.1 * one, reach)(u)
     first, second = u[: at[1]], u[at[1] : at[2]]
     assert relay[: at[1]] == pytest.approx(np.where(first >= 0.7, 1.0, -1.0))
     assert relay[at[1] : at[2]] == pytest.approx(np.where(second <= -0.9, -1.0, 1.0))
-    across = laws.rotating_grains_of(0.499 * np.pi * one, one, 0.0 * one, reach)(u)
+    across = unseen_cores.rotating_grains_of(0.499 * np.pi * one, one, 0.0 * one, reach)(u)
     assert across == pytest.approx(np.clip(u, -1.0, 1.0), abs=0.02)
     # it jumps at the astroid, and rests where no torque is
     for degrees, fold in ((15, 0.6147), (45, 0.5), (75, 0.6147)):
         axis = np.radians(degrees)
-        z = laws.rotating_grains_of(axis * one, one, 0.0 * one, reach)(u)
+        z = unseen_cores.rotating_grains_of(axis * one, one, 0.0 * one, reach)(u)
         steps = np.diff(z[: at[1] + 1])
         assert u[np.argmax(steps) + 1] == pytest.approx(fold, abs=0.005)
         upper = slice(at[1], at[1] + 600)
@@ -199,13 +195,12 @@ def test_moments_turn_to_the_field_and_jump(load):
         assert np.abs(torque).max() < 2e-3
 
 
-def test_a_grain_switches_where_the_work_is_enough(load):
-    laws = load('foreign.unseen_cores')
+def test_a_grain_switches_where_the_work_is_enough():
     along, u = np.array([[1.0, 0.0, 0.0]]), np.array([0.0, 0.69, 0.71, 0.51, 0.49, 0.31, 0.29])
     # stress takes it to an axis across the field: +0.5 for 0 -> 1 beside the work of 0.2
     stress, own = np.array([-0.5]), np.zeros(1)
     for opposing, last in ((0.0, [1, 1, 1, 0]), (0.2, [1, 0, 0, 0])):
-        law = laws.tetragonal_grains_of(along, stress, own, (0.2, 0.5), opposing)
+        law = unseen_cores.tetragonal_grains_of(along, stress, own, (0.2, 0.5), opposing)
         assert law(u) == pytest.approx(np.array([0, 0, 1, *last]))
     # many, against trying every switch
     rng, count = np.random.default_rng(7), 60
@@ -227,17 +222,16 @@ def test_a_grain_switches_where_the_work_is_enough(load):
                     break
                 s = int(np.argmax(spare))
             expected[k, i] = moments[i, s] ** 2
-    z = laws.tetragonal_grains_of(along, stress, own, (0.1, 0.15))(u)
+    z = unseen_cores.tetragonal_grains_of(along, stress, own, (0.1, 0.15))(u)
     assert z == pytest.approx(expected.mean(axis=1), abs=0.03)
     assert np.median(np.abs(z - expected.mean(axis=1))) < 1e-12
 
 
-def test_a_turn_begins_the_loss_of_energy_anew(load):
-    cores, laws = load('foreign.cores'), load('foreign.fresh_cores')
+def test_a_turn_begins_the_loss_of_energy_anew():
     # without a reversible field: u - 0.5 = m + loss, whose sign changes behind a turn
     p = np.array([1.0, 0.0, 3.0, 0.1, 0.0, 50.0])
     u, at = tour(ROUND)
-    m = cores.law_of(laws._energy_balance, 0.5, p)(u)
+    m = cores.law_of(fresh_cores._energy_balance, 0.5, p)(u)
     rise, fall = slice(at[2] + 320, at[3]), slice(at[1] + 200, at[2])
     assert m[rise] == pytest.approx(u[rise] - 0.6, abs=1e-3)
     assert m[fall] == pytest.approx(u[fall] - 0.4, abs=1e-3)
@@ -246,10 +240,9 @@ def test_a_turn_begins_the_loss_of_energy_anew(load):
     assert turned - loss == pytest.approx(u[at[1] : at[2]] - 0.5, abs=1e-3)
 
 
-def test_a_branch_goes_over_into_its_limiting_one(load):
-    cores, laws = load('foreign.cores'), load('foreign.fresh_cores')
+def test_a_branch_goes_over_into_its_limiting_one():
     u, at = tour(ROUND)
-    z = np.arctanh(cores.law_of(laws._limiting_loops, 0.5, 0.1, 1.5, 0.8)(u)) / 1.5
+    z = np.arctanh(cores.law_of(fresh_cores._limiting_loops, 0.5, 0.1, 1.5, 0.8)(u)) / 1.5
     # 0.1 ahead at the turn, where 0.2 of the slope is left, and no more than 0.16 behind it
     fall = slice(at[1], at[1] + 2)
     assert np.diff(z[fall])[0] == pytest.approx(0.2 * np.diff(u[fall])[0], rel=0.05)
@@ -257,14 +250,13 @@ def test_a_branch_goes_over_into_its_limiting_one(load):
     assert z[at[2] + 150 : at[3]] == pytest.approx(u[at[2] + 150 : at[3]] - 0.55, abs=1e-3)
 
 
-def test_a_line_hops_from_pin_to_pin(load):
-    laws = load('foreign.fresh_cores')
+def test_a_line_hops_from_pin_to_pin():
     rng = np.random.default_rng(7)
     at_pin = np.cumsum(rng.uniform(0.02, 0.06, (40, 25)), axis=1) - 0.1
     strength = rng.uniform(0.05, 0.2, at_pin.shape)
     u, at = tour(ROUND, 100)
     for tension in (0.0, 0.5):
-        z = laws.pinned_line_of(at_pin, strength, tension)(u)
+        z = fresh_cores.pinned_line_of(at_pin, strength, tension)(u)
         held = strength.copy()
         gap = (0.5 + tension) * np.diff(at_pin, axis=1)
         held[:, 1:] = np.maximum(held[:, 1:], gap)
@@ -285,11 +277,10 @@ def test_a_line_hops_from_pin_to_pin(load):
         assert z[at[5]] == pytest.approx(z[at[3]], abs=1e-12)
 
 
-def test_strain_comes_nearer_to_its_bounding_line(load):
-    cores, laws = load('foreign.cores'), load('foreign.fresh_cores')
+def test_strain_comes_nearer_to_its_bounding_line():
     one = np.ones(1)
     u, at = tour(ROUND, 4000)
-    z = cores.law_of(laws._bounding_lines, 0.5, 0.1 * one, 4.0 * one, one)(u)
+    z = cores.law_of(fresh_cores._bounding_lines, 0.5, 0.1 * one, 4.0 * one, one)(u)
     fall = slice(at[1], at[2] + 1)
     # the slope is 1 / (1 + hard gap / (first - gap))
     gap = 0.1 - z[fall] + (u[fall] - 0.5)
@@ -301,16 +292,15 @@ def test_strain_comes_nearer_to_its_bounding_line(load):
     assert gap[-1] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_moment_follows_its_field_on_a_tractrix(load):
-    cores, laws = load('foreign.cores'), load('foreign.sealed_cores')
+def test_a_moment_follows_its_field_on_a_tractrix():
     one, r, bow, middle = np.ones(1), 0.15, 1.5, 0.4
     u, at = tour(ROUND)
     # a straight way: a play
-    z = laws.dragged_moments_of(middle, r * one, 0.0 * one, one, 1e9)(u)
+    z = sealed_cores.dragged_moments_of(middle, r * one, 0.0 * one, one, 1e9)(u)
     expected = cores.play(u, 2.0 * r) + r - middle
     assert z[at[1] :] == pytest.approx(expected[at[1] :], abs=1e-9)
     # a bent one: drawn back onto the circle after every small step
-    z = laws.dragged_moments_of(middle, r * one, bow * one, one, 1e9)(u)
+    z = sealed_cores.dragged_moments_of(middle, r * one, bow * one, one, 1e9)(u)
     fine = tour(ROUND, 8000)[0]
     x = fine[0] - middle
     moment, expected = np.array([x, bow * x * x]), []
@@ -323,12 +313,12 @@ def test_a_moment_follows_its_field_on_a_tractrix(load):
     assert z == pytest.approx(np.array(expected)[::20], abs=2e-4)
     # what was across is not found again
     u, at = tour([0.0, 1.0, 0.4, 1.0, 0.4, 1.0])
-    z = laws.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(u)
+    z = sealed_cores.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(u)
     assert z[at[5]] - z[at[3]] > 1e-3
     # a step that is lost to rounding is none
     tiny = np.repeat(u, 2)
     tiny[1::2] += 1e-18
-    assert laws.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(tiny)[::2] == (
+    assert sealed_cores.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(tiny)[::2] == (
         pytest.approx(z, abs=1e-12)
     )
 
@@ -352,9 +342,8 @@ def rested(u, bias, friction, bonds):
     return np.array(found)
 
 
-def test_a_spin_goes_back_where_its_neighbours_come(load):
-    laws = load('foreign.sealed_cores')
-    count = laws.NEAR
+def test_a_spin_goes_back_where_its_neighbours_come():
+    count = sealed_cores.NEAR
     bias, bond = np.full(count, -100.0), np.zeros((count, 1))
     # one between two that are drawn away from it by 0.1, and it from each of them
     bias[:3], bond[:2, 0] = (-0.34, -0.39, -0.36), -0.1
@@ -362,13 +351,12 @@ def test_a_spin_goes_back_where_its_neighbours_come(load):
     # they go at 0.25 and 0.23, where it comes again until 0.18
     u = [0.0, 0.19, 0.21, 0.44, 0.46, 0.48, 0.59, 0.61, 0.59, 0.57, 0.26, 0.24, 0.22, 0.17]
     up = [0, 0, 1, 1, 2, 2, 2, 3, 3, 2, 2, 1, 1, 0]
-    law = laws.random_bonds_of(bias, np.full(count, 0.01), bond)
+    law = sealed_cores.random_bonds_of(bias, np.full(count, 0.01), bond)
     assert law(np.array(u)) * count == pytest.approx(np.array(up, float))
 
 
-def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way(load):
-    laws = load('foreign.sealed_cores')
-    rng, count = np.random.default_rng(7), 12 * laws.NEAR
+def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way():
+    rng, count = np.random.default_rng(7), 12 * sealed_cores.NEAR
     bias = -rng.uniform(-0.5, 1.5, count)
     friction = 0.1 * np.exp(0.5 * rng.standard_normal(count))
     bond = 0.2 * rng.standard_normal((count, 3))
@@ -380,18 +368,18 @@ def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way(load):
             for i in range(count):
                 j = (i + d + 1) % count
                 whole[i, j] = whole[j, i] = own[i, d]
-        z = laws.random_bonds_of(bias, friction, own)(u)
+        z = sealed_cores.random_bonds_of(bias, friction, own)(u)
         assert z == pytest.approx(rested(u, bias, friction, whole), abs=1e-12), name
         moved[name] = abs(z[at[5]] - z[at[3]])
     assert moved['none'] == moved['one way'] == 0.0
     assert moved['both'] > 0.0
 
 
-def test_a_slider_slips_where_its_load_lets_it(load):
-    laws = load('foreign.sealed_cores')
+def test_a_slider_slips_where_its_load_lets_it():
     one, stiff, limit, lean, bend = np.ones(1), 1.5, 0.12, 0.5, 0.2
     u, at = tour(ROUND)
-    x = laws.loaded_sliders_of(stiff * one, limit * one, lean, bend)(u)
+    law = sealed_cores.loaded_sliders_of(stiff * one, limit * one, lean, bend)
+    x = law(u)
     most = limit * (1.0 + lean * (2.0 * x - 1.0))
     force = u - x - bend * (x * x - x)
     assert np.all(abs(force) <= most + 1e-9)
@@ -402,14 +390,13 @@ def test_a_slider_slips_where_its_load_lets_it(load):
     assert force[fall] == pytest.approx(held, abs=1e-9)
     # every loop closes, and the next rise goes on as if there were none
     assert x[at[5]] == pytest.approx(x[at[3]], abs=1e-9)
-    whole = laws.loaded_sliders_of(stiff * one, limit * one, lean, bend)(tour([0, 1, 0, 1])[0])
+    whole = law(tour([0, 1, 0, 1])[0])
     assert x[at[6]] == pytest.approx(whole[-1], abs=1e-9)
 
 
-def test_a_slope_is_shared_by_the_gap_ahead(load):
-    cores, laws = load('foreign.cores'), load('foreign.sealed_cores')
+def test_a_slope_is_shared_by_the_gap_ahead():
     middle, apart, broad, wider = 0.5, 0.2, 0.8, 1.05
-    law = cores.law_of(laws._gap_shares, middle, apart, broad, wider)
+    law = cores.law_of(sealed_cores._gap_shares, middle, apart, broad, wider)
 
     def limiting(u):
         lower = (u - middle - 0.5 * apart) / broad
@@ -437,33 +424,29 @@ def test_a_slope_is_shared_by_the_gap_ahead(load):
     assert abs(z[at[5]] - z[at[3]]) > 1e-3
 
 
-def stage_of(load, law):
+def stage_of(law):
     """Return a stage of a core without noise."""
-    module = load('foreign.stage')
-    stage = module.make_stage('preisach', 3)
+    stage = make_stage('preisach', 3)
     core = replace(stage.core, law=law, line=0.6, share=0.4, level=0.0)
     return replace(stage, core=core, rate=10_000.0, noise='white', noise_rms=0.0)
 
 
-def test_plays_reach_a_stage_of_plays(load):
-    references, cores = load('foreign.references'), load('foreign.cores')
-    motion = load('foreign.motion')
-    stage = stage_of(load, lambda u: cores.play(u, 0.2) + 0.5 * cores.play(u, 0.6))
+def test_plays_reach_a_stage_of_plays():
+    stage = stage_of(lambda u: cores.play(u, 0.2) + 0.5 * cores.play(u, 0.6))
     records = {}
     for name in ('identification', 'diagnosis', 'unseen'):
-        moved = motion.record_motion(
+        moved = record_motion(
             name, stage.rate, np.random.default_rng(1), labelled=False, first=400.0
         )
         v = stage.limits[0] + np.ptp(stage.limits) * moved.u
         records[name] = v, stage.respond(v, name, clean=True)
-    found = references.references(stage, records, ('ten plays', 'forty plays'))
+    found = references(stage, records, ('ten plays', 'forty plays'))
     assert found['ten plays'].unseen < 0.01
     assert found['forty plays'].unseen < 0.02
 
 
-def test_linear_part_has_gain_one_and_its_delay(load):
-    module = load('foreign.stage')
-    linear = module.Linear(((300.0, 0.05, 0.9), (700.0, 0.05, 0.1)), 2000.0, 2.5e-4)
+def test_linear_part_has_gain_one_and_its_delay():
+    linear = Linear(((300.0, 0.05, 0.9), (700.0, 0.05, 0.1)), 2000.0, 2.5e-4)
     rate, n = 10_000.0, 10_000
     y = linear(np.where(np.arange(n) < 100, 0.0, 1.0), rate)
     assert y[-1] == pytest.approx(1.0, abs=1e-6)
@@ -473,15 +456,13 @@ def test_linear_part_has_gain_one_and_its_delay(load):
     assert late.std() == pytest.approx(slope * 1e-4 / 3, rel=0.05)
 
 
-def test_offset_and_gain_are_no_effect(load):
-    size_of = load('foreign.sizes').size_of
+def test_offset_and_gain_are_no_effect():
     y = np.random.default_rng(0).uniform(0, 1, 1000)
     assert size_of(0.3 * y - 2.0, y) == pytest.approx(0.0, abs=1e-9)
     assert size_of(0.01 * np.sin(np.arange(1000.0)), y) == pytest.approx(0.707, rel=0.02)
 
 
-def test_blocks_of_cases_hold_every_kind(load):
-    case = load('foreign.case')
+def test_blocks_of_cases_hold_every_kind():
     for group in case.CASES:
         cases = [case.draw(group, k) for k in range(case.CASES[group])]
         assert len({c.key for c in cases}) == len(cases)
@@ -524,14 +505,12 @@ def test_blocks_of_cases_hold_every_kind(load):
         ),
     ],
 )
-def test_outcome_of_a_row(load, said, truth, expected):
-    study = load('study_foreign')
+def test_outcome_of_a_row(said, truth, expected):
     row = study.Row('tuning-000 preisach x labelled', misfit=0.5, truth=truth, **said)
     assert study.outcome(row) == expected
 
 
-def test_faults_of_the_data_are_named_by_the_record(load):
-    study = load('study_foreign')
+def test_faults_of_the_data_are_named_by_the_record():
     row = study.Row('k', 'none', fault='stuck', faults=('stuck', 'timing_jitter'), misfit=0.5)
     assert study.outcome(row) == 'named'
     assert study.false_faults(row) == ('timing_jitter',)

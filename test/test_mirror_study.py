@@ -3,28 +3,16 @@
 
 """What the study of the measured mirror rests on."""
 
-import importlib
-from pathlib import Path
-import sys
-
 import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.explain import Rival
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.periodic import periodicity
 import pytest
-
-FOLDER = Path(__file__).resolve().parents[1] / 'benchmarks'
-
-
-@pytest.fixture(scope='module')
-def study():
-    sys.path.insert(0, str(FOLDER))
-    yield importlib.import_module('study_mirror')
-    sys.path.remove(str(FOLDER))
+import study_mirror as study
 
 
-def test_the_records_that_do_not_repeat_are_found(study):
+def test_the_records_that_do_not_repeat_are_found():
     folder = study.data_folder()
     if not folder.is_dir():
         pytest.skip(f'{folder} is not there')
@@ -36,7 +24,7 @@ def test_the_records_that_do_not_repeat_are_found(study):
     assert max(t.difference for t in tested if not t.suspicious) < 2
 
 
-def test_spectra_hold_the_whole_error(study):
+def test_spectra_hold_the_whole_error():
     rng = np.random.default_rng(1)
     truth = stage.loop_stage()
     records = stage.records(truth, rng, (1.0,), count=2, noise=0.01)
@@ -49,7 +37,7 @@ def test_spectra_hold_the_whole_error(study):
     assert np.hypot(*study.in_bands(found, edges)) == pytest.approx(error, rel=0.01)
 
 
-def test_modes_are_followed_through_the_amplitudes(study):
+def test_modes_are_followed_through_the_amplitudes():
     rng = np.random.default_rng(4)
     found = study.amplitude_dependence(
         stage.linear_stage(), stage.records(stage.loop_stage(plays=0.0), rng, count=3)

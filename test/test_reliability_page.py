@@ -6,15 +6,11 @@
 
 import json
 from pathlib import Path
-import sys
 
+import build
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / 'benchmarks/reliability'))
-
-import build  # noqa: E402
-
 FILES = sorted(build.ROWS.glob('*.json'))
 
 

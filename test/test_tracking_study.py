@@ -4,28 +4,17 @@
 """The study of tracking counts what it says: where the model is the stage, nothing is left."""
 
 from dataclasses import replace
-import importlib
-from pathlib import Path
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 from paper_stage import FS, PAPER
 from piezo_ident.model.stage_model import EffectSetting
-import pytest
+import study_tracking as study
 
-FOLDER = Path(__file__).resolve().parents[1] / 'benchmarks'
 BENT = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
 
 
-@pytest.fixture(scope='module')
-def study():
-    sys.path.insert(0, str(FOLDER))
-    yield importlib.import_module('study_tracking')
-    sys.path.remove(str(FOLDER))
-
-
-def test_errors_are_of_the_models_that_they_name(study):
+def test_errors_are_of_the_models_that_they_name():
     # a sensor with another zero than the models know
     stage = study.Stage(
         name='bent sensor',
@@ -46,7 +35,7 @@ def test_errors_are_of_the_models_that_they_name(study):
     assert refined < 0.01 and learned <= refined
 
 
-def test_its_picture_has_every_stage_and_way(study):
+def test_its_picture_has_every_stage_and_way():
     errors = np.array([5.0, 1.0, 0.1, 0.01])
     rows = [
         study.Row(stage, 'creep', 0.1, motion, 70e-6, tuple(errors * factor))

@@ -7,20 +7,13 @@ Killed while writing, no room, no right to write: nothing is lost, nothing is ha
 """
 
 import os
-from pathlib import Path
-import sys
 
 import piezo_ident as pi
 from piezo_ident.common import files as output
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import temporary_output
 import pytest
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-from reliability import crash  # noqa: E402
-
-sys.path.remove(str(ROOT / 'benchmarks'))
+from reliability import crash
 
 KINDS = ('save', 'report', 'convert to r.db3', 'convert to bag', 'predict')
 

@@ -11,8 +11,6 @@ from dataclasses import replace
 from functools import cache
 import importlib
 import os
-from pathlib import Path
-import sys
 from types import SimpleNamespace
 
 from diagnosis_examples import measured as example_record
@@ -44,22 +42,12 @@ from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program, SLOW, slow_model
 import pytest
+import truths
 
 # the name of the package is that of the function
 diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
-ROOT = Path(__file__).resolve().parents[2]
 RATE = 20_000.0
 IDENTIFICATION = identification_program(noise=2, slope=12)
-
-
-@pytest.fixture(scope='module')
-def truths():
-    sys.path.insert(0, str(ROOT / 'benchmarks'))
-    try:
-        import truths as found
-    finally:
-        sys.path.remove(str(ROOT / 'benchmarks'))
-    return found
 
 
 def record_of(v, y, labels, name) -> Record:
@@ -70,14 +58,13 @@ def record_of(v, y, labels, name) -> Record:
 @cache
 def measured(effect, size, seed):
     """Return model, a record to diagnose and one that nothing saw."""
-    import truths as found
 
     def other(t, number):
         if effect != 'cross_coupling':
             return None
-        return {'other': found.other_axis(t, np.random.default_rng(number))}
+        return {'other': truths.other_axis(t, np.random.default_rng(number))}
 
-    stage = found.make_stage(effect, size, seed)
+    stage = truths.make_stage(effect, size, seed)
     sequence = parse_program(IDENTIFICATION).build()
     t = np.arange(sequence.n) / RATE
     labels = [(s.label, s.start, s.stop) for s in sequence.segments]
@@ -85,7 +72,7 @@ def measured(effect, size, seed):
     model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
     records = []
     for kind in ('diagnosis', 'unseen'):
-        t, v, labels = found.program(kind, seed)
+        t, v, labels = truths.program(kind, seed)
         channels = other(t, len(kind))
         record = record_of(v, stage.respond(t, v, channels=channels), labels, kind)
         (piece,) = record.pieces
@@ -110,7 +97,7 @@ def unseen_errors(result, record) -> tuple[float, float]:
     # the whole catalogue, and those that come near
     [('creep', ()), ('saturation', ('saturation', 'backlash', 'preload_loss', 'creep'))],
 )
-def test_effect_of_the_catalogue_is_named_and_added(truths, effect, candidates):
+def test_effect_of_the_catalogue_is_named_and_added(effect, candidates):
     model, record, unseen = measured(effect, 0.3, 1)
     result = diagnose(model, record, DiagnosisSettings(effects=candidates))
     assert result.verdict in ('named', 'class'), result.sentence
@@ -123,7 +110,7 @@ def test_effect_of_the_catalogue_is_named_and_added(truths, effect, candidates):
     assert after < before / 3
 
 
-def test_of_a_long_record_a_stated_part_is_searched_and_fitted(truths):
+def test_of_a_long_record_a_stated_part_is_searched_and_fitted():
     model, record, unseen = measured('creep', 1.0, 1)
     most = record.n * 2 // 3
     few = ('creep', 'saturation')
@@ -140,14 +127,14 @@ def test_of_a_long_record_a_stated_part_is_searched_and_fitted(truths):
     assert (part.sentence, part.after) == (result.sentence, result.after)
 
 
-def test_a_part_that_is_too_short_is_refused_with_its_length(truths):
+def test_a_part_that_is_too_short_is_refused_with_its_length():
     model, record, _ = measured('creep', 0.3, 1)
     with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
         diagnose(model, record, DiagnosisSettings(most_samples=1000))
 
 
 @pytest.mark.parametrize('most', [1000, 1001, 3000, 4321, 6999])
-def test_of_records_the_beginnings_are_taken_in_proportion(truths, most):
+def test_of_records_the_beginnings_are_taken_in_proportion(most):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record
     other = replace(piece.cut(0, 4000), sample_rate=5 * RATE)
@@ -165,7 +152,7 @@ def test_of_records_the_beginnings_are_taken_in_proportion(truths, most):
     assert diagnose_module._beginnings(model, whole, 7000) == whole
 
 
-def test_effect_outside_the_catalogue_stays_unexplained(truths):
+def test_effect_outside_the_catalogue_stays_unexplained():
     model, record, unseen = measured('floor_vibration', 0.3, 1)
     result = diagnose(model, record)
     assert result.verdict == 'unexplained', result.sentence
@@ -177,7 +164,7 @@ def test_effect_outside_the_catalogue_stays_unexplained(truths):
     assert after < 1.05 * before
 
 
-def test_no_effect_is_none(truths):
+def test_no_effect_is_none():
     model, record, unseen = measured(None, 0.0, 2)
     result = diagnose(model, record)
     assert result.verdict == 'none', result.sentence
@@ -201,7 +188,7 @@ segments:
 """
 
 
-def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
+def test_a_refit_to_a_part_of_the_range_holds_there_alone():
     model, record, _ = measured('creep', 0.3, 1)
     sequence = parse_program(NARROW).build(RATE)
     stage = truths.make_stage('creep', 0.3, 1)
@@ -220,7 +207,7 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone(truths):
     assert not [w for w in whole.warnings if 'was refitted' in w]
 
 
-def test_lines_that_another_axis_makes_are_no_hum(truths):
+def test_lines_that_another_axis_makes_are_no_hum():
     model, record, unseen = measured('cross_coupling', 0.3, 1)
     few = DiagnosisSettings(effects=('creep', 'periodic_disturbance', 'cross_coupling'))
     result = diagnose(model, record, few)
@@ -238,14 +225,14 @@ def test_lines_that_another_axis_makes_are_no_hum(truths):
         ('saturation', 0.3, 2, 'sensor_nonlinearity'),
     ],
 )
-def test_what_looks_like_another_effect_at_first_stands_alone(truths, effect, size, seed, other):
+def test_what_looks_like_another_effect_at_first_stands_alone(effect, size, seed, other):
     model, record, _ = measured(effect, size, seed)
     result = diagnose(model, record, DiagnosisSettings(effects=(other, effect)))
     assert [e.name for e in result.effects] == [effect], result.sentence
     assert result.after.overall < 0.1 * result.before.overall
 
 
-def test_what_a_wider_hysteresis_imitates_may_hide_in_it(truths):
+def test_what_a_wider_hysteresis_imitates_may_hide_in_it():
     model, record, unseen = measured('noncongruent_minor_loops', 0.3, 1)
     few = DiagnosisSettings(effects=('creep', 'noncongruent_minor_loops', 'sensor_nonlinearity'))
     result = diagnose(model, record, few)
@@ -264,7 +251,7 @@ def with_another_h():
     return model, Record((bent,), 'bent')
 
 
-def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(truths, monkeypatch):
+def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(monkeypatch):
     model, bent = with_another_h()
     monkeypatch.setattr(base_refit, 'refit_holds', lambda *_: False)
     result = diagnose(model, bent, FEW)
@@ -274,7 +261,7 @@ def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(truths, monk
 
 
 @pytest.mark.parametrize('takes', [True, False])
-def test_a_refit_that_knows_only_where_loops_were_is_not_kept(truths, monkeypatch, takes):
+def test_a_refit_that_knows_only_where_loops_were_is_not_kept(monkeypatch, takes):
     model, bent = with_another_h()
     if not takes:
         monkeypatch.setattr(refined_model, 'takes_shape', lambda *_: False)
@@ -284,7 +271,7 @@ def test_a_refit_that_knows_only_where_loops_were_is_not_kept(truths, monkeypatc
     assert ('where loops were' in result.sentence) != takes
 
 
-def test_another_gain_is_no_other_hysteresis(truths):
+def test_another_gain_is_no_other_hysteresis():
     model, record, _ = measured(None, 0.0, 2)
     (piece,) = record.pieces
     larger = Record((replace(piece, y=1.02 * piece.y),), 'larger')
@@ -296,7 +283,7 @@ def test_another_gain_is_no_other_hysteresis(truths):
     assert result.model is model and result.after.overall == result.before.overall > 0.3
 
 
-def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept(truths):
+def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
     moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
@@ -335,7 +322,7 @@ def test_slow_motion_does_not_retune_g():
     assert result.model.dynamics == slow_model().dynamics
 
 
-def test_a_refit_of_h_is_kept_beside_hum(truths):
+def test_a_refit_of_h_is_kept_beside_hum():
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     h = model.hysteresis
     other = replace(h, thresholds=h.thresholds**0.7, weights=1.1 * h.weights)
@@ -349,7 +336,7 @@ def test_a_refit_of_h_is_kept_beside_hum(truths):
     assert before > 3.0 and after < 0.4
 
 
-def test_hum_stays_in_its_record(truths):
+def test_hum_stays_in_its_record():
     model, record, unseen = measured('periodic_disturbance', 0.3, 1)
     result = diagnose(model, record, FEW)
     assert 'switched off, and the hysteresis as it was given' in ' '.join(result.warnings)
@@ -362,7 +349,7 @@ def test_hum_stays_in_its_record(truths):
     assert after == pytest.approx(before)
 
 
-def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
+def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find():
     model, record, _ = measured('creep', 0.3, 1)
     first = diagnose(model, record, FEW)
     again = model_from_dict(model_to_dict(first.model))
@@ -373,7 +360,7 @@ def test_refined_model_is_kept_by_a_file_and_has_nothing_left_to_find(truths):
     assert second.before.overall < 0.1
 
 
-def test_seed_repeats_and_inputs_stay(truths):
+def test_seed_repeats_and_inputs_stay():
     model, record, _ = measured(None, 0.0, 1)
     y = record.pieces[0].y.copy()
     one, other = (diagnose(model, record, replace(FEW, seed=3)) for _ in range(2))
@@ -382,14 +369,14 @@ def test_seed_repeats_and_inputs_stay(truths):
     np.testing.assert_array_equal(record.pieces[0].y, y)
 
 
-def test_a_candidate_that_is_left_out_is_not_named(truths):
+def test_a_candidate_that_is_left_out_is_not_named():
     model, record, _ = measured('creep', 0.3, 1)
     result = diagnose(model, record, replace(FEW, without=('creep',)))
     assert 'creep' not in {e.name for e in result.effects}
     assert 'creep' not in {c.name for c in result.candidates}
 
 
-def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried(truths):
+def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried():
     model, record, _ = measured('creep', 0.3, 1)
     result = diagnose(model, record, DiagnosisSettings(effects=('creep',)))
     assert [e.name for e in result.effects] == ['creep']
@@ -398,7 +385,7 @@ def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried(truths):
     assert 'diagnose again with' in result.group.separating_experiment
 
 
-def test_every_step_can_be_cancelled(truths):
+def test_every_step_can_be_cancelled():
     model, record, _ = measured(None, 0.0, 1)
     for step in ('residual', 'candidates', 'verdict'):
 
@@ -418,7 +405,7 @@ def test_unknown_candidates_are_refused():
         DiagnosisSettings(without=('crep',))
 
 
-def test_another_rate_and_too_little_are_refused(truths):
+def test_another_rate_and_too_little_are_refused():
     model, record, _ = measured(None, 0.0, 1)
     piece = record.pieces[0]
     slow = Record((Piece(piece.v[::2], piece.y[::2], RATE / 2),), 'slow')
@@ -454,7 +441,7 @@ def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatc
     assert any('was not judged: singular' in warning for warning in result.warnings)
 
 
-def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
+def test_displacement_that_does_not_follow_the_voltage_is_no_stage():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
@@ -463,7 +450,7 @@ def test_displacement_that_does_not_follow_the_voltage_is_no_stage(truths):
         diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
 
 
-def test_displacement_that_runs_against_the_model_is_refused(truths):
+def test_displacement_that_runs_against_the_model_is_refused():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     turned = Record((replace(piece, y=-piece.y),), 'turned')
@@ -471,7 +458,7 @@ def test_displacement_that_runs_against_the_model_is_refused(truths):
         diagnose(model, turned, FEW)
 
 
-def test_columns_that_may_be_swapped_are_said(truths):
+def test_columns_that_may_be_swapped_are_said():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     noise = 1e-3 * np.random.default_rng(1).standard_normal(piece.n)
@@ -486,7 +473,7 @@ def test_columns_that_may_be_swapped_are_said(truths):
 @pytest.mark.parametrize(
     ('scale', 'said'), [(1.0, []), (1e-3, ['in volts?']), (1e3, ['extrapolation'])]
 )
-def test_voltages_that_the_model_does_not_know_are_said(truths, scale, said):
+def test_voltages_that_the_model_does_not_know_are_said(scale, said):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
@@ -496,7 +483,7 @@ def test_voltages_that_the_model_does_not_know_are_said(truths, scale, said):
     assert all(part in line for part, line in zip(said, heard, strict=True))
 
 
-def test_one_pass_over_the_range_names_nothing(truths):
+def test_one_pass_over_the_range_names_nothing():
     model, record, _ = measured('creep', 0.3, 1)
     piece = record.pieces[0]
     sine = next(s for s in piece.segments if s.label.startswith('sine:1Hz'))
@@ -511,7 +498,7 @@ def test_one_pass_over_the_range_names_nothing(truths):
 # -- the parts that carry it -------------------------------------------------------------------
 
 
-def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
+def test_the_stroke_is_that_of_one_record_without_its_faults():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     stroke = make_rows(model, [record]).stroke
@@ -525,7 +512,7 @@ def test_the_stroke_is_that_of_one_record_without_its_faults(truths):
         assert make_rows(model, [faulty], bad).stroke == pytest.approx(stroke, rel=1e-3)
 
 
-def test_time_begins_with_the_record_whatever_its_clock_says(truths):
+def test_time_begins_with_the_record_whatever_its_clock_says():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     epoch = Record((replace(piece, start_time=600.0),), 'epoch')
@@ -545,7 +532,7 @@ def test_time_begins_with_the_record_whatever_its_clock_says(truths):
     assert make_rows(model, [two]).duration == pytest.approx(piece.duration)
 
 
-def test_of_one_kind_of_excitation_eighths_are_held_out(truths):
+def test_of_one_kind_of_excitation_eighths_are_held_out():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     rows = make_rows(model, [Record((replace(piece, segments=()),), 'unlabelled')])
@@ -555,7 +542,7 @@ def test_of_one_kind_of_excitation_eighths_are_held_out(truths):
     assert len(set(one.group)) == 8
 
 
-def test_left_out_blocks_are_predicted_as_by_a_fit_without_them(truths):
+def test_left_out_blocks_are_predicted_as_by_a_fit_without_them():
     model, record, _ = measured(None, 0.0, 1)
     rows = make_rows(model, [record])
     rng = np.random.default_rng(0)
@@ -586,7 +573,7 @@ def test_what_a_model_missed_is_read_from_its_file(errors, missed):
     assert diagnose_module._missed(SimpleNamespace(identification={'errors': errors})) == missed
 
 
-def test_a_limit_that_one_kind_of_excitation_reaches_is_kept(truths):
+def test_a_limit_that_one_kind_of_excitation_reaches_is_kept():
     model, record, unseen = measured('slew_limit', 0.3, 2)
     few = DiagnosisSettings(effects=('slew_limit', 'amplifier_lag', 'changed_dynamics'))
     found = diagnose(model, record, few)
@@ -608,7 +595,7 @@ def test_a_limit_below_most_speeds_is_no_lag(limit):
     assert found.after.overall < 0.01 < 5.0 < found.before.overall
 
 
-def test_columns_near_the_optimum_are_derivatives(truths):
+def test_columns_near_the_optimum_are_derivatives():
     model, record, _ = measured(None, 0.0, 1)
     rows = make_rows(model, [record])
     simulator = Simulator(model, rows)
@@ -623,7 +610,7 @@ def test_columns_near_the_optimum_are_derivatives(truths):
     assert fitted.mean_square < 1e-6
 
 
-def test_a_fit_ends_when_a_step_gains_too_little(truths):
+def test_a_fit_ends_when_a_step_gains_too_little():
     model, record, _ = measured('creep', 0.3, 1)
     simulator = Simulator(model, make_rows(model, [record]))
     law = HysteresisLaw('plays', base_thresholds(1.0))
@@ -645,7 +632,7 @@ def test_a_fit_ends_when_a_step_gains_too_little(truths):
 
 
 @pytest.mark.parametrize('name', ['creep', 'rate_dependent_hysteresis'])
-def test_processors_that_share_a_run_give_the_columns_of_one(truths, monkeypatch, name):
+def test_processors_that_share_a_run_give_the_columns_of_one(monkeypatch, name):
     model, record, _ = measured(None, 0.0, 1)
     law = HysteresisLaw('preisach', base_thresholds(1.0)[::6])
     values = {
@@ -663,7 +650,7 @@ def test_processors_that_share_a_run_give_the_columns_of_one(truths, monkeypatch
         assert all(np.array_equal(a, b) for a, b in zip(columns, found[0], strict=True))
 
 
-def test_states_run_side_by_side_as_they_do_alone(truths):
+def test_states_run_side_by_side_as_they_do_alone():
     model, record, _ = measured(None, 0.0, 1)
     simulator = Simulator(model, make_rows(model, [record]))
     simulator.remember(State(model.hysteresis, np.zeros(1)))
@@ -685,7 +672,7 @@ def test_states_run_side_by_side_as_they_do_alone(truths):
 
 
 @pytest.mark.parametrize('m', [12, 30, 49])
-def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
+def test_every_sample_counts_in_rows_of_any_length(monkeypatch, m):
     model, record, _ = measured('creep', 0.3, 1)
     monkeypatch.setattr(rows_module, 'MOST_ROWS', record.n // m + 1)
     rows = make_rows(model, [record])
@@ -693,7 +680,7 @@ def test_every_sample_counts_in_rows_of_any_length(truths, monkeypatch, m):
     assert rows.n == record.n // m
 
 
-def test_what_is_kept_from_the_run_before_changes_nothing(truths):
+def test_what_is_kept_from_the_run_before_changes_nothing():
     model, record, _ = measured(None, 0.0, 1)
     simulator = Simulator(model, make_rows(model, [record]))
     state = State(model.hysteresis, np.zeros(1), retuning=(0.1, 0.2, 0.01, 0.02))
@@ -722,7 +709,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing(truths):
         ('creep', 'changed_dynamics', 'thermal_drift'),
     ],
 )
-def test_quick_derivatives_are_differences_of_whole_runs(truths, effects):
+def test_quick_derivatives_are_differences_of_whole_runs(effects):
     model, record, _ = measured(None, 0.0, 1)
     rows = make_rows(model, [record])
     simulator = Simulator(model, rows)

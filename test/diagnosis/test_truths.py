@@ -9,17 +9,14 @@ import sys
 
 import numpy as np
 import pytest
+import truths
+from truths.cores import everett, plays
+from truths.leftover import base_of, left_over
+from truths.linear import Cascade, delayed, RATE, relaxation
+from truths.stage import make_base
+from truths.table_one import table_one_stage
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
-import truths  # noqa: E402
-from truths.cores import everett, plays  # noqa: E402
-from truths.leftover import base_of, left_over  # noqa: E402
-from truths.linear import Cascade, delayed, RATE, relaxation  # noqa: E402
-from truths.stage import make_base  # noqa: E402
-from truths.table_one import table_one_stage  # noqa: E402
-
 NAMES = truths.EFFECTS + truths.OUTSIDE
 
 

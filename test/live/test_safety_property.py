@@ -9,17 +9,11 @@ Whatever arrives, the voltage applied keeps to limits and slew; what that means 
 generator, is in benchmarks/reliability/safety.py, which `make attack` runs 10^5 times.
 """
 
-from pathlib import Path
-import sys
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from piezo_ident.live.guard import GuardSettings
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
-
 from safety import Broken, check, run, sequence
 
 #: 1 V a sample

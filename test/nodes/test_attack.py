@@ -4,8 +4,8 @@
 """The graph under attack: nodes stay up, say what they refuse, and the voltage is safe."""
 
 from pathlib import Path
-import sys
 
+from attack import contradiction, odd_messages, start
 from course import level, paper
 from graph import Graph
 from piezo_ident.nodes.wire import SERVICE
@@ -13,10 +13,6 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
-
-from attack import contradiction, odd_messages, start
 
 
 @pytest.fixture(scope='module')

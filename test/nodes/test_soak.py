@@ -3,18 +3,12 @@
 
 """The whole graph for some seconds, as `make soak` runs it for hours: nothing is lost."""
 
-from pathlib import Path
-import sys
-
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from processes import take_domain
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks/reliability'))
-
 from soak import clock_drift, slope, soak, Stream
 
 

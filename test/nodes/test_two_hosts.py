@@ -4,18 +4,15 @@
 """A graph over two hosts, which are two network namespaces of this machine."""
 
 from pathlib import Path
-import sys
 import xml.etree.ElementTree as ET
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
+import netns
+
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / 'benchmarks/reliability'))
-
-import netns  # noqa: E402
-
 REASON = netns.why_not()
 two_hosts = pytest.mark.skipif(bool(REASON), reason=REASON or 'there are two hosts')
 
