@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 import time
 from typing import Any
 
@@ -44,15 +43,14 @@ from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import Drive, Successor, Tracker
-from piezo_ident.model.files import load
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, run, WARN
 from piezo_ident.nodes.learner import Learner
-from piezo_ident.nodes.model_loader import ModelLoader
-from piezo_ident.nodes.wire import from_message, LATCHED, publisher_ids, STREAM, to_message
+from piezo_ident.nodes.model_loader import ModelLoader, no_file
+from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray
 
 __all__ = ['FeedforwardNode', 'main']
 
@@ -85,11 +83,7 @@ class FeedforwardNode(DrivingNode):
         self._tracking_error = self.create_publisher(Float64MultiArray, 'tracking_error', STREAM)
         self._loader = ModelLoader(self, self._prepared, self._take_model, self.report_state)
         if path := self.values['model']:
-            try:
-                self._take_model(self._prepared(load(path)), path)
-            except PiezoIdentError as error:
-                raise PiezoIdentError(f'model: {error}') from None
-        self.create_subscription(String, 'model', self._on_model, LATCHED)
+            self._loader.begin_with(path)
         self._reference = self.create_subscription(
             Float64MultiArray, 'reference', self._on_reference, STREAM
         )
@@ -105,8 +99,8 @@ class FeedforwardNode(DrivingNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse limits that are crossed or in use, and a model file that is not there."""
-        if name == 'model' and value and not Path(value).is_file():
-            return f'model: {value}: no such file'
+        if name == 'model':
+            return no_file(value)
         if name not in LIMITS or 'silence' not in self.values:
             return None
         if self._state in DRIVING:
@@ -127,9 +121,6 @@ class FeedforwardNode(DrivingNode):
         if model is not None and set(changed) & set(LIMITS):
             self._tracker = None
             self._loader.load(self._source, lambda: model)
-
-    def _on_model(self, message: String) -> None:
-        self._loader.load_text(message.data)
 
     def _prepared(self, model: StageModel) -> tuple[StageModel, Tracker | Successor]:
         # by the thread of the loader

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import functools
-from pathlib import Path
 import time
 from typing import Any
 
@@ -15,15 +14,14 @@ import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
-from piezo_ident.model.files import load
 from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
-from piezo_ident.nodes.model_loader import ModelLoader
-from piezo_ident.nodes.wire import from_message, LATCHED, PREVIEW, STREAM, to_message
+from piezo_ident.nodes.model_loader import ModelLoader, no_file
+from piezo_ident.nodes.wire import from_message, PREVIEW, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray
 
 __all__ = ['ModelNode', 'main']
 
@@ -53,12 +51,7 @@ class ModelNode(LabNode):
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
         if path := self.values['model']:
-            # at the start nothing waits, and a bad file ends the node
-            try:
-                self._use(_tried(load(path)), path)
-            except PiezoIdentError as error:
-                raise PiezoIdentError(f'model: {error}') from None
-        self.create_subscription(String, 'model', self._on_model, LATCHED)
+            self._loader.begin_with(path)
         for topic, take in (('voltage', self._voltage), ('displacement', self._displacement)):
             on_message = functools.partial(self._on_block, topic, take)
             self.create_subscription(Float64MultiArray, topic, on_message, STREAM)
@@ -68,9 +61,7 @@ class ModelNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a model file that is not there; what is wrong inside is in ``~/status``."""
-        if name == 'model' and value and not Path(value).is_file():
-            return f'model: {value}: no such file'
-        return None
+        return no_file(value) if name == 'model' else None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, or another window."""
@@ -79,20 +70,15 @@ class ModelNode(LabNode):
         if 'window' in changed:
             self._error.window = changed['window']
 
-    def _on_model(self, message: String) -> None:
-        self._loader.load_text(message.data)
-
     def _take_model(self, model: StageModel | None, source: str) -> None:
-        if model is None:
-            self._refuse_model(source)
-        else:
-            self._use(model, source)
-
-    def _use(self, model: StageModel, source: str) -> None:
         try:
-            self._predictor.set_model(model)
+            if model is not None:
+                self._predictor.set_model(model)
         except PiezoIdentError as error:
-            self._refuse_model(f'{source}: {error}')
+            model, source = None, f'{source}: {error}'
+        if model is None:
+            kept = 'the old model is kept' if self._predictor.model else 'there is no model'
+            self._refusal = f'model refused, {kept}: {source}'
             return
         self._source, self._refusal = source, ''
         self._models += 1
@@ -100,10 +86,6 @@ class ModelNode(LabNode):
             # the state stays what it was
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
         self._error.clear()
-
-    def _refuse_model(self, reason: str) -> None:
-        kept = 'the old model is kept' if self._predictor.model else 'there is no model'
-        self._refusal = f'model refused, {kept}: {reason}'
 
     # blocks
 

@@ -1,11 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models that come while a node works: a thread reads and compiles them, the newest wish last."""
+"""Models that a node gets when it starts, and while it works: then a thread reads the newest."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 import queue
 import threading
 from typing import Generic, TypeVar
@@ -14,16 +15,25 @@ from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.model.files import load, model_from_dict
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.nodes.wire import LATCHED
 from rclpy.node import Node
+from std_msgs.msg import String
 
-__all__ = ['ModelLoader']
+__all__ = ['ModelLoader', 'no_file']
 
 T = TypeVar('T')
 
 
+def no_file(path: str) -> str | None:
+    """Return that there is no such file of a model, None when there is or none is named."""
+    return f'model: {path}: no such file' if path and not Path(path).is_file() else None
+
+
 class ModelLoader(Generic[T]):
     """
-    Reads models in a thread, for reading YAML and compiling take longer than a block.
+    Reads models, those of the topic `model` too.
+
+    It does so in a thread, for reading YAML and compiling take longer than a block.
 
     Parameters
     ----------
@@ -50,15 +60,24 @@ class ModelLoader(Generic[T]):
         self._thread: threading.Thread | None = None
         self._is_ending = False
         self._wake = node.create_guard_condition(self._take_loaded)
+        node.create_subscription(String, 'model', self._load_text, LATCHED)
+
+    def begin_with(self, path: str) -> None:
+        """
+        Load a file at once: when a node starts, nothing waits, and a bad file ends it.
+
+        Raises
+        ------
+        PiezoIdentError
+        """
+        try:
+            self._take(self._prepare(load(path)), path)
+        except PiezoIdentError as error:
+            raise PiezoIdentError(f'model: {error}') from None
 
     def load_file(self, path: str) -> None:
         """Load a file."""
         self.load(path, lambda: load(path))
-
-    def load_text(self, text: str) -> None:
-        """Load the text of a file that came on the topic."""
-        name = 'topic model'
-        self.load(name, lambda: model_from_dict(parse_yaml(text, name), name))
 
     def load(self, source: str, read: Callable[[], StageModel]) -> None:
         """Load what a function returns."""
@@ -70,6 +89,10 @@ class ModelLoader(Generic[T]):
     def close(self) -> None:
         """Wake nobody any more."""
         self._is_ending = True
+
+    def _load_text(self, message: String) -> None:
+        name = 'topic model'
+        self.load(name, lambda: model_from_dict(parse_yaml(message.data, name), name))
 
     def _load_all(self) -> None:
         while True:

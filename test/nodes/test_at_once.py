@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.nodes import model, player, recorder
+from piezo_ident.nodes import model, model_loader, player, recorder
 from processes import take_domain
 import rclpy
 from rclpy.context import Context
@@ -78,6 +78,6 @@ def test_a_bag_that_is_slow_to_make_and_to_close(made, monkeypatch, tmp_path):
 def test_a_model_file_that_is_slow_to_read(made, monkeypatch, tmp_path):
     (tmp_path / 'model.yaml').write_text('')
     node = made(model.ModelNode)
-    monkeypatch.setattr(model, 'load', slow)
+    monkeypatch.setattr(model_loader, 'load', slow)
     wish = Parameter('model', value=str(tmp_path / 'model.yaml'))
     assert seconds(lambda: node.set_parameters([wish])) < AT_ONCE
