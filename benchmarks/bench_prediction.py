@@ -27,7 +27,6 @@ import numpy as np
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
-from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 from side_by_side import markdown, ratio, show, take_turns
@@ -101,7 +100,7 @@ class Plays:
     """H in the ways in which one may write it, from a rest at zero."""
 
     def __init__(self, model: StageModel) -> None:
-        h = model.hysteresis
+        self.h = h = model.hysteresis
         self.r, self.q, self.p1, self.p2 = h.thresholds, h.weights, h.p1, h.p2
 
     def polynomial(self, u: np.ndarray) -> np.ndarray:
@@ -110,8 +109,7 @@ class Plays:
 
     def ours(self, u: np.ndarray) -> np.ndarray:
         """Return w by this package."""
-        zero = np.zeros(self.r.size)
-        return weighted_plays(u, self.r, self.q, self.p1, self.p2, zero)[0]
+        return self.h.follow(u, np.zeros(self.r.size))[0]
 
     def fused(self, u: np.ndarray) -> np.ndarray:
         """Return w by the hand-written kernel."""
@@ -241,7 +239,7 @@ def plays(model: StageModel, n: int, short: int, runs: int) -> tuple[str, str]:
     h, u = Plays(model), model.scaling.u(voltage(model, n))
     ways = {
         'kernel fused by hand': (h.fused, n),
-        '`piezo_ident.operators.play.weighted_plays`': (h.ours, n),
+        '`Hysteresis.follow` of `piezo_ident`': (h.ours, n),
         'NumPy, vectorised prefix scan': (h.prefix_scan, n // 4),
         'Python, loops over time and plays': (h.python_loop, short),
     }

@@ -32,7 +32,7 @@ from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Qu
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
-from piezo_ident.operators.play import weighted_plays
+from piezo_ident.operators.kernels import hysteresis
 from scipy.optimize import OptimizeResult
 
 __all__ = [
@@ -142,7 +142,7 @@ def filtered_rows(
     part = np.array([1.0 - delay.fraction, delay.fraction])
     G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
     for i, excerpt in enumerate(excerpts):
-        row, memory = excerpt.row, excerpt.start(r)
+        row, memory = excerpt.row, excerpt.start(r).copy()
         stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
         n = excerpt.rows
         block = np.zeros((k + law.size + 1, n))
@@ -154,7 +154,8 @@ def filtered_rows(
         begin = 0 if law.lags else begin
         stretches -= begin
         before, u = excerpt.u[:begin], excerpt.u[begin:end]
-        memory = weighted_plays(before, r, np.zeros(r.size), 0.0, 0.0, memory)[1]
+        # the memory alone; a frozen array would be another type to the compiler
+        hysteresis(before, np.array(r), np.zeros(r.size), 0.0, 0.0, memory, np.empty(begin))
         u = Delay(delay.samples).apply(u)
         for j, column in enumerate(law.columns(u, memory), start=k):
             _average(filter_arx(G.a, G.b, column), stretches, row, block[j])

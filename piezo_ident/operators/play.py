@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.operators.kernels import hysteresis, plays
+from piezo_ident.operators.kernels import plays
 
-__all__ = ['initial_memory', 'play_columns', 'weighted_plays']
+__all__ = ['initial_memory', 'play_columns']
 
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
@@ -71,33 +71,3 @@ def play_columns(
     out = np.empty((r.size, x.size))
     plays(x, r, start, out)
     return out
-
-
-def weighted_plays(
-    v: NDArray[np.float64],
-    thresholds: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    p1: float,
-    p2: float,
-    memory: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """
-    Return ``p1 v^3 + p2 v + sum_i q_i F_ri[v]`` (eqs. 3 and 6) and the memory after it.
-
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-    thresholds, weights, memory : ndarray, shape (m,)
-    p1, p2 : float
-
-    Returns
-    -------
-    w : ndarray, shape (n,)
-    memory : ndarray, shape (m,)
-    """
-    x = np.ascontiguousarray(v)
-    end = memory.copy()
-    out = np.empty(x.size)
-    # frozen arrays would be other types to the compiler
-    hysteresis(x, np.array(thresholds), np.array(weights), p1, p2, end, out)
-    return out, end

@@ -13,7 +13,6 @@ from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.play import weighted_plays
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 import pytest
@@ -54,7 +53,7 @@ def predicted(predictor, blocks):
 
 def memory(m, v):
     h, u = m.hysteresis, m.scaling.u(v)
-    return weighted_plays(u, h.thresholds, h.weights, h.p1, h.p2, h.initial_memory(u[0]))[1]
+    return h.follow(u, h.initial_memory(u[0]))[1]
 
 
 @pytest.mark.parametrize('seed', range(5))

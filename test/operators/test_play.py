@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.operators.play import initial_memory, play_columns, weighted_plays
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.play import initial_memory, play_columns
 import pytest
 
 signals = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
@@ -70,12 +71,12 @@ def test_initial_memory_is_the_virgin_state_in_one_stroke():
 @given(signals, st.lists(st.integers(0, 60), max_size=4))
 def test_weighted_sum_is_eq_6_however_it_is_cut(v, cuts):
     p1, p2 = -0.2774, 0.6232  # the paper's
-    start = initial_memory(v[0], R)
-    whole, end = weighted_plays(v, R, Q, p1, p2, start)
+    h, start = Hysteresis(R, Q, p1, p2), initial_memory(v[0], R)
+    whole, end = h.follow(v, start)
     assert_allclose(whole, Q @ plainly(v, R) + p1 * v**3 + p2 * v, atol=1e-14)
     memory, parts = start, []
     for a, b in pairwise([0, *sorted(min(c, v.size) for c in cuts), v.size]):
-        w, memory = weighted_plays(v[a:b], R, Q, p1, p2, memory)
+        w, memory = h.follow(v[a:b], memory)
         parts.append(w)
     assert_array_equal(np.concatenate(parts), whole)
     assert_array_equal(memory, end)
@@ -86,12 +87,12 @@ def test_nothing_given_is_changed():
     for x in (v, r, memory):
         x.setflags(write=False)
     play_columns(v, r, memory)
-    weighted_plays(v, r, Q, 0.0, 1.0, memory)
+    Hysteresis(r, Q, 0.0, 1.0).follow(v, memory)
 
 
 def test_one_bad_sample_does_not_stay_in_the_memory():
     v = np.array([0.0, 0.5, np.nan, 0.5, 0.2])
-    w, memory = weighted_plays(v, R, Q, 0.0, 1.0, np.zeros(4))
+    w, memory = Hysteresis(R, Q, 0.0, 1.0).follow(v, np.zeros(4))
     assert np.isnan(w[2])
     assert np.all(np.isfinite(np.delete(w, 2)))
     assert np.all(np.isfinite(memory))
