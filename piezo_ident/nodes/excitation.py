@@ -137,11 +137,8 @@ class ExcitationNode(LabNode):
             return None
         if name != 'program' and self._is_playing():
             return f'{name} cannot be changed while a program is played; call ~/stop first'
-        try:
-            self._guard_settings(self.wanted)
-            self._build(self.wanted['program'], self.wanted)
-        except PiezoIdentError as error:
-            return str(error)
+        self._guard_settings(self.wanted)
+        self._build(self.wanted['program'], self.wanted)
         return None
 
     def _build(self, text: str, values: Mapping[str, Any] | None = None) -> tuple[Sequence, ...]:

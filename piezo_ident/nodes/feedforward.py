@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.control.inverse import FAR
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.live_learning import LiveLearning
@@ -105,10 +105,7 @@ class FeedforwardNode(DrivingNode):
             return None
         if self._state in DRIVING:
             return f'{name} cannot be changed while the node drives; call ~/stop first'
-        try:
-            self._settings(self.wanted)
-        except PiezoIdentError as error:
-            return str(error)
+        self._settings(self.wanted)
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:

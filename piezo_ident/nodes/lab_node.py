@@ -142,7 +142,10 @@ class LabNode(Node):
             return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
         if isinstance(value, float) and value != value:
             return f'{name} must be a number, got NaN'
-        return self.refuse(name, value)
+        try:
+            return self.refuse(name, value)
+        except PiezoIdentError as error:
+            return str(error)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters; those that cannot be changed may be set to what they are."""
@@ -180,7 +183,7 @@ class LabNode(Node):
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Return why a value of a parameter cannot be taken, None when it can; see `wanted`."""
+        """Return or raise why a value of a parameter cannot be taken, if so; see `wanted`."""
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:

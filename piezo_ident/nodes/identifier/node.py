@@ -150,10 +150,7 @@ class IdentifierNode(LabNode):
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse values that the settings would refuse later."""
         if name == 'thresholds':
-            try:
-                settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
-            except PiezoIdentError as error:
-                return str(error)
+            settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
         if name == 'output':
             return 'output is blank; name a folder' if value.isspace() else home_problem(value)
         if name == 'channels' and (topics := list(filter(None, value))):
