@@ -58,14 +58,13 @@ class ArxFactor:
         ``p = na_max + n_lags + 1``; columns as in the module's drawing.
     n : int
         Number of rows that went in.
-    na_max, n_lags : int
-        Lags of the output, and of the input from lag 0 on.
+    na_max : int
+        Lags of the output; those of the input come behind them, from lag 0 on.
     """
 
     R: NDArray[np.float64]
     n: int
     na_max: int
-    n_lags: int
 
     def _columns(
         self, na: int, nb: int, d: int
@@ -164,7 +163,7 @@ def arx_factor(
             yield np.hstack([past_y[:, 1:], past_u, past_y[:, :1]])
 
     R = triangular_factor(rows(), p)
-    return ArxFactor(R, n, na_max, n_lags)
+    return ArxFactor(R, n, na_max)
 
 
 def factor_of(
@@ -173,7 +172,7 @@ def factor_of(
     """Reduce stretches of input and output, none of them too short, to one triangular factor."""
     factors = [arx_factor(u, y, na_max, n_lags) for u, y in parts]
     R = triangular_factor([factor.R for factor in factors], na_max + n_lags + 1)
-    return ArxFactor(R, sum(factor.n for factor in factors), na_max, n_lags)
+    return ArxFactor(R, sum(factor.n for factor in factors), na_max)
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,11 +155,6 @@ class History:
         return self.count
 
     @property
-    def blocks(self) -> int:
-        """Number of blocks that are kept in full."""
-        return len(self._recent)
-
-    @property
     def last(self) -> float:
         """The voltage now [V]."""
         return float(self._recent[-1][1][-1])

@@ -24,6 +24,7 @@ from process_jobs import (
     tick_for_ever,
     unpicklable,
 )
+from processes import alive
 import pytest
 
 
@@ -94,13 +95,6 @@ def test_it_gives_way():
         worker.close()
 
 
-def is_there(pid):
-    try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except OSError:
-        return False
-
-
 @pytest.mark.skipif(not Path('/proc/self/stat').exists(), reason='no /proc')
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, None])
 def test_it_ends_with_its_parent(number):
@@ -113,13 +107,13 @@ def test_it_ends_with_its_parent(number):
     )
     try:
         pid = int(parent.stdout.readline())
-        assert is_there(pid)
+        assert alive(pid)
         if number is not None:
             parent.send_signal(number)
         parent.stdin.close()
         parent.wait(30.0)
         deadline = time.monotonic() + 30.0
-        while is_there(pid):
+        while alive(pid):
             assert time.monotonic() < deadline
             time.sleep(0.02)
     finally:
