@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 import math
@@ -13,12 +13,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import firwin, lfilter
+from truths.programs import Label, Tape
 
 __all__ = ['POORER', 'Label', 'Motion', 'record_motion']
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
-Label = tuple[str, int, int]
 
 #: top speed of the moves between segments [spans/s]
 SPEED = 4.0
@@ -34,33 +34,8 @@ class Motion:
     labels: tuple[Label, ...]
 
 
-class _Tape:
-    """Pieces in a row; each is joined to the one before by a soft move."""
-
-    def __init__(self, rate: float, start: float, pace: float) -> None:
-        self.rate, self.level, self.pace = rate, start, pace
-        self.pieces: list[Array] = []
-        self.labels: list[Label] = []
-        self.n = 0
-
-    def add(self, label: str, u: Array) -> None:
-        if self.labels and self.labels[-1][0] == label:
-            label += ':2' if ':' not in label else '-2'
-        self.pieces.append(u)
-        self.labels.append((label, self.n, self.n + u.size))
-        self.n += u.size
-        self.level = float(u[-1])
-
-    def ramp(self, a: float, b: float) -> Array:
-        n = max(2, math.ceil(0.5 * math.pi * abs(b - a) / SPEED * self.rate))
-        return a + (b - a) * 0.5 * (1 - np.cos(np.pi * np.arange(1, n + 1) / n))
-
-    def move(self, level: float) -> None:
-        if abs(level - self.level) > 1e-9:
-            self.add('ramp', self.ramp(self.level, level))
-
-    def rest(self, label: str, seconds: float) -> None:
-        self.add(label, np.full(max(2, round(seconds * self.rate)), self.level))
+class _Tape(Tape):
+    """A tape in parts of the range."""
 
     def sine(
         self, name: str, bias: float, amplitude: float, frequency: float, seconds: float
@@ -76,23 +51,6 @@ class _Tape:
             * np.arange(1, round(periods * self.rate / frequency) + 1)
         )
         self.add(f'sine:{frequency:g}Hz{name}', bias - amplitude * np.cos(angle))
-
-    def corners(self, label: str, levels: Sequence[float], speed: float) -> None:
-        """Straight from level to level, at so many spans a second."""
-        self.move(levels[0])
-        parts = []
-        for a, b in pairwise(levels):
-            n = max(1, round(abs(b - a) / speed * self.pace * self.rate))
-            parts.append(a + (b - a) * np.arange(1, n + 1) / n)
-        self.add(label, np.concatenate(parts))
-
-    def stairs(self, label: str, levels: Sequence[float], holds: Sequence[float]) -> None:
-        parts, level = [], self.level
-        for target, hold in zip(levels, holds, strict=True):
-            n = round(hold * self.pace * self.rate)
-            parts += [self.ramp(level, target), np.full(n, target)]
-            level = target
-        self.add(label, np.concatenate(parts))
 
     def jumps(self, label: str, low: float, high: float, count: int, hold: float) -> None:
         self.move(low)
@@ -163,7 +121,7 @@ def record_motion(
     # long records at high rates cost too much
     pace = {10_000.0: 1.0, 20_000.0: 0.9, 50_000.0: 0.6}.get(rate, 1.0)
     start = rest if labelled else rng.uniform(0.1, 0.9)
-    tape = _Tape(rate, start, pace)
+    tape = _Tape(rate, SPEED, start, pace)
     make = {'identification': _identification, 'diagnosis': _diagnosis, 'unseen': _unseen}[name]
     parts = make(tape, rng, labelled, poorer, first)
     if not labelled:

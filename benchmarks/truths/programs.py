@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Label', 'other_axis', 'program', 'table_one_sines']
+__all__ = ['Label', 'Tape', 'other_axis', 'program', 'table_one_sines']
 
 Array = NDArray[np.float64]
 Label = tuple[str, int, int]
@@ -20,34 +21,68 @@ Label = tuple[str, int, int]
 SPEED = 40.0
 
 
-class _Tape:
-    """Voltages in a row; every piece is joined to the one before by a soft move."""
+class Tape:
+    """
+    Pieces of a motion in a row; every piece is joined to the one before by a soft move.
 
-    def __init__(self, rate: float) -> None:
-        self.rate = rate
+    Parameters
+    ----------
+    rate : float
+        [Hz]
+    speed : float
+        Top speed of the moves, in units of the motion a second.
+    level : float
+        Where it starts.
+    pace : float
+        Factor by which all but moves, rests and jumps are shorter.
+    """
+
+    def __init__(self, rate: float, speed: float, level: float = 0.0, pace: float = 1.0) -> None:
+        self.rate, self.speed, self.level, self.pace = rate, speed, level, pace
         self.pieces: list[Array] = []
         self.labels: list[Label] = []
-        self.level, self.n = 0.0, 0
+        self.n = 0
 
-    def add(self, label: str, v: Array) -> None:
+    def add(self, label: str, u: Array) -> None:
         if self.labels and self.labels[-1][0] == label:
             label += ':2' if ':' not in label else '-2'
-        self.pieces.append(v)
-        self.labels.append((label, self.n, self.n + v.size))
-        self.n += v.size
-        self.level = float(v[-1])
+        self.pieces.append(u)
+        self.labels.append((label, self.n, self.n + u.size))
+        self.n += u.size
+        self.level = float(u[-1])
 
-    def move(self, level: float, label: str = 'ramp') -> None:
+    def move(self, level: float) -> None:
         if abs(level - self.level) > 1e-9:
-            self.add(label, self.way(self.level, level))
+            self.add('ramp', self.way(self.level, level))
 
     def way(self, start: float, stop: float) -> Array:
-        """Return half a cosine, at most SPEED steep."""
-        n = max(2, math.ceil(0.5 * math.pi * abs(stop - start) / SPEED * self.rate))
+        """Return half a cosine, at most `speed` steep."""
+        n = max(2, math.ceil(0.5 * math.pi * abs(stop - start) / self.speed * self.rate))
         return start + (stop - start) * 0.5 * (1 - np.cos(np.pi * np.arange(1, n + 1) / n))
 
     def rest(self, label: str, seconds: float) -> None:
-        self.add(label, np.full(round(seconds * self.rate), self.level))
+        self.add(label, np.full(max(2, round(seconds * self.rate)), self.level))
+
+    def corners(self, label: str, levels: Sequence[float], slope: float) -> None:
+        """Go straight from level to level, from the first on."""
+        self.move(levels[0])
+        parts = []
+        for a, b in pairwise(levels):
+            n = max(1, round(abs(b - a) / slope * self.pace * self.rate))
+            parts.append(a + (b - a) * np.arange(1, n + 1) / n)
+        self.add(label, np.concatenate(parts))
+
+    def stairs(self, label: str, levels: Sequence[float], holds: Sequence[float]) -> None:
+        parts, level = [], self.level
+        for target, hold in zip(levels, holds, strict=True):
+            n = round(hold * self.pace * self.rate)
+            parts += [self.way(level, target), np.full(n, target)]
+            level = target
+        self.add(label, np.concatenate(parts))
+
+
+class _Voltages(Tape):
+    """A tape of volts."""
 
     def sine(
         self, label: str, bias: float, amplitude: float, frequency: float, periods: int
@@ -57,22 +92,6 @@ class _Tape:
         n = round(periods / frequency * self.rate)
         angle = 2 * np.pi * frequency * np.arange(1, n + 1) / self.rate
         self.add(label, bias - amplitude * np.cos(angle))
-
-    def corners(self, label: str, levels: list[float], slope: float) -> None:
-        """Go straight from level to level, from the first on."""
-        self.move(levels[0])
-        parts = []
-        for a, b in pairwise(levels):
-            n = max(1, round(abs(b - a) / slope * self.rate))
-            parts.append(a + (b - a) * np.arange(1, n + 1) / n)
-        self.add(label, np.concatenate(parts))
-
-    def staircase(self, label: str, levels: list[float], holds: list[float]) -> None:
-        parts, level = [], self.level
-        for target, hold in zip(levels, holds, strict=True):
-            parts += [self.way(level, target), np.full(round(hold * self.rate), target)]
-            level = target
-        self.add(label, np.concatenate(parts))
 
     def multisine(
         self,
@@ -132,7 +151,7 @@ def program(
         When the kind is unknown.
     """
     rng = np.random.default_rng([55, seed])
-    tape = _Tape(sample_rate)
+    tape = _Voltages(sample_rate, SPEED)
     if kind == 'diagnosis':
         _diagnosis(tape, rng)
     elif kind == 'unseen':
@@ -142,15 +161,15 @@ def program(
     return tape.result()
 
 
-def _diagnosis(tape: _Tape, rng: np.random.Generator) -> None:
+def _diagnosis(tape: _Voltages, rng: np.random.Generator) -> None:
     tape.rest('idle', 1.0)
     tape.sine('sine:1Hz', 5.0, 5.0, 1.0, 3)
     tape.sine('sine:80Hz-large', 5.0, 4.5, 80.0, 56)
     tape.sine('sine:80Hz-small', 5.0, 1.5, 80.0, 56)
     tape.move(0.0)
     up = [2.6, 5.2, 9.6] if rng.random() < 0.5 else [3.4, 6.1, 9.6]
-    tape.staircase('staircase:up', up, [0.3, 0.8, 2.0])
-    tape.staircase('staircase:down', [6.4, 3.1, 0.4], [0.5, 1.2, 0.3])
+    tape.stairs('staircase:up', up, [0.3, 0.8, 2.0])
+    tape.stairs('staircase:down', [6.4, 3.1, 0.4], [0.5, 1.2, 0.3])
     for bias in (2.5, 5.0, 7.5):
         low, high = bias - 1.5, bias + 1.5
         tape.corners(f'triangle:minor-{bias:g}V', [low, high, low, high, low], 20.0)
@@ -162,7 +181,7 @@ def _diagnosis(tape: _Tape, rng: np.random.Generator) -> None:
     tape.rest('idle', 0.6)
 
 
-def _unseen(tape: _Tape, rng: np.random.Generator) -> None:
+def _unseen(tape: _Voltages, rng: np.random.Generator) -> None:
     tape.rest('idle', 0.3)
     tape.sine('sine:3Hz', 4.2, 3.9, 3.0, 5)
     tape.sine('sine:35Hz', 5.5, 4.0, 35.0, 25)
@@ -199,7 +218,7 @@ def table_one_sines(
     sample_rate: float = 20000.0, amplitude: float = 5.0
 ) -> tuple[Array, Array, list[Label]]:
     """Return the published six sines, v = 5 + A sin(2 pi f t), each reached by a soft move."""
-    tape = _Tape(sample_rate)
+    tape = _Voltages(sample_rate, SPEED)
     tape.rest('idle', 0.2)
     for f, periods in ((1, 3), (10, 20), (50, 75), (80, 120), (100, 150), (120, 180)):
         tape.sine(f'sine:{f}Hz', 5.0, amplitude, float(f), periods)
