@@ -40,16 +40,10 @@ SEEDS = 20
 NOISES = (1e-5, 1e-4, 5e-4)
 
 
-def record_of(stage: SimulatedStage, program: str, seed: int) -> Record:
+def record_of(stage: SimulatedStage, program: str, seed: int = 0) -> Record:
     """Return what the stage answers to a shipped program, with its noise."""
     sequence = Program.load(program).build(stage.model.sample_rate)
     return stage.play(sequence, np.random.default_rng(seed))
-
-
-def truth_of(stage: SimulatedStage, program: str) -> Record:
-    """Return the same without noise and converters."""
-    sequence = Program.load(program).build(stage.model.sample_rate)
-    return stage.ideal.play(sequence)
 
 
 def with_noise(stage: SimulatedStage, share: float) -> SimulatedStage:
@@ -66,7 +60,7 @@ def minor_loop_error(model: StageModel, truth: Record) -> float:
 
 def seeds_table(stage: SimulatedStage) -> list[str]:
     """Run all seeds and noise levels on the stage whose thresholds are the model's own."""
-    truth = truth_of(stage, 'validation')
+    truth = record_of(stage.ideal, 'validation')
     lines = [
         '| noise / stroke | runs | d right | stable | swarm within 1 % | worst error, % of stroke '
         '| allowed | median error |',
@@ -101,8 +95,8 @@ def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
         '|---|---|' + '---|' * (len(frequencies) + 1),
     ]
     for name, stage in stages.items():
-        record = record_of(stage, 'identification', 0)
-        sines, loops = truth_of(stage, 'validation'), truth_of(stage, 'minor_loops')
+        record = record_of(stage, 'identification')
+        sines, loops = (record_of(stage.ideal, x) for x in ('validation', 'minor_loops'))
         for count in (10, None):
             model = identify(record, Settings(thresholds=count)).model
             rows = [(f'{model.hysteresis.thresholds.size + 1}', model)]
