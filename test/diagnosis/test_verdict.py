@@ -37,6 +37,7 @@ def rows():
         labels=tuple(f'kind {i}' for i in range(8)),
         kinds=tuple(f'kind {i}' for i in range(8)),
         of_record=np.zeros(BLOCKS * SIZE, dtype=int),
+        passes=9.0,
     )
 
 
@@ -59,6 +60,15 @@ def a_round(*contenders, before=WHOLE):
     start, best = fitted(before), contenders[0]
     gain = start.mean_square - best.mean_square
     return SimpleNamespace(before=start, contenders=contenders, gain=gain, chance={}, best={})
+
+
+def a_search(rows, **own):
+    """Return a search by these rows of which so much is there."""
+    made = object.__new__(forward_selection.ForwardSelection)
+    made._simulator = SimpleNamespace(rows=rows)
+    made._noise, made._smallest, made._given, made._most = 0.0, 0.05, np.inf, 4
+    vars(made).update(own)
+    return made
 
 
 def rivals(rows, *contenders, plays=True):
@@ -264,12 +274,8 @@ def test_nothing_is_gained_below_the_noise(rows):
 def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
     rows, monkeypatch, share, wide_left, kinds, is_taken
 ):
-    search = object.__new__(forward_selection.ForwardSelection)
-    rows = SimpleNamespace(**(vars(rows) | {'passes': 9.0, 'kinds': kinds}))
-    search._simulator = SimpleNamespace(rows=rows)
-    search._noise, search._smallest, search._given, search._most = 0.0, 0.05, np.inf, 4
-    search._worth = 0.0
-    search._candidates, search.retuned = [], lambda fitted: fitted
+    rows.kinds = kinds
+    search = a_search(rows, _worth=0.0, _candidates=[], retuned=lambda fitted: fitted)
     best = contender('even_nonlinearity', 0.02)
     plays, wide, as_given = (
         SimpleNamespace(mean_square=part * WHOLE) for part in (1.0, wide_left, share)
@@ -347,7 +353,6 @@ def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
 
 
 def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
-    rows.passes = 9.0
     this = a_round(contender('saturation', 0.9))
     this.best = {
         name: SimpleNamespace(error=0.95 * this.before.errors.sum())
@@ -401,10 +406,7 @@ def test_an_effect_that_costs_a_kind_is_not(rows):
 def test_a_further_effect_may_make_up_for_the_form_of_the_law_before(
     rows, parameters, left, smallest, is_taken
 ):
-    search = object.__new__(forward_selection.ForwardSelection)
-    search._simulator = SimpleNamespace(rows=SimpleNamespace(**vars(rows), passes=9.0))
-    search._noise, search._smallest, search._given = 0.0, smallest, np.inf
-    search._base = SimpleNamespace(mean_square=WHOLE)
+    search = a_search(rows, _smallest=smallest, _base=SimpleNamespace(mean_square=WHOLE))
     before = SimpleNamespace(
         mean_square=0.07 * WHOLE,
         errors=contender('backlash', 0.07).errors,
@@ -421,9 +423,7 @@ def test_a_further_effect_may_make_up_for_the_form_of_the_law_before(
 
 @pytest.mark.parametrize(('left', 'names'), [(0.015, ['cross_coupling']), (0.005, None)])
 def test_what_another_axis_leaves_by_its_form_is_no_line(rows, left, names):
-    search = object.__new__(forward_selection.ForwardSelection)
-    search._simulator = SimpleNamespace(rows=rows)
-    search._certain = forward_selection.TESTED[::-1]
+    search = a_search(rows, _certain=forward_selection.TESTED[::-1])
     search._candidates = [find_effect(name) for name in search._certain]
     rounds = {
         'cross_coupling': a_round(contender('cross_coupling', 0.02)),
@@ -445,14 +445,9 @@ def choose(rows):
     """Return what a search starts from, given what either round leaves, and the rival it keeps."""
 
     def chosen(linear, bent, fits=True, retuned_left=0.05, passes=9.0, **changed):
-        search = object.__new__(forward_selection.ForwardSelection)
-        search._simulator = SimpleNamespace(
-            rows=SimpleNamespace(**vars(rows), passes=passes),
-            model=SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2))),
-        )
-        search._noise, search._missed, search._smallest = 0.0, 0.0, 0.05
-        search._certain, search._given, search._misfit, search._most = (), np.inf, 0.0, 4
-        vars(search).update(changed)
+        rows.passes = passes
+        search = a_search(rows, **{'_missed': 0.0, '_certain': (), '_misfit': 0.0} | changed)
+        search._simulator.model = SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2)))
         names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
         search._candidates = [find_effect(n) for n in names]
         again = a_round(bent, before=retuned_left * WHOLE)
@@ -587,7 +582,7 @@ def test_beside_much_noise_little_is_no_finding(rows, rms, verdict):
 
 
 def test_a_change_of_g_explains_nearly_all_that_is_left():
-    search = object.__new__(forward_selection.ForwardSelection)
+    search = a_search(None)
     static, slow, linear = map(find_effect, ('saturation', 'creep', 'amplifier_lag'))
     for search._is_new, share in ((True, criteria.NAMED), (False, criteria.LAW_FITS)):
         assert search._wanted([linear]) == search._wanted([static, linear]) == share
