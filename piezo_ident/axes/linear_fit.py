@@ -31,7 +31,7 @@ THIN = 3
 STEPS = 6
 
 
-def linear_fit(response: LineResponse, order: int, *, iterations: int = 20) -> Modal:
+def linear_fit(response: LineResponse, order: int, *, iterations: int) -> Modal:
     """Identify a stable modal model of a frequency response."""
     return refined(subspace(response, order), response, iterations=iterations)
 

@@ -195,7 +195,7 @@ class Rows:
         """Return an rms in % of stroke as a mean square, normalised."""
         return (size * self.stroke / 100.0) ** 2
 
-    def errors(self, e: Array, noise: float = 0.0) -> Errors:
+    def errors(self, e: Array, noise: float) -> Errors:
         """
         Return the errors of a residual of the rows, shape (n,), normalised.
 

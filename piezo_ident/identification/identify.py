@@ -303,11 +303,11 @@ def _left(model: StageModel, runs: Sequence[Run]) -> float:
 
 def first_steps(
     records: Sequence[Record],
-    settings: Settings | None = None,
+    settings: Settings,
     *,
     which: str,
-    steps: Steps | None = None,
-    progress: Progress = silent,
+    steps: Steps | None,
+    progress: Progress,
 ) -> Steps:
     """
     Take the first step alone, or the second one and what it needs of the first.
@@ -317,11 +317,11 @@ def first_steps(
     records : sequence of Record
         With segments ``step`` or ``noise`` for the delay; with ``noise`` and ``triangle`` for the
         dynamics, since the hysteresis has to be undone.
-    settings : Settings, optional
+    settings : Settings
     which : {'delay', 'dynamics'}
-    steps : Steps, optional
+    steps : Steps or None
         What was found already.
-    progress : callable, optional
+    progress : callable
         As for `identify`.
 
     Raises
@@ -329,7 +329,7 @@ def first_steps(
     IdentificationError
         When the data do not carry this step.
     """
-    data, settings, steps = prepare(records), settings or Settings(), steps or Steps()
+    data, steps = prepare(records), steps or Steps()
     with singular_is_ours():
         if which == 'delay':
             if not data.kinds & {'step', 'noise'}:

@@ -34,7 +34,7 @@ def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
     return faster.normalised() if faster.a.size < G.a.size else None
 
 
-def fast_part(G: Dynamics, rate: float, lean: bool = False) -> Dynamics:
+def fast_part(G: Dynamics, rate: float, lean: bool) -> Dynamics:
     """Return G with G(1) = 1, without slow real poles where it can; `lean`, without pairs too."""
     G = without_pairs(G, rate) if lean else G
     return without_slow_part(G, rate) or G.normalised()

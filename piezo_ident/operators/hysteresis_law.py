@@ -187,17 +187,11 @@ class HysteresisLaw:
         variance = np.sum(T * (covariance @ T), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def parts(
-        self, places: Sequence[int] | None = None
-    ) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
-        """
-        Give the H of each coefficient alone, and which thresholds it has; shape (m,).
-
-        Of those in some places, or of all.
-        """
+    def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
+        """Give the H of each coefficient in some places alone, and which thresholds it has."""
         r, m = self.thresholds, self.thresholds.size
         n = (POWERS + 2) * m
-        for row in self._parameters if places is None else self._parameters[list(places)]:
+        for row in self._parameters[list(places)]:
             plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
             moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
             rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])

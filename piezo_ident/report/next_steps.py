@@ -67,20 +67,19 @@ class Step:
     command: str
 
 
-def next_steps(result: Identification | Diagnosis, prompt: Prompt | None = None) -> list[Step]:
+def next_steps(result: Identification | Diagnosis, prompt: Prompt) -> list[Step]:
     """
     Return what to do after an identification or a diagnosis.
 
     Parameters
     ----------
     result : Identification or Diagnosis
-    prompt : Prompt, optional
+    prompt : Prompt
         Names of the files.
     """
-    named = prompt or Prompt()
     if isinstance(result, Diagnosis):
-        return list(_after_diagnosis(result, named))
-    return list(_after_identification(result, named))
+        return list(_after_diagnosis(result, prompt))
+    return list(_after_identification(result, prompt))
 
 
 def _after_identification(result: Identification, prompt: Prompt) -> Iterator[Step]:

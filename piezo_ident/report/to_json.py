@@ -68,9 +68,7 @@ def diagnosis_schema() -> dict[str, Any]:
     return schema
 
 
-def steps_to_json(
-    steps: Steps, sample_rate: float, records: Sequence[Record] = ()
-) -> dict[str, Any]:
+def steps_to_json(steps: Steps, sample_rate: float, records: Sequence[Record]) -> dict[str, Any]:
     """
     Return the result of single steps, under the keys of `to_json`.
 
@@ -79,7 +77,7 @@ def steps_to_json(
     steps : Steps
     sample_rate : float
         [Hz]
-    records : sequence of Record, optional
+    records : sequence of Record
         For the faults in their data.
     """
     data = {**VERSION, 'sample_rate': sample_rate, 'data_faults': _faults(records)}

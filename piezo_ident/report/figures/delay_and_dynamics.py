@@ -35,7 +35,7 @@ LEAST_RANGE = 4.0
 DAMPED, UNSURE, APART = 0.5, 0.1, 0.09
 
 
-def delay_figure(identification: Identification, runs: Sequence[PieceRun] = ()) -> Figure:
+def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Figure:
     """
     Draw the averaged step response with the delay, and the scan of the ARX loss.
 

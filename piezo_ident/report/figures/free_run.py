@@ -167,9 +167,7 @@ def _name_segments(axes: Axes, run: PieceRun) -> None:
         style.name_above(axes, s.label, 0.5 * (first + last), 30.0 if rotated else 0.0)
 
 
-def segments_figure(
-    runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], str] | None = None
-) -> Figure:
+def segments_figure(runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], str]) -> Figure:
     """
     Draw a readable stretch of every segment with its error below.
 
@@ -198,7 +196,7 @@ def segments_figure(
         across = slice(None) if i % 2 == 0 and i + 1 == len(cells) else i % 2
         trace = fig.add_subplot(grid[2 * (i // 2) + 1, across])
         error = fig.add_subplot(grid[2 * (i // 2) + 2, across], sharex=trace)
-        _draw_segment(trace, error, run, s, (errors or {}).get((run.record, s.label), ''))
+        _draw_segment(trace, error, run, s, errors.get((run.record, s.label), ''))
     head = fig.add_subplot(grid[0, :])
     head.set_axis_off()
     for name, colour, width in (
