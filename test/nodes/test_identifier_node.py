@@ -195,10 +195,7 @@ def cancelled_at(g, step, during):
     ok, message = g.call('identifier/cancel')
     answered = time.monotonic() - begin
     assert ok, message
-    g.wait(
-        lambda: any(s['state'] == 'cancelled' for s in g.statuses('identifier')[seen:]),
-        'cancelled',
-    )
+    g.until('identifier', 'cancelled', since=seen)
     return answered, time.monotonic() - begin
 
 

@@ -85,15 +85,9 @@ def test_cancel_during_the_excitation_ramps_to_rest(measured):
         begin = time.monotonic()
         assert course.call('identifier/cancel')[0]
         answered = time.monotonic() - begin
-        course.wait(
-            lambda: any(s['state'] == 'cancelled' for s in course.statuses('identifier')[begun:]),
-            'cancelled',
-        )
+        course.until('identifier', 'cancelled', since=begun)
         ended = time.monotonic() - begin
-        course.wait(
-            lambda: any(s['state'] == 'stopped' for s in course.statuses('excitation')[seen:]),
-            'stopped',
-        )
+        course.until('excitation', 'stopped', since=seen)
         course.wait(lambda: voltage and voltage[-1].values[-1] == 0.0, 'rest')
         in_time(answered, 0.5, 'answer to a cancel during the excitation')
         in_time(ended, 2.0, 'end after a cancel during the excitation')
@@ -106,9 +100,6 @@ def test_the_end_of_the_node_ends_the_excitation(measured):
     course = measured
     voltage, seen = course.collect('voltage'), settling(course)
     assert course.handle('identifier').stop() == 0
-    course.wait(
-        lambda: any(s['state'] == 'stopped' for s in course.statuses('excitation')[seen:]),
-        'stopped',
-    )
+    course.until('excitation', 'stopped', since=seen)
     course.wait(lambda: voltage and voltage[-1].values[-1] == 0.0, 'rest')
     assert voltage[-1].segment == 'ramp:stop'

@@ -108,9 +108,7 @@ def test_a_stop_ramps_both_axes(lab):
     applied = [lab.collect(topic) for topic in ('applied_voltage', 'applied_voltage_b')]
     seen = len(lab.statuses('excitation'))
     assert lab.call('excitation/start')[0]
-    lab.wait(
-        lambda: any(s['state'] == 'running' for s in lab.statuses('excitation')[seen:]), 'a start'
-    )
+    lab.until('excitation', 'running', since=seen)
     lab.wait(lambda: len(applied[1]) > 10, 'voltages')
     assert lab.call('excitation/stop')[0]
     lab.until('excitation', 'stopped', since=seen)
