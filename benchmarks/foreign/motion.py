@@ -141,13 +141,13 @@ def _mixed(parts: Parts, rng: Rng, labelled: bool) -> Parts:
     return parts if labelled else [parts[i] for i in rng.permutation(len(parts))]
 
 
-def _swings(growing: bool, count: int, middle: float = 0.5) -> list[float]:
+def _swings(growing: bool, count: int) -> list[float]:
     sizes = np.linspace(1.0, count, count) / count * 0.5
     if not growing:
         sizes = sizes[::-1]
-    levels = [middle]
+    levels = [0.5]
     for size in sizes:
-        levels += [min(middle + size, 1.0), max(middle - size, 0.0)]
+        levels += [0.5 + size, 0.5 - size]
     return levels
 
 

@@ -362,8 +362,8 @@ class Attack:
         self.survived('models that are none')
         return said
 
-    def services(self, seconds: float, clients: int = 4) -> float:
-        """Call services as fast as so many processes can; return calls answered a second."""
+    def services(self, seconds: float) -> float:
+        """Call services as fast as four processes can; return calls answered a second."""
         command = [sys.executable, str(HERE), '--client', str(seconds)]
         running = [
             subprocess.Popen(
@@ -373,7 +373,7 @@ class Attack:
                 env=self.g.environment,
                 text=True,
             )
-            for _ in range(clients)
+            for _ in range(4)
         ]
         try:
             said = [p.communicate(timeout=seconds + 2 * ANSWERED) for p in running]

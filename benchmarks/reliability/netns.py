@@ -214,7 +214,7 @@ class Outcome:
         return bool(self.lost or self.faults) or (self.state == 'failed' and bool(self.message))
 
 
-def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
+def run(percent: int = 0, down: float = 0.0) -> Outcome:
     """
     Run a program over two hosts.
 
@@ -224,8 +224,6 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
         Of the packets that are dropped, in both directions.
     down : float
         How long the link is down in the midst of it [s].
-    program : str
-        YAML.
 
     Raises
     ------
@@ -240,7 +238,7 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
         hosts.node(0, 'excitation', {'subscribers': 3, 'wait_limit': 60.0})
         hosts.node(1, 'identifier', SETTINGS)
         hosts.node(1, 'model', {})
-        (hosts.folder / 'program.yaml').write_text(program)
+        (hosts.folder / 'program.yaml').write_text(PROGRAM)
         command = [sys.executable, str(HERE), '--drive', str(hosts.folder / 'program.yaml')]
         driver = hosts.start(1, command, 'driver')
         assert driver.stdout is not None
@@ -254,7 +252,7 @@ def run(percent: int = 0, down: float = 0.0, program: str = PROGRAM) -> Outcome:
             error = (hosts.folder / 'driver.err').read_text()[-1500:]
             raise RuntimeError(f'the run did not come to an end: {begun} {error}')
         end = json.loads(text.strip().splitlines()[-1])
-        sent = parse_program(program).build(20_000.0).n
+        sent = parse_program(PROGRAM).build(20_000.0).n
         return Outcome(
             **{**end, 'faults': tuple(end['faults'])}, sent=sent, dropped=hosts.dropped()
         )
