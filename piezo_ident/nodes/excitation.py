@@ -40,11 +40,11 @@ from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
-from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.channels import role_of
 
-__all__ = ['ExcitationNode', 'main']
+__all__ = ['ExcitationNode']
 
 #: unit of a program, and what it is in SI
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
@@ -340,8 +340,3 @@ class ExcitationNode(LabNode):
             self._thread.join()
             for output in self._outputs:
                 output.close()
-
-
-def main(argv: Many[str] | None = None) -> int:
-    """Run the node; see `piezo_ident.nodes.lab_node.run`."""
-    return run(ExcitationNode, argv)

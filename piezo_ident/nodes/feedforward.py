@@ -29,7 +29,7 @@ from the stage, as in micrometres | the block is refused | WARN |
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import time
 from typing import Any
 
@@ -45,14 +45,14 @@ from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import Drive, Successor, Tracker
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
-from piezo_ident.nodes.lab_node import guard_settings, OK, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
 from piezo_ident.nodes.learner import Learner
 from piezo_ident.nodes.model_loader import ModelLoader, no_file
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['FeedforwardNode', 'main']
+__all__ = ['FeedforwardNode']
 
 #: parameters that are taken over between two references
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
@@ -368,8 +368,3 @@ class FeedforwardNode(DrivingNode):
         """Ramp to rest within a second."""
         self._loader.close()
         super().close()
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; see `piezo_ident.nodes.lab_node.run`."""
-    return run(FeedforwardNode, argv)

@@ -9,7 +9,7 @@ ROS passes over a parameter or an argument that nobody knows without a word.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import difflib
 from pathlib import Path
 import re
@@ -24,7 +24,7 @@ from rclpy.utilities import remove_ros_args
 __all__ = ['begin', 'home_problem', 'no_parameter', 'unknown_to']
 
 
-def begin(argv: Sequence[str] | None) -> None:
+def begin() -> None:
     """
     Initialise ROS, without its signal handlers.
 
@@ -34,7 +34,7 @@ def begin(argv: Sequence[str] | None) -> None:
         When ROS cannot take the arguments, or a file that they name.
     """
     try:
-        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     # of which the classes of rcl's errors are
     except RuntimeError as error:
         # without the places in the sources of rcl
@@ -60,10 +60,10 @@ def no_parameter(node: Node, name: str) -> str:
     return f'{name} is no parameter of this node{guess}'
 
 
-def unknown_to(node: Node, argv: Sequence[str] | None) -> Iterator[str]:
+def unknown_to(node: Node) -> Iterator[str]:
     """Return a line on each parameter and argument that was given and that the node has not."""
     given = getattr(node, '_parameter_overrides', ())
     yield from (no_parameter(node, name) for name in sorted(given) if not node.has_parameter(name))
-    rest = remove_ros_args(args=sys.argv if argv is None else argv)[1:]
+    rest = remove_ros_args(args=sys.argv)[1:]
     if rest:
         yield f'{" ".join(rest)} is passed over; set parameters by --ros-args -p NAME:=VALUE'

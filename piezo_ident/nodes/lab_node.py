@@ -304,7 +304,7 @@ class LabNode(Node):
         """Wait a moment until the last status was heard."""
         self._status.wait_for_all_acked(Duration(seconds=0.1))
 
-    def introduce(self, argv: Sequence[str] | None) -> None:
+    def introduce(self) -> None:
         """Write that the node is up, which parameters differ from the default, what is unknown."""
         changed = {
             name: value
@@ -313,7 +313,7 @@ class LabNode(Node):
         }
         said = f'; set: {shown(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
-        for line in unknown_to(self, argv):
+        for line in unknown_to(self):
             self.journal.tell(line, WARN)
 
     def close(self) -> None:
@@ -330,7 +330,7 @@ def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> 
     )
 
 
-def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
+def run(make: Callable[[], LabNode]) -> int:
     """
     Run a node until SIGINT or SIGTERM, and let it close before the context goes.
 
@@ -338,8 +338,6 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     ----------
     make : callable
         Makes the node.
-    argv : sequence of str, optional
-        Arguments for ROS.
 
     Returns
     -------
@@ -352,7 +350,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     ENDING.listen()
     ENDING.patience = STARTING
     try:
-        begin(argv)
+        begin()
     except PiezoIdentError as error:
         sys.stderr.write(f'piezo_ident: error: {error}\n')
         return 2
@@ -361,7 +359,7 @@ def run(make: Callable[[], LabNode], argv: Sequence[str] | None = None) -> int:
     node, code = None, 0
     try:
         node = make()
-        node.introduce(argv)
+        node.introduce()
         ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience
         executor.add_node(node)
         _spin(executor, node)

@@ -17,16 +17,18 @@ from piezo_ident.nodes.ending import ENDING
 __all__ = ['excitation', 'feedforward', 'identifier', 'model', 'player', 'recorder', 'stage']
 
 
-def _run(node: str) -> None:
+def _run(module: str, name: str) -> None:
     ENDING.listen()
-    code = importlib.import_module(f'piezo_ident.nodes.{node}').main()
-    ENDING.leave(code)
+    node = getattr(importlib.import_module(f'piezo_ident.nodes.{module}'), name)
+    from piezo_ident.nodes.lab_node import run
+
+    ENDING.leave(run(node))
 
 
-excitation = partial(_run, 'excitation')
-feedforward = partial(_run, 'feedforward')
-identifier = partial(_run, 'identifier')
-model = partial(_run, 'model')
-player = partial(_run, 'player')
-recorder = partial(_run, 'recorder')
-stage = partial(_run, 'stage')
+excitation = partial(_run, 'excitation', 'ExcitationNode')
+feedforward = partial(_run, 'feedforward', 'FeedforwardNode')
+identifier = partial(_run, 'identifier.node', 'IdentifierNode')
+model = partial(_run, 'model', 'ModelNode')
+player = partial(_run, 'player', 'PlayerNode')
+recorder = partial(_run, 'recorder', 'RecorderNode')
+stage = partial(_run, 'stage', 'StageNode')

@@ -16,14 +16,14 @@ from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, Previ
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import ModelLoader, no_file
 from piezo_ident.nodes.wire import from_message, PREVIEW, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['ModelNode', 'main']
+__all__ = ['ModelNode']
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
 #: how long a problem of the stream stays in the status [s], and how many of them
@@ -240,8 +240,3 @@ def _tried(model: StageModel) -> StageModel:
     """Return the model after a few samples, so that all it needs is compiled and fits together."""
     model.stream().process(np.full(10, model.scaling.range[0]))
     return model
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(ModelNode, argv)

@@ -23,7 +23,7 @@ from typing import Any
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.subscriptions import DEPTH, message_class, topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
@@ -31,7 +31,7 @@ from piezo_ident.record.bags.recover import Bag
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
-__all__ = ['PlayerNode', 'chosen_topics', 'main']
+__all__ = ['PlayerNode', 'chosen_topics']
 
 #: how long the end of the node waits for the replay to end [s]
 PATIENCE = 1.0
@@ -350,8 +350,3 @@ def _profile(connection: Connection) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
-
-
-def main(argv: Any = None) -> int:
-    """Run the node."""
-    return run(PlayerNode, argv)

@@ -26,11 +26,11 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import Rate
 from piezo_ident.nodes.given import home_problem
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
 
-__all__ = ['RecorderNode', 'main']
+__all__ = ['RecorderNode']
 
 #: how often the subscriptions are emptied [s]
 POLL = 0.02
@@ -244,8 +244,3 @@ class RecorderNode(LabNode):
         numbers = self._numbers()
         brief = f'{numbers["messages"]} messages: {message}' if state == 'recording' else message
         self.report_status(state, progress, message, level, brief=brief, **numbers)
-
-
-def main(argv: Any = None) -> int:
-    """Run the node."""
-    return run(RecorderNode, argv)

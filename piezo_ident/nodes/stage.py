@@ -63,13 +63,13 @@ from piezo_ident.live.pacing import Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.nodes.journal import RecentFaults
-from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['StageNode', 'main']
+__all__ = ['StageNode']
 
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
@@ -369,8 +369,3 @@ class StageNode(LabNode):
             time.sleep(max(0.0, begin + sent / self.sample_rate - time.monotonic()))
         for publisher in self._applied:
             publisher.wait_for_all_acked(Duration(seconds=0.1))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; see `piezo_ident.nodes.lab_node.run`."""
-    return run(StageNode, argv)

@@ -34,13 +34,13 @@ from piezo_ident.nodes.identifier.jobs import (
     warm_up,
 )
 from piezo_ident.nodes.identifier.worker import Worker
-from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, run, WARN
+from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.subscriptions import topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from std_msgs.msg import String
 
-__all__ = ['IdentifierNode', 'main']
+__all__ = ['IdentifierNode']
 
 Result = IdentificationOutcome | DiagnosisOutcome | str
 
@@ -386,8 +386,3 @@ class IdentifierNode(LabNode):
             self._worker.join(PATIENCE)
             self._set_state('cancelled', 0.0, 'the node ends')
         self._worker.close()
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(IdentifierNode, argv)
