@@ -55,6 +55,7 @@ from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import suspicions
+from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Record, records_of
 from piezo_ident.residual import (
     all_stretches,
@@ -136,6 +137,7 @@ def diagnose(
         raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
+    records = [with_quiet_voltage(record) for record in records]
     part = _beginnings(model, records, settings.most_samples)
     is_whole = part == records
     try:

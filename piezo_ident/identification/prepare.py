@@ -19,6 +19,7 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults
 from piezo_ident.record.gaps import bridged
+from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.residual.stretches import true_runs
 
@@ -210,7 +211,10 @@ def prepare(records: Sequence[Record]) -> Prepared:
         raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
-    records = [without_faults(record.first(MOST_SAMPLES // len(records))) for record in records]
+    records = [
+        with_quiet_voltage(without_faults(record.first(MOST_SAMPLES // len(records))))
+        for record in records
+    ]
     rate, left = common_rate(records)
     refuse_undriven(records)
     for record in records:

@@ -31,6 +31,7 @@ from piezo_ident.model.metrics import BLOCK, nrmse_fit, percent, REVERSED, runs_
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.faults import without_faults
+from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
 __all__ = [
@@ -168,7 +169,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     expect(model, StageModel, 'free_run, first argument', 'read a model with load')
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     record.require_displacement()
-    record = without_faults(record)
+    record = with_quiet_voltage(without_faults(record))
     groups = connected_pieces(record)
     _check_rates(model, record)
     starts = [fit_start(model, pieces[0]) for pieces in groups]

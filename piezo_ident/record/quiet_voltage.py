@@ -1,0 +1,85 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The voltage of a record without the noise of its own measurement.
+
+Many labs record the monitor of the amplifier and not the command.  Its noise is a path of many
+spans in a minute, which no hysteresis follows: laws with lags along the path would follow time,
+and a hold would be none.  Where the voltage is quiet but for noise, a play that is as wide as the
+noise stands in for it; where it moves, it stays as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.operators.play import play_columns
+from piezo_ident.record.record import Fault, Piece, Record
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+__all__ = ['with_quiet_voltage']
+
+Vector = NDArray[np.float64]
+
+#: samples of a window, and the share of the windows that may be quieter than the noise
+WINDOW, QUIET = 100, 10.0
+#: width of the play, in standard deviations of the noise
+WIDTH = 8.0
+#: widest play, as a share of the range: beyond it the voltage is a noise that was played
+MOST = 5e-3
+#: widths that the voltage moves within so many samples where it moves
+MOVES, AROUND = 10.0, 9
+#: path of noise [ranges] that does no harm
+SHORT = 0.05
+
+
+def with_quiet_voltage(record: Record) -> Record:
+    """
+    Return a record whose voltage has no noise where it rests or moves slowly.
+
+    A fault of it says how large the noise was; the same record is returned where there is none.
+    """
+    span = float(np.ptp(record.voltage_range))
+    if span == 0.0 or any(fault.name == 'voltage_noise' for fault in record.faults):
+        return record
+    deviation = max(_deviation(piece.v) for piece in record)
+    width = WIDTH * deviation
+    if not 0.0 < width <= MOST * span:
+        return record
+    pieces = tuple(replace(piece, v=_quiet(piece.v, width)) for piece in record)
+    gone = sum(_path(one) - _path(other) for one, other in zip(record, pieces, strict=True))
+    if gone < SHORT * span:
+        return record
+    fault = Fault(
+        'voltage_noise',
+        f'of {1e3 * deviation:.2g} mV rms, as of a monitor',
+        record.n,
+        f'taken out where the voltage moves by less than {MOVES * width:.2g} V in {AROUND} '
+        'samples; give the command instead if it was recorded',
+    )
+    return replace(record, pieces=pieces, faults=(*record.faults, fault))
+
+
+def _deviation(v: Vector) -> float:
+    """Return the standard deviation of white noise [V] in the quietest parts of a voltage."""
+    if v.size < 3 * WINDOW:
+        return 0.0
+    # of a smooth motion little is left
+    d = np.diff(v, 2)
+    windows = d[: d.size // WINDOW * WINDOW].reshape(-1, WINDOW)
+    return float(np.percentile(windows.std(axis=1), QUIET) / np.sqrt(6.0))
+
+
+def _quiet(v: Vector, width: float) -> Vector:
+    """Return the middle of a play of some width [V], or the voltage where it moves by more."""
+    u = v - v.min()
+    still = play_columns(u, [width], np.array([u[0] - 0.5 * width]))[0] + 0.5 * width + v.min()
+    reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
+    return np.where(reach > MOVES * width, v, still)
+
+
+def _path(piece: Piece) -> float:
+    return float(np.abs(np.diff(piece.v)).sum())
