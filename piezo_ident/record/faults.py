@@ -35,8 +35,9 @@ HELD = 10
 MOST, MOST_ROW = 2**17, 2**10
 #: share of that step by which numbers in a file may be rounded
 ROUNDED = 0.07
-#: where more of a record than this looks wrong, it is the way of the data
-MAX_FAULTY = 0.05
+#: where more of a record than this looks wrong, single readings and ones that are held, it is the
+#: way of the data
+MAX_WILD, MAX_HELD = 0.05, 0.3
 
 
 def without_faults(record: Record) -> Record:
@@ -63,7 +64,9 @@ def without_faults(record: Record) -> Record:
                 counts[name] += b - a
                 met.setdefault(name, []).append(float(piece.time(a, a + 1)[0]))
         pieces += _cut_out(_bridged_over(piece, wild, span), held)
-    if not counts or sum(counts.values()) > MAX_FAULTY * record.n or not pieces:
+    hangs = counts['stuck']
+    is_way = hangs > MAX_HELD * record.n or counts.total() - hangs > MAX_WILD * record.n
+    if not counts.total() or is_way or not pieces:
         return record
     faults = [
         Fault(

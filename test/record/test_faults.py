@@ -110,6 +110,9 @@ def test_a_sensor_that_hangs_or_drops_out_is_cut_out():
     record, counts = cleaned(y)
     assert counts == {'stuck': 1999 + 300}
     assert [p.n for p in record] == [50_001, 38_000, 109_700]
+    # a tenth of the record, too; where most of it is so, it is the way of the sensor
+    y[100_000:117_000] = y[100_000]
+    assert cleaned(y)[1] == {'stuck': 1999 + 300 + 16_999}
 
 
 @pytest.mark.parametrize('bits', [6, 8, 12, 16])
