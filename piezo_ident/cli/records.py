@@ -40,8 +40,12 @@ __all__ = [
 TOLD = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
-#: what a folder is searched for: .txt and .dat are often something else
-RECORD_FILES = (*(x for x in READERS if x not in ('.txt', '.dat', '.asc')), *BAG_FILES)
+#: what may be a record, but is often something else
+UNCERTAIN = ('.txt', '.dat', '.asc')
+#: size from which such a file is no notes [bytes]
+NOTES = 20_000
+#: what a folder is searched for
+RECORD_FILES = (*(x for x in READERS if x not in UNCERTAIN), *BAG_FILES)
 
 
 @contextmanager
@@ -85,6 +89,9 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
             )
         if skipped:
             console.note(f'{path}: its folders are not read ({", ".join(skipped)}); name them too')
+        if others := [p.name for p in sorted(path.glob('[!.]*')) if _may_be_record(p)]:
+            some = ', '.join(others[:3]) + (', ...' if len(others) > 3 else '')
+            console.note(f'{path}: {some}: not read, as text may be anything; name them too')
         records += inside
     return records
 
@@ -93,6 +100,11 @@ def _is_record(path: Path) -> bool:
     return (path / 'metadata.yaml').is_file() or (
         path.is_file() and path.suffix.lower() in RECORD_FILES
     )
+
+
+def _may_be_record(path: Path) -> bool:
+    """Return whether a text is too long for notes."""
+    return path.suffix.lower() in UNCERTAIN and path.is_file() and path.stat().st_size > NOTES
 
 
 def expand_apart(

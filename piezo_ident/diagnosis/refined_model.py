@@ -195,8 +195,8 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
 def _at_rest(model: StageModel) -> float:
     """Return the displacement at rest at the lowest voltage, hum and other axes left out."""
     own = tuple(x for x in model.effects if x.name not in TESTED)
-    y = replace(model, effects=own).simulate([model.scaling.range[0]])
-    return float(model.scaling.x(y)[0])
+    y = replace(model, effects=own).stream().reset(model.scaling.range[0])
+    return float(model.scaling.x(y))
 
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:

@@ -317,6 +317,10 @@ def test_a_folder_of_records_leaves_none_out_unsaid(capsys, tmp_path):
     taken = ['TEK0001.CSV', 'b.csv', 'crashed.mcap']
     assert [path.name for path in expand([tmp_path], Console())] == taken
     assert capsys.readouterr().err == ''
+    (tmp_path / 'long.dat').write_text('1.0 2.0\n' * 5000)
+    assert [path.name for path in expand([tmp_path], Console())] == taken
+    assert 'long.dat: not read, as text may be anything; name' in capsys.readouterr().err
+    (tmp_path / 'long.dat').unlink()
     (tmp_path / 'monday').mkdir()
     (tmp_path / 'monday' / 'a.NPZ').write_text('')
     (tmp_path / 'bags' / 'whole').mkdir(parents=True)
