@@ -17,7 +17,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 from piezo_ident.common.config import shipped_names
-from piezo_ident.record.options import parse_columns, plain_unit, UNITS
+from piezo_ident.record.options import parse_columns, scaled_unit, UNITS
 
 
 def _name(text: str) -> str:
@@ -100,11 +100,14 @@ def _unit_of(quantity: str, role: str) -> click.Option:
     known = UNITS[role]
 
     def unit(text: str) -> str:
-        if plain_unit(text) not in known:
+        if not (found := scaled_unit(role, text)):
             raise click.BadParameter(f'{text!r} is no unit; give {", ".join(known)}')
-        return plain_unit(text)
+        return found
 
-    text = f'Of {role} in the files (default: by the header, else {next(iter(known))}).'
+    text = (
+        f'Of {role} in the files (default: by the header, else {next(iter(known))}); '
+        f'10{[*known][-2]} where one of the file is that much.'
+    )
     return _option(f'--{quantity}-unit', unit, '|'.join(known), text)
 
 

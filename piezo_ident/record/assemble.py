@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
-from piezo_ident.record.options import ReadOptions, UNITS
+from piezo_ident.record.options import ReadOptions, unit_factor, UNITS
 from piezo_ident.record.ordering import at_times, in_order, OrderedRows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 from piezo_ident.record.rounded_time import unrounded
@@ -122,7 +122,7 @@ def assemble(
     unit = options.displacement_unit or 'm'
     if unit != 'm':
         moved = {k: x for k, x in table.columns.items() if k == 'y' or role_of(k) == 'y'}
-        scaled = {k: x / UNITS['y'][unit] for k, x in moved.items()}
+        scaled = {k: x / unit_factor('y', unit) for k, x in moved.items()}
         table = replace(table, columns={**table.columns, **scaled})
     _check_limits(table, options.voltage_limits, name)
     _check_ranges(table, unit, name)
@@ -224,7 +224,8 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     if stroke is not None and stroke == 0.0 and not idle:
         raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
     if stroke is not None and (stroke > STROKE[1] or (stroke < STROKE[0] and not idle)):
-        others = {u: stroke * UNITS['y'][unit] / factor for u, factor in UNITS['y'].items()}
+        read = unit_factor('y', unit)
+        others = {u: stroke * read / factor for u, factor in UNITS['y'].items()}
         fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '

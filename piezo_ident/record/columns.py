@@ -317,10 +317,15 @@ def _unit_of(
         quantity = _QUANTITIES[role]
         kind = next((q for r, q in _QUANTITIES.items() if unit in UNITS[r]), None)
         way = f'--{quantity}-unit {[*UNITS[role]][-2]}'
+        scale = f'--{quantity}-unit 10{[*UNITS[role]][-2]}'
         raise DataError(
             f'{path}: {listed([name])} is to be the {quantity}, '
-            + (f'but its unit is of a {kind}' if kind else f'whose unit {unit!r} is unknown')
-            + f'; name another column, or its unit: {way}',
+            + (
+                f'but its unit is of a {kind}; name another column, or what one {unit} is, as in '
+                f'{scale}'
+                if kind
+                else f'whose unit {unit!r} is unknown; name another column, or its unit: {way}'
+            ),
             options='' if kind else way,
         )
     return unit

@@ -21,7 +21,7 @@ from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.channels import channel_of_column, column_of, role_of
 from piezo_ident.record.columns import RecordTable
-from piezo_ident.record.options import ReadOptions, UNITS
+from piezo_ident.record.options import ReadOptions, unit_factor
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.tables import Blocks, blocks_of, labels_of, write_mat, write_npz
 from piezo_ident.record.text_table import read_text, write_csv
@@ -139,8 +139,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
 
 def _factor(table: RecordTable, role: str) -> float:
     """Return how many of a column's unit make one of SI; 1 where no unit is named."""
-    units: Mapping[str, float] = UNITS.get(role_of(role) or role, {})
-    return units.get(table.units.get(role, ''), 1.0)
+    return unit_factor(role_of(role) or role, table.units.get(role, ''))
 
 
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:

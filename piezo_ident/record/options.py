@@ -15,7 +15,7 @@ import unicodedata
 
 from piezo_ident.common.errors import DataError, expect
 
-__all__ = ['UNITS', 'ReadOptions', 'parse_columns', 'plain_unit']
+__all__ = ['UNITS', 'ReadOptions', 'parse_columns', 'plain_unit', 'scaled_unit', 'unit_factor']
 
 #: how many of a unit make a second, a volt and a metre
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -33,7 +33,9 @@ class ReadOptions:
     Parameters
     ----------
     displacement_unit : {'m', 'mm', 'um', 'nm'}, optional
-        Unit of the displacement in the file; by default what the header says, else m.
+        Unit of the displacement in the file; by default what the header says, else m.  With a
+        number before it, what one of the file is: ``'10um'`` of a sensor of 10 um/V.  So are the
+        other units: ``'20V'`` of a monitor that shows a twentieth.
     voltage_limits : tuple of float, optional
         Smallest and largest voltage [V] that may occur.
     namespace, voltage_topic, displacement_topic : str, optional
@@ -79,12 +81,12 @@ class ReadOptions:
             given = getattr(self, f'{quantity}_unit')
             if given is None:
                 continue
-            known = [*UNITS[role]]
-            unit = plain_unit(given) if isinstance(given, str) else ''
-            if unit not in known:
+            unit = scaled_unit(role, given) if isinstance(given, str) else ''
+            if not unit:
+                known = [*UNITS[role]]
                 raise DataError(
                     f'unknown {quantity} unit {given!r}; use {", ".join(known[:-1])} or '
-                    f'{known[-1]}'
+                    f'{known[-1]}, or what one of the file is, as in 10{known[-2]}'
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)
         if self.rate is not None:
@@ -138,6 +140,37 @@ def plain_unit(text: str) -> str:
     return _SPELT.get(text.lower(), text)
 
 
+def scaled_unit(role: str, text: str) -> str:
+    """
+    Return a unit of ``t``, ``v`` or ``y`` with the letters of `UNITS`; empty for none.
+
+    A number before it says what one of the file is.
+
+    >>> scaled_unit('y', ' 10 micron'), scaled_unit('v', '20V'), scaled_unit('y', '0um')
+    ('10um', '20V', '')
+    """
+    found = _SCALED.fullmatch(text)
+    if not found or plain_unit(found[2]) not in UNITS[role]:
+        return ''
+    if found[1] and not (math.isfinite(float(found[1])) and float(found[1]) > 0.0):
+        return ''
+    return found[1] + plain_unit(found[2])
+
+
+def unit_factor(role: str, unit: str) -> float:
+    """
+    Return how many of a unit from `scaled_unit` make one of SI; 1 where none is named.
+
+    >>> unit_factor('y', '10um'), unit_factor('v', 'mV')
+    (100000.0, 1000.0)
+    """
+    found = _SCALED.fullmatch(unit)
+    known = UNITS.get(role, {})
+    return known.get(found[2], 1.0) / float(found[1] or 1.0) if found else 1.0
+
+
+#: a unit, and a number before it
+_SCALED = re.compile(r'\s*(\d+(?:\.\d*)?(?:e[-+]?\d+)?|)\s*(\D+)', re.IGNORECASE)
 _SPELT = {
     **dict.fromkeys(('sec', 'secs', 'second', 'seconds', 'sekunden'), 's'),
     **dict.fromkeys(('msec', 'millisecond', 'milliseconds'), 'ms'),

@@ -287,7 +287,9 @@ def test_what_would_need_a_guess_is_refused(c, reason):
         read(c)
 
 
-@pytest.mark.parametrize(('unit', 'factor'), [('mm', 1e3), ('um', 1e6), ('µm', 1e6), ('nm', 1e9)])
+@pytest.mark.parametrize(
+    ('unit', 'factor'), [('mm', 1e3), ('um', 1e6), ('µm', 1e6), ('nm', 1e9), ('10 um', 1e5)]
+)
 def test_displacement_units(unit, factor):
     t, v, y = columns()
     record = read([t, v, y * factor], displacement_unit=unit)
@@ -295,8 +297,9 @@ def test_displacement_units(unit, factor):
 
 
 def test_unknown_unit_is_refused():
-    with pytest.raises(DataError, match='use m, mm, um or nm'):
-        read(columns(), displacement_unit='inch')
+    for unit in ('inch', '0um', '-3um', '10', '1e999um'):
+        with pytest.raises(DataError, match='use m, mm, um or nm, or what one of the file is'):
+            read(columns(), displacement_unit=unit)
 
 
 def test_voltage_limits():

@@ -312,6 +312,20 @@ def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
     assert (named.pieces[0].sample_rate, named.faults) == (RATE, ())
 
 
+def test_volts_of_a_sensor_and_of_a_monitor(tmp_path, capsys):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'Zeit (ms),Monitor (mV),Sensor (V)\n{rows(1e3 * K / RATE, 50 * V, UM / 10)}')
+    with pytest.raises(DataError, match='what one V is, as in --displacement-unit 10um'):
+        pi.read(path, columns='y=Sensor (V)')
+    given = ['--columns', 'y=Sensor (V)', '--displacement-unit', '10um', '--voltage-unit', '20mV']
+    assert main(['convert', *given, str(path), str(tmp_path / 'o.npz')]) == 0
+    assert "y is 'Sensor (V)' in 10um" in capsys.readouterr().err
+    (piece,) = pi.read(tmp_path / 'o.npz').pieces
+    np.testing.assert_allclose(piece.v, V, rtol=1e-6)
+    np.testing.assert_allclose(piece.y, 1e-6 * np.asarray(UM), rtol=1e-5)
+    assert main(['convert', '--voltage-unit', '-20V', str(path), str(tmp_path / 'p.npz')]) == 2
+
+
 @pytest.mark.parametrize(
     ('header', 'rate', 'kind', 'cure'),
     [
