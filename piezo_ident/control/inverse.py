@@ -90,8 +90,10 @@ class Inverse(Showable):
         100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: what the
         inversion leaves; of the span of the model where the motion stands still.
     expected : float or None
-        The error of the model [% of stroke], as of its diagnosis or its identification, if it is
-        known: the stage will err by about as much.
+        What the stage will err by [%, as `error`], if that of the model is known: as many metres
+        as on the data of its diagnosis, or its identification, however small the motion is.
+    expected_rms : float or None
+        The same [m].
     warnings : tuple of str
 
     Examples
@@ -113,6 +115,7 @@ class Inverse(Showable):
     passes: int
     error: float
     expected: float | None
+    expected_rms: float | None
     warnings: tuple[str, ...]
 
 
@@ -253,7 +256,9 @@ def invert(
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
     warnings += _extrapolated(model, v, y)
-    warnings += _ringing(model, y)
+    known = expected_error(model)
+    expected = None if known is None else known / span
+    warnings += _ringing(model, y, expected)
     # the same of nearly the same motion
     warnings += (
         _creeping(model, float(v[0]))
@@ -271,7 +276,8 @@ def invert(
         clipped=short,
         passes=passes,
         error=percent_of_stroke(y, predicted[lead:], span * abs(s.Y)),
-        expected=expected_error(model),
+        expected=expected,
+        expected_rms=None if known is None else 0.01 * known * abs(s.Y),
         warnings=tuple(warnings),
     )
 
@@ -334,9 +340,9 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
     return told
 
 
-def _ringing(model: StageModel, y: Array) -> list[str]:
-    """Return a warning where a motion holds more above the lowest mode than the model errs."""
-    mode, expected = lowest_mode(model), expected_error(model)
+def _ringing(model: StageModel, y: Array, expected: float | None) -> list[str]:
+    """Return a warning where a motion holds more above the lowest mode than is expected."""
+    mode = lowest_mode(model)
     if expected is None or not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
         return []
     sos = butter(4, mode, btype='highpass', fs=model.sample_rate, output='sos')

@@ -160,8 +160,8 @@ def _drive(result: Inverse) -> tuple[str, Table]:
     rows += [('begins', f'{lead:.4g} ms before the motion')] if lead else []
     rows += [('left by the inversion', f'{number(result.error)} % of stroke')]
     expected = 'unknown, the model holds no error on data it was not fitted to'
-    if result.expected is not None:
-        rms = length(0.01 * result.expected * float(np.ptp(result.wanted)))
+    if result.expected is not None and result.expected_rms is not None:
+        rms = length(result.expected_rms)
         expected = f'{number(result.expected)} % of stroke, {rms} rms, as the model errs elsewhere'
     rows += [('expected', expected)]
     rows += [('warning', warning) for warning in result.warnings]

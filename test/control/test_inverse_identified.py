@@ -13,6 +13,7 @@ from piezo_ident.control import linear_inverse
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
+from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import EffectSetting
 from programs import identification_program
 import pytest
@@ -116,3 +117,16 @@ def test_corners_that_ring_are_told(behind_amplifier):
     assert not pi.invert(model, scan(60.0, corners=2e-3)).warnings
     # of a model that is exact nothing is unknown
     assert not pi.invert(PAPER, scan(60.0)).warnings
+
+
+def test_what_is_expected_is_as_many_metres_for_small_motion(behind_amplifier):
+    _, model = behind_amplifier
+    large, small = (pi.invert(model, scan(5.0) * part) for part in (1.0, 0.1))
+    assert large.expected_rms == pytest.approx(0.01 * expected_error(model) * abs(model.scaling.Y))
+    assert small.expected_rms == large.expected_rms
+    assert small.expected == pytest.approx(10.0 * large.expected)
+    assert large.expected * 60e-6 == pytest.approx(100 * large.expected_rms, rel=1e-3)
+    # a motion that stands still has no span
+    still = pi.invert(model, np.full(2000, 20e-6))
+    assert still.expected == expected_error(model)
+    assert pi.invert(PAPER, scan(5.0)).expected_rms is None

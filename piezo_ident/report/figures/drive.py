@@ -25,8 +25,7 @@ def drive_figure(drive: Inverse) -> Figure:
     style.line(motion, t, 1e6 * drive.wanted, COLOURS['under'], 'wanted', linewidth=3.0)
     style.line(motion, t, 1e6 * drive.predicted, COLOURS['model'], 'model under the voltage')
     e = drive.wanted - drive.predicted
-    stroke = float(np.ptp(drive.wanted))
-    band = 0.0 if drive.expected is None else 0.01 * drive.expected * stroke
+    band = drive.expected_rms or 0.0
     limit, largest = style.axis_limit(e)
     unit, scale = style.length_unit(max(largest, band))
     if band:
@@ -47,7 +46,7 @@ def drive_figure(drive: Inverse) -> Figure:
     tidy(volts, '', 'voltage / V')
     tidy(motion, '', 'displacement / µm')
     tidy(error, 'time / s', f'error / {unit}')
-    style.percent_axis(error, scale * stroke)
+    style.percent_axis(error, scale * float(np.ptp(drive.wanted)))
     volts.margins(x=0.01)
     style.legend_above(motion)
     style.legend_above(error)
