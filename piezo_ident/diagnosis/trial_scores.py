@@ -186,7 +186,7 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         high=rows.reach[1],
         speeds=np.quantile(moving, quantiles) if moving.size else np.zeros(quantiles.size),
         duration=rows.duration,
-        channels={name: (float(x.mean()), float(x.std())) for name, x in whole.items()},
+        channels={name: (float(x[0]), float(x.std())) for name, x in whole.items()},
         lines=tuple(lines),
         modes=tuple((m.frequency, m.damping) for m in model.dynamics.modes(model.sample_rate)),
         max_frequency=rows.highest_frequency,

@@ -79,14 +79,14 @@ class CrossCoupling(Effect):
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """Return every channel that moves, with three corners."""
         trials = []
-        for name, (mean, std) in view.channels.items():
+        for name, (rest, std) in view.channels.items():
             # another axis's displacement is an answer too, and no cause of what both share
             if role_of(name) == 'y' or not (np.isfinite(std) and std > 0):
                 continue
             for f in (10.0, 100.0, 1000.0):
                 if f >= 0.4 * view.sample_rate:
                     continue
-                shape = {'channel': name, 'frequency': f, 'damping': 0.7, 'offset': mean}
+                shape = {'channel': name, 'frequency': f, 'damping': 0.7, 'offset': rest}
                 steps = {'gain': 1e-3 / std, 'rate_gain': 1e-3 / (2 * np.pi * f * std)}
                 trials.append(cls.trial(shape, steps=steps))
         return tuple(trials)

@@ -33,7 +33,7 @@ class View:
     duration : float
         Length of the longest record [s].
     channels : mapping of str to (float, float)
-        Mean and standard deviation of each further channel, in its own unit.
+        First value and standard deviation of each further channel, in its own unit.
     lines : tuple of float
         Frequencies [Hz] of the lines in the residual.
     modes : tuple of (float, float)

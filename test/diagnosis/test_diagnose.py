@@ -216,6 +216,24 @@ def test_lines_that_another_axis_makes_are_no_hum():
     assert after < before / 5
 
 
+def test_the_rest_of_another_axis_is_where_it_stood_at_first():
+    filtered = {'rate_gain': 0.0, 'frequency': 100.0, 'damping': 0.7}
+    truth = with_effects(cross_coupling={'channel': 'v_b', 'gain': 4e-4, **filtered})
+    (piece,) = played(slow_model(), 'two axes').pieces
+    t = np.arange(piece.n) / SLOW
+    b = 70.0 - 50.0 * np.cos(2 * np.pi * 7.3 * t) - 20.0 * np.cos(2 * np.pi * 23.1 * t)
+    piece = replace(piece, channels={'v_b': b})
+    noise = 4e-9 * np.random.default_rng(5).standard_normal(piece.n)
+    record = Record((replace(piece, y=truth.predict_piece(piece) + noise),), 'two axes')
+    few = DiagnosisSettings(effects=('creep', 'cross_coupling'))
+    result = diagnose(slow_model(), record, few)
+    (setting,) = result.model.effects
+    assert setting.parameters['offset'] == 0.0
+    # no part of what follows the other axis is taken for a zero that has moved
+    assert not [warning for warning in result.warnings if 'zero of the displacement' in warning]
+    assert free_run(result.model, record).errors.percent < 0.01
+
+
 @pytest.mark.parametrize(
     ('effect', 'size', 'seed', 'other'),
     [
