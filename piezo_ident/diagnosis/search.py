@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitt
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.polishing import good_enough, least_gain
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.signature import has_place, shows
+from piezo_ident.diagnosis.signature import follows_motion, has_place, shows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
@@ -289,6 +289,8 @@ def takes(
     gain, left = before - max(best.mean_square, noise), max(before - noise, 1e-300)
     if rows.percent(gain) < smallest or gain < criteria.LEAST_GAIN * explainable:
         return False
+    if _may_be_unseen(rows, this):
+        return False
     # what follows time alone fits a shifted residual as well; its lines and trends have tests
     # of their own
     chance = 0.0 if find_effect(best.name).time_driven else this.chance.get(best.name, 0.0)
@@ -298,6 +300,22 @@ def takes(
         return False
     # what shows where it alone acts has no need of a proof by all kinds of excitation
     return has_place(best.name) or not _harms(rows, this.before, best)
+
+
+def _may_be_unseen(rows: Rows, this: Round) -> bool:
+    """
+    Return whether the best contender is a gain that wanders where creep or drift gains more.
+
+    These were dropped, since they do not show at rest.  A record that hardly rests shows nothing
+    of them there, and a gain of many values follows what they do to the motion.
+    """
+    if not follows_motion(this.contenders[0].name):
+        return False
+    known = {c.name for c in this.contenders}
+    unseen = [
+        g for name, g in gains_of(rows, this).items() if has_place(name) and name not in known
+    ]
+    return max(unseen, default=0.0) > this.gain
 
 
 def stands_out(rows: Rows, this: Round) -> bool:

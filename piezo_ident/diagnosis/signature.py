@@ -29,7 +29,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.residual.stretches import block_means, rests
 from scipy.ndimage import uniform_filter1d
 
-__all__ = ['has_place', 'shows']
+__all__ = ['follows_motion', 'has_place', 'shows']
 
 Array = NDArray[np.float64]
 
@@ -47,6 +47,11 @@ Place = tuple[NDArray[np.int64], Array]
 def has_place(name: str) -> bool:
     """Return whether an effect has a place where it alone acts: a rest, for creep and drift."""
     return _PLACES.get(name) is _at_rest
+
+
+def follows_motion(name: str) -> bool:
+    """Return whether an effect shows within single motions: a gain that drifts."""
+    return _PLACES.get(name) is _in_motion
 
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
