@@ -11,7 +11,7 @@ The model runs at the full rate before it is averaged, so nothing is aliased.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
@@ -28,7 +28,7 @@ from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
-from piezo_ident.residual.stretches import block_means
+from piezo_ident.residual.stretches import block_means, bridged
 
 __all__ = ['Rows', 'centred', 'make_rows', 'means']
 
@@ -258,6 +258,11 @@ def make_rows(
         )
     names = tuple(dict.fromkeys(run.record for run in runs))
     bad = bad or [None] * len(runs)
+    # a single wild reading would be noise of all readings
+    runs = [
+        run if out is None else replace(run, x=bridged(run.x, out))
+        for run, out in zip(runs, bad, strict=True)
+    ]
     use = [_without(run.known, out) for run, out in zip(runs, bad, strict=True)]
     samples = sum(int(known.sum()) for known in use)
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))

@@ -26,6 +26,7 @@ __all__ = [
     'Stretch',
     'all_stretches',
     'block_means',
+    'bridged',
     'find_repeats',
     'rests',
     'stretches_of',
@@ -33,6 +34,8 @@ __all__ = [
     'true_runs',
 ]
 
+#: bad samples in a row that say nothing of their neighbours
+SPIKE = 3
 #: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
 REST_TIME, REST_SAMPLES = 0.05, 200
 #: share of the differences of a measured voltage that reverse the one before while it rests
@@ -136,6 +139,17 @@ def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the runs of true values, as first and behind the last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def bridged(e: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return a signal with a straight line over up to `SPIKE` bad samples in a row."""
+    at = [k for a, b in true_runs(bad) if b - a <= SPIKE for k in range(a, b)]
+    if not at or len(at) == e.size:
+        return e
+    good = np.delete(np.arange(e.size), at)
+    new = e.copy()
+    new[at] = np.interp(at, good, e[good])
+    return new
 
 
 def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:

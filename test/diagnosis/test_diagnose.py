@@ -216,6 +216,21 @@ def test_lines_that_another_axis_makes_are_no_hum():
     assert after < before / 5
 
 
+def test_single_wild_readings_are_no_noise():
+    record = example_record()
+    (piece,) = record.pieces
+    at = np.random.default_rng(4).choice(np.arange(100, piece.n - 100, 50), 30, replace=False)
+    y = piece.y.copy()
+    y[at] += 0.5 * record.stroke
+    wild = Record((replace(piece, y=y),), record.name)
+    few = DiagnosisSettings(effects=('creep',))
+    one, other = (diagnose(slow_model(), r, few) for r in (record, wild))
+    assert [fault.count for fault in other.faults if fault.name == 'outliers'] == [30]
+    assert other.noise_floor == pytest.approx(one.noise_floor, rel=0.05)
+    assert other.before.overall == pytest.approx(one.before.overall, rel=0.02)
+    assert [e.name for e in other.effects] == [e.name for e in one.effects] == ['creep']
+
+
 def test_the_rest_of_another_axis_is_where_it_stood_at_first():
     filtered = {'rate_gain': 0.0, 'frequency': 100.0, 'damping': 0.7}
     truth = with_effects(cross_coupling={'channel': 'v_b', 'gain': 4e-4, **filtered})
