@@ -113,7 +113,7 @@ def _periods(u: NDArray[np.float64]) -> int:
     return 1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AxesIdentification:
     """
     A stage of several axes, identified.
@@ -135,6 +135,18 @@ class AxesIdentification:
     errors: dict[str, Score]
     periodicity: tuple[Periodicity, ...]
     periods: Periods
+
+    def __repr__(self) -> str:
+        told = [f'{c.name:32s}{c.error:8.3g} %' for c in self.explanation.candidates]
+        return '\n'.join(
+            [
+                f'A stage of {len(self.model.outputs)} axes: {self.model.effect}.',
+                '',
+                '100 rms(y - yhat) / rms(y) on what was held out:',
+                *told,
+                *(f'warning: {warning}' for warning in self.warnings),
+            ]
+        )
 
     @property
     def error(self) -> float:

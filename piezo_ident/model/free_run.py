@@ -27,7 +27,7 @@ from piezo_ident.model.initial_memory import (
     forgetting,
     forgotten,
 )
-from piezo_ident.model.metrics import BLOCK, nrmse_fit, percent, REVERSED, runs_against
+from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.faults import without_faults
@@ -183,9 +183,8 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             late.append(min(left, piece.n))
             left -= late[-1]
     warnings = list(_on_starts(model, record, starts))
-    pairs = ((piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True))
-    if runs_against(pairs, model.scaling.Y):
-        warnings.append(f'{record.name}: {REVERSED}')
+    pairs = [(piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True)]
+    warnings += [f'{record.name}: {doubt}' for doubt in doubts(pairs, model.scaling.Y)]
     return FreeRun(
         record=record,
         pieces=tuple(predicted),

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import math
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ __all__ = [
     'FORMULA',
     'KINDS',
     'REVERSED',
+    'doubts',
     'expected_error',
     'fit_percent',
     'nrmse_fit',
@@ -29,6 +30,8 @@ __all__ = [
     'strokes',
 ]
 
+#: times that a displacement moves as much, or as little, from which its unit is in doubt
+UNIT = 30.0
 #: how `percent_of_stroke` is defined, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
 #: kinds of data, in the order in which they are shown and in which an error is quoted of them
@@ -123,6 +126,26 @@ def runs_against(
             yy, pp, yp = yy + float(dy @ dy), pp + float(dp @ dp), yp + float(dy @ dp)
         reach = max(reach, float(np.ptp(y_hat)))
     return reach > STILL * abs(span) and yp < below * math.sqrt(yy * pp)
+
+
+def doubts(parts: Sequence[tuple[Vector, Vector]], span: float) -> Iterator[str]:
+    """
+    Yield why a measured displacement may not be that of the stage.
+
+    Parameters
+    ----------
+    parts, span
+        As of `runs_against`.
+    """
+    if runs_against(parts, span):
+        yield REVERSED
+    squares = np.array([(y.size * np.var(y), y.size * np.var(y_hat)) for y, y_hat in parts])
+    measured, predicted = np.sqrt(squares.sum(axis=0))
+    if predicted > 0.0 and measured > 0.0 and not 1.0 / UNIT < measured / predicted < UNIT:
+        yield (
+            f'the displacement moves {measured / predicted:.3g} times as much as the model says; '
+            'is its unit right, and is it the sensor of this stage?'
+        )
 
 
 def nrmse_fit(error: float, spread: float) -> float:

@@ -151,3 +151,14 @@ def test_a_free_run_shows_itself():
     assert_array_equal(run.measured, 7.5e-6 * v + 1e-8)
     assert run.errors.offset == pytest.approx(1e-8)
     assert '% of stroke' in run._repr_html_()
+
+
+@pytest.mark.parametrize(('factor', 'is_odd'), [(1000.0, True), (1e-3, True), (3.0, False)])
+def test_a_displacement_in_another_unit_is_doubted(factor, is_odd):
+    v = sine(1.0, 3.0)
+    model = linear_stage(weights=(0.2, 0.2))
+    run = free_run(model, record(v, factor * model.simulate(v)))
+    told = [w.partition(' moves ')[2] for w in run.warnings if 'is its unit right' in w]
+    assert bool(told) == is_odd
+    # the start is estimated, too, and takes a part of it
+    assert [float(w.split()[0]) for w in told] == pytest.approx([factor] * is_odd, rel=0.05)
