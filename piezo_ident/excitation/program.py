@@ -87,8 +87,11 @@ class Sequence:
 
     def describe(self) -> str:
         """Return one line a segment: start, length, label and voltages."""
+        # times tell the sample, for labels of a record that was measured
+        rate, digits = self.sample_rate, max(3, math.ceil(math.log10(self.sample_rate)))
         return '\n'.join(
-            f'{s.start / self.sample_rate:9.3f} s {s.n / self.sample_rate:9.3f} s  {s.label:20s} '
+            f'{s.start / rate:{digits + 6}.{digits}f} s {s.n / rate:{digits + 6}.{digits}f} s  '
+            f'{s.label:20s} '
             f'{self.v[s.start : s.stop].min():7.3f} .. {self.v[s.start : s.stop].max():.3f} V'
             for s in self.segments
         )
