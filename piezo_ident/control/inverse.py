@@ -247,7 +247,7 @@ def invert(
     if short.any():
         warnings.append(_unreached(t[short], abs(s.Y) * float(miss[short].max()), low, high, slew))
         if not clip:
-            raise DataError(*warnings, options='--clip')
+            raise DataError('; '.join([*warnings, *_faint(model, y)]), options='--clip')
     e = e[~maximum_filter1d(short, near)]
     left = float(np.sqrt(np.mean(e**2))) / span if e.size else 0.0
     if left > MATTERS:
@@ -332,12 +332,18 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
             f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '
             f'identified range {low:g} .. {high:g} V, where the model is an extrapolation'
         )
-    if 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
-        told.append(
-            f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
-            f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
-        )
-    return told
+    return [*told, *_faint(model, y)]
+
+
+def _faint(model: StageModel, y: Array) -> list[str]:
+    """Return a warning where a motion is so small that its unit is in doubt."""
+    s = model.scaling
+    if not 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
+        return []
+    return [
+        f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
+        f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
+    ]
 
 
 def _ringing(model: StageModel, y: Array, expected: float | None) -> list[str]:

@@ -9,6 +9,7 @@ import re
 import numpy as np
 from paper_stage import FS, PAPER
 import piezo_ident as pi
+from piezo_ident.common.errors import DataError
 from piezo_ident.control import linear_inverse
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.excitation.program import parse_program
@@ -130,3 +131,9 @@ def test_what_is_expected_is_as_many_metres_for_small_motion(behind_amplifier):
     still = pi.invert(model, np.full(2000, 20e-6))
     assert still.expected == expected_error(model)
     assert pi.invert(PAPER, scan(5.0)).expected_rms is None
+
+
+def test_a_motion_in_micrometres_taken_for_metres_is_doubted_where_it_is_refused(behind_amplifier):
+    _, model = behind_amplifier
+    with pytest.raises(DataError, match=r'out of reach .*; .* is it in metres\?'):
+        pi.invert(model, 1e-6 * scan(5.0) - 1e-10)
