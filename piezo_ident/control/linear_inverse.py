@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import Effect, find_effect
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
@@ -158,7 +159,9 @@ def lowest_mode(model: StageModel) -> float:
 
 def least_gain(model: StageModel) -> float:
     """Return the gain of G, as a share of the static one, below which it is not made up for."""
-    return EXACT if expected_error(model) is None else FROM_DATA
+    # plays that widen with speed are undone with G as it is, or smooth motion is missed by more
+    widens = any(effect.name == RateDependentHysteresis.name for effect in model.effects)
+    return EXACT if widens or expected_error(model) is None else FROM_DATA
 
 
 def least_preview(model: StageModel) -> float:
