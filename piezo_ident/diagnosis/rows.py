@@ -381,7 +381,7 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
 
 def _memory(model: StageModel, run: Run) -> Memory:
     u0 = float(run.u[0])
-    start = None if is_at_rest(model, run.piece) else fit_start(model, run.piece)
+    start = None if is_at_rest(model, run.piece) else fit_start(model, run.piece, run.use)
     if start is None or start.memory is None:
         return lambda r: initial_memory(u0, r)
     at = np.concatenate([[0.0], model.hysteresis.thresholds])

@@ -69,7 +69,7 @@ def predictions_of(
         start: StartLike = (memories or {}).get(key_of(run))
         judged = run.use
         if start is None:
-            start, judged = fit_start(model, run.piece), run.known
+            start, judged = fit_start(model, run.piece, run.use), run.known
             if start is not None:
                 late = early_part(model, run.piece)
                 judged = judged & (np.arange(judged.size) >= late)

@@ -31,6 +31,7 @@ from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.faults import without_faults
+from piezo_ident.record.gaps import bridged
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
@@ -172,16 +173,18 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     record = with_quiet_voltage(without_faults(record))
     groups = connected_pieces(record)
     _check_rates(model, record)
-    starts = [fit_start(model, pieces[0]) for pieces in groups]
+    joined = bridged(record)
+    starts = [fit_start(model, one.piece, one.sound) for one in joined]
     predicted = _predicted(model, record, groups, starts)
     estimated: list[bool] = []
     late: list[int] = []
-    for pieces, start in zip(groups, starts, strict=True):
+    for pieces, one, start in zip(groups, joined, starts, strict=True):
         estimated += [start is not None, *[False] * (len(pieces) - 1)]
-        left = 0 if start is None else _late(model, pieces, start)
+        left = 0 if start is None else _late(model, one.piece, start)
         for piece in pieces:
-            late.append(min(left, piece.n))
-            left -= late[-1]
+            # of the bridged samples, those of the gaps before this piece included
+            gone = round((piece.start_time - pieces[0].start_time) * piece.sample_rate)
+            late.append(min(max(left - gone, 0), piece.n))
     warnings = list(_on_starts(model, record, starts))
     pairs = [(piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True)]
     warnings += [f'{record.name}: {doubt}' for doubt in doubts(pairs, model.scaling.Y)]
@@ -229,16 +232,17 @@ def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...
         When a piece has another sampling rate than the model, or the prediction overflows.
     """
     _check_rates(model, record)
+    record = with_quiet_voltage(record)
     groups = connected_pieces(record)
     return tuple(_predicted(model, record, groups, [None] * len(groups)))
 
 
-def _late(model: StageModel, pieces: Sequence[Piece], start: Start) -> int:
-    """Return the first sample of connected pieces that an estimate of their start leaves free."""
-    end = early_part(model, pieces[0]) if start.creep.size else 0
+def _late(model: StageModel, piece: Piece, start: Start) -> int:
+    """Return the first sample of a bridged piece that an estimate of their start leaves free."""
+    end = early_part(model, piece) if start.creep.size else 0
     if start.memory is None:
         return end
-    v = pieces[0].v if len(pieces) == 1 else np.concatenate([piece.v for piece in pieces])
+    v = piece.v
     # a voltage that rests forgets nothing
     return max(end, forgotten(v, way=forgetting(model)) if v.min() < v.max() else v.size)
 
@@ -249,7 +253,7 @@ def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]
     elsewhere = sum(start.memory is not None for start in found)
     if elsewhere:
         yield (
-            f'{record.name}: {elsewhere} of {len(record.pieces)} pieces do not start at the '
+            f'{record.name}: {elsewhere} of {len(starts)} pieces do not start at the '
             f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
             'estimated from their early part'
         )
@@ -257,8 +261,8 @@ def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]
     if most:
         yield (
             f'{record.name}: creep of earlier motion goes on, by '
-            f'{100.0 * abs(most) / record.stroke:.2g} % of stroke at the start; it is estimated '
-            f'from the first {EARLY:.0%}'
+            f'{100.0 * abs(most / model.scaling.Y):.2g} % of the span of the model at the start; '
+            f'it is estimated from the first {EARLY:.0%}'
         )
 
 
@@ -373,12 +377,13 @@ def piece_runs(
     known = memories or {}
     runs = []
     for record in [records] if isinstance(records, Record) else records:
-        for pieces in connected_pieces(record):
+        record = with_quiet_voltage(record)
+        for pieces, one in zip(connected_pieces(record), bridged(record), strict=True):
             if not model.takes(pieces[0]):
                 continue
             start: StartLike = known.get((record.name, pieces[0].start_time))
             if start is None:
-                start = fit_start(model, pieces[0])
+                start = fit_start(model, one.piece, one.sound)
             both = (run_pieces(m, pieces, start) for m in (model, static))
             for piece, y_hat, y_static in zip(pieces, *both, strict=True):
                 runs.append(PieceRun(record.name, piece, y_hat, y_static))

@@ -67,6 +67,8 @@ WORTH = 0.9
 FAINT = 1e-5
 #: rms that it may leave with the zero of the model, over that with a free zero
 SURE = 1.1
+#: rms that creep must leave there beside a zero that moved, over that without creep
+APART = 0.3
 
 
 def forgotten(u: NDArray[np.float64], share: float = SHARE, way: float = 0.0) -> int:
@@ -161,7 +163,9 @@ def early_part(model: StageModel, piece: Piece) -> int:
     return min(end, piece.n)
 
 
-def fit_start(model: StageModel, piece: Piece) -> Start | None:
+def fit_start(
+    model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
+) -> Start | None:
     """
     Estimate what a stage keeps of its motion before a piece.
 
@@ -169,6 +173,9 @@ def fit_start(model: StageModel, piece: Piece) -> Start | None:
     ----------
     model : StageModel
     piece : Piece
+        With short gaps bridged, as of `piezo_ident.record.gaps.bridged`.
+    sound : ndarray of bool, shape (n,), optional
+        Its samples that were measured; all when absent.
 
     Returns
     -------
@@ -179,14 +186,19 @@ def fit_start(model: StageModel, piece: Piece) -> Start | None:
     creeps = _creeps(model)
     if known and not creeps:
         return None
-    still, e = _fit(model, piece, memory=not known)
+    still, e = _fit(model, piece, sound, memory=not known)
     if not creeps:
         return still
-    free, left = _fit(model, piece, memory=not known, creep=True, zero=True)
+    free, left = _fit(model, piece, sound, memory=not known, creep=True, zero=True)
     if np.std(left) > WORTH * np.std(e) - FAINT:
         return None if known else still
-    held, e = _fit(model, piece, memory=not known, creep=True)
-    return held if np.sqrt(np.mean(e**2)) <= SURE * np.std(left) else free
+    held, e_held = _fit(model, piece, sound, memory=not known, creep=True)
+    if np.sqrt(np.mean(e_held**2)) <= SURE * np.std(left):
+        return held
+    # a zero and slow creep make up for each other: what the model lacks looks like both
+    if np.std(left) <= APART * np.std(e):
+        return free
+    return None if known else still
 
 
 def crept(model: StageModel, start: Start) -> float:
@@ -207,7 +219,13 @@ def _creeps(model: StageModel) -> bool:
 
 
 def _fit(
-    model: StageModel, piece: Piece, *, memory: bool, creep: bool = False, zero: bool = False
+    model: StageModel,
+    piece: Piece,
+    sound: NDArray[np.bool_] | None = None,
+    *,
+    memory: bool,
+    creep: bool = False,
+    zero: bool = False,
 ) -> tuple[Start, NDArray[np.float64]]:
     """Return a start by least squares on the early part, and what it leaves of some samples."""
     h = model.hysteresis
@@ -216,7 +234,9 @@ def _fit(
     u = model.hysteresis_input(part)
     u0 = float(u[0])
     # rows are thinned: a few numbers do not need a hundred thousand samples
-    keep = slice(None, None, max(1, part.n // 5000))
+    keep = np.arange(part.n) if sound is None else np.flatnonzero(sound[: part.n])
+    keep = keep if keep.size else np.arange(part.n)
+    keep = keep[:: max(1, keep.size // 5000)]
     x = model.scaling.x(part.y)[keep]
     m, k = (h.thresholds.size, h.lag_range.shape[1]) if memory else (0, 0)
     gains, times = _elements(model) if creep else np.empty((2, 0))
@@ -251,8 +271,10 @@ def _fit(
     falls = np.diff(h.thresholds, prepend=0.0)[:m]
     whole = np.eye(rest.size)
     whole[:m, :m] = -np.tril(np.ones((m, m))) * falls
-    # creep has followed voltages of the range
-    reach = h(np.linspace(*h.span, 65)) - h(np.array([u0]))
+    # creep has followed voltages of the range; H stands between its two branches
+    way = np.linspace(*h.span, 65)
+    here = [h(np.array([*come, u0]))[-1] for come in (way[:1], way)]
+    reach = h(way)[:, None] - here
     far = np.repeat([[reach.min(), -FAR], [reach.max(), FAR]], [c, z], axis=1)
     lags = h.lag_range[:, :k]
     low = np.concatenate([np.zeros(m), np.minimum([*lags[0], *far[0]], rest[m:])])

@@ -141,7 +141,10 @@ def doubts(parts: Sequence[tuple[Vector, Vector]], span: float) -> Iterator[str]
         yield REVERSED
     squares = np.array([(y.size * np.var(y), y.size * np.var(y_hat)) for y, y_hat in parts])
     measured, predicted = np.sqrt(squares.sum(axis=0))
-    if predicted > 0.0 and measured > 0.0 and not 1.0 / UNIT < measured / predicted < UNIT:
+    # a record that moves by little says nothing
+    reach = max((float(np.ptp(y_hat)) for _, y_hat in parts if y_hat.size), default=0.0)
+    moves = reach > STILL * abs(span) and measured > 0.0
+    if moves and not 1.0 / UNIT < measured / predicted < UNIT:
         yield (
             f'the displacement moves {measured / predicted:.3g} times as much as the model says; '
             'is its unit right, and is it the sensor of this stage?'

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Fault, Piece, Record
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 __all__ = ['with_quiet_voltage']
 
@@ -31,7 +31,9 @@ WIDTH = 8.0
 #: widest play, as a share of the range: beyond it the voltage is a noise that was played
 MOST = 5e-3
 #: widths that the voltage moves within so many samples where it moves
-MOVES, AROUND = 10.0, 9
+MOVES, AROUND = 3.0, 9
+#: rms of second over first differences, sqrt(3) of white noise, below which it is none
+WHITE = 1.4
 #: path of noise [ranges] that does no harm
 SHORT = 0.05
 
@@ -45,7 +47,9 @@ def with_quiet_voltage(record: Record) -> Record:
     span = float(np.ptp(record.voltage_range))
     if span == 0.0 or any(fault.name == 'voltage_noise' for fault in record.faults):
         return record
-    deviation = max(_deviation(piece.v) for piece in record)
+    # a monitor is noisy in all pieces: what one alone has was played
+    long = [piece.v for piece in record if piece.n >= 3 * WINDOW]
+    deviation = min(map(_deviation, long), default=0.0)
     width = WIDTH * deviation
     if not 0.0 < width <= MOST * span:
         return record
@@ -65,20 +69,31 @@ def with_quiet_voltage(record: Record) -> Record:
 
 def _deviation(v: Vector) -> float:
     """Return the standard deviation of white noise [V] in the quietest parts of a voltage."""
-    if v.size < 3 * WINDOW:
-        return 0.0
     # of a smooth motion little is left
-    d = np.diff(v, 2)
-    windows = d[: d.size // WINDOW * WINDOW].reshape(-1, WINDOW)
-    return float(np.percentile(windows.std(axis=1), QUIET) / np.sqrt(6.0))
+    one, two = (
+        d[: d.size // WINDOW * WINDOW].reshape(-1, WINDOW).std(axis=1)
+        for d in (np.diff(v), np.diff(v, 2))
+    )
+    quiet = np.percentile(two, QUIET)
+    # sines and small multisines were played
+    is_white = np.median((two / np.maximum(one[: two.size], 1e-300))[two <= quiet]) > WHITE
+    return float(quiet / np.sqrt(6.0)) if is_white else 0.0
 
 
 def _quiet(v: Vector, width: float) -> Vector:
-    """Return the middle of a play of some width [V], or the voltage where it moves by more."""
-    u = v - v.min()
-    still = play_columns(u, [width], np.array([u[0] - 0.5 * width]))[0] + 0.5 * width + v.min()
+    """Return a voltage [V] without noise of some width, or as it is where it moves by more."""
+    still = _played(v, width)
     reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
-    return np.where(reach > MOVES * width, v, still)
+    # it stands half a width behind: the mean of that is put back, and its noise taken out again
+    near = still + uniform_filter1d(v - still, WINDOW)
+    return np.where(reach > MOVES * width, v, _played(near, 0.5 * width / np.sqrt(WINDOW)))
+
+
+def _played(v: Vector, width: float) -> Vector:
+    """Return the middle of a play of some width [V]."""
+    u = v - v.min()
+    play = play_columns(u, [width], np.array([u[0] - 0.5 * width]))[0]
+    return np.asarray(play + 0.5 * width + v.min())
 
 
 def _path(piece: Piece) -> float:

@@ -162,3 +162,10 @@ def test_a_displacement_in_another_unit_is_doubted(factor, is_odd):
     assert bool(told) == is_odd
     # the start is estimated, too, and takes a part of it
     assert [float(w.split()[0]) for w in told] == pytest.approx([factor] * is_odd, rel=0.05)
+
+
+def test_a_record_at_rest_has_no_unit_that_could_be_doubted():
+    v = np.full(3000, 5.0)
+    y = 1e-9 * np.random.default_rng(0).standard_normal(v.size)
+    run = free_run(linear_stage(weights=(0.2, 0.2)), record(v, y))
+    assert not [w for w in run.warnings if 'unit' in w]

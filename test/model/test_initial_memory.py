@@ -242,3 +242,34 @@ def test_a_run_goes_on_where_another_ended():
 def test_a_start_of_another_model_is_refused():
     with pytest.raises(ModelError, match='start of 3 elements for 4'):
         CREEPING.simulate(V, start=Start(None, np.ones(3)))
+
+
+@pytest.mark.parametrize('hole', [50, 400, 5000, 40_000])
+def test_a_short_gap_does_not_cost_the_creep_of_earlier_motion(hole):
+    piece = after_motion(4.0)
+    record = Record((piece.cut(0, hole), piece.cut(hole + 20, piece.n)))
+    run = free_run(CREEPING, record)
+    assert run.estimated == (True, False)
+    assert run.errors_after_start.percent < 0.04
+
+
+def test_a_record_may_begin_on_the_way_down():
+    t = np.arange(8 * int(FS)) / FS
+    v = np.interp(t, [0, 0.5, 2.0, 2.2, 3.0, 4.0, 5.0, 6.0, 8.0], [0, 10, 10, 5, 4, 0, 9, 3, 0])
+    y = CREEPING.simulate(v)
+    y = y + 2e-4 * np.ptp(y) * np.random.default_rng(4).standard_normal(v.size)
+    piece = Piece(v, y, FS).cut(int(2.2 * FS), v.size)
+    assert free_run(CREEPING, Record((piece,))).errors_after_start.percent < 0.05
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_a_model_lacks_is_no_creep_of_earlier_motion(seed):
+    rng = np.random.default_rng(seed)
+    h = CREEPING.hysteresis
+    other = replace(h, weights=h.weights * (1 + 0.15 * rng.standard_normal(h.weights.size)))
+    stage = replace(CREEPING, hysteresis=other)
+    v = after_motion(0.0).v
+    y = stage.simulate(v)
+    run = free_run(CREEPING, Record((Piece(v, y, FS),)))
+    still = 100 * np.sqrt(np.mean((y - CREEPING.simulate(v)) ** 2)) / np.ptp(y)
+    assert run.errors.percent < 1.05 * still
