@@ -35,7 +35,7 @@ MOVES, AROUND = 3.0, 9
 #: rms of second over first differences, sqrt(3) of white noise, below which it is none
 WHITE = 1.4
 #: path of noise [ranges] that does no harm
-SHORT = 0.05
+SHORT = 0.01
 
 
 def with_quiet_voltage(record: Record) -> Record:
@@ -75,8 +75,11 @@ def _deviation(v: Vector) -> float:
         for d in (np.diff(v), np.diff(v, 2))
     )
     quiet = np.percentile(two, QUIET)
+    if quiet == 0.0:
+        return 0.0
     # sines and small multisines were played
-    is_white = np.median((two / np.maximum(one[: two.size], 1e-300))[two <= quiet]) > WHITE
+    near = (two <= quiet) & (two > 0.5 * quiet)
+    is_white = np.median(two[near] / one[: two.size][near]) > WHITE
     return float(quiet / np.sqrt(6.0)) if is_white else 0.0
 
 

@@ -61,6 +61,9 @@ def test_noise_of_a_monitor_is_taken_out_where_the_voltage_is_quiet(size):
         70.0 + 10.0 * np.random.default_rng(0).standard_normal(COMMAND.size),
         np.full(COMMAND.size, 5.0),
         COMMAND[:100],
+        # a small sine, and a small dither, after a slow motion
+        np.concatenate([np.linspace(0, 50, 4000), 50 + 0.02 * np.sin(2 * np.pi * 1000 * T)]),
+        COMMAND + 0.005 * np.sin(2 * np.pi * 2000 * T),
     ],
 )
 def test_a_command_stays_as_it_is(v):
@@ -80,3 +83,20 @@ def test_a_prediction_from_a_monitor_is_that_from_the_command():
     raw = 100 * np.sqrt(np.mean((model.simulate(v + noise) - y) ** 2)) / np.ptp(y)
     assert error < 0.1
     assert raw > 10 * error
+
+
+def test_slow_motion_does_not_lag_behind_in_one_direction():
+    v = 70.0 - 50.0 * np.cos(2 * np.pi * T)
+    noise = 0.02 * np.random.default_rng(2).standard_normal(v.size)
+    (piece,) = with_quiet_voltage(record(v + noise)).pieces
+    off, up = piece.v - v, np.sin(2 * np.pi * T) > 0.2
+    down = np.sin(2 * np.pi * T) < -0.2
+    # three deviations either way for a play alone
+    assert abs(off[up].mean() - off[down].mean()) < 0.5 * 0.02
+
+
+def test_a_small_motion_beside_a_noisy_piece_was_played():
+    small = 20.0 + 0.02 * np.sin(2 * np.pi * 50 * T)
+    pieces = tuple(record(v).pieces[0] for v in (noisy(0.02), small))
+    both = pi.Record(pieces, 'both')
+    assert with_quiet_voltage(both) is both
