@@ -82,16 +82,20 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
                 # the results of many records are none
                 if len(below) > len(parts) and not (place / MARK).is_file():
                     skipped.append(place.name)
+        others = [p.name for p in sorted(path.glob('[!.]*')) if _may_be_record(p)]
+        some = ', '.join(others[:3]) + (', ...' if len(others) > 3 else '')
+        unread = f'{path}: {some}: not read, as text may be anything; name them too'
         if not inside:
             raise DataError(
-                f'{path}: a folder without records; give a bag, or a folder with '
+                unread.removesuffix(' too')
+                if others
+                else f'{path}: a folder without records; give a bag, or a folder with '
                 f'{", ".join(RECORD_FILES)} files'
             )
         if skipped:
             console.note(f'{path}: its folders are not read ({", ".join(skipped)}); name them too')
-        if others := [p.name for p in sorted(path.glob('[!.]*')) if _may_be_record(p)]:
-            some = ', '.join(others[:3]) + (', ...' if len(others) > 3 else '')
-            console.note(f'{path}: {some}: not read, as text may be anything; name them too')
+        if others:
+            console.note(unread)
         records += inside
     return records
 

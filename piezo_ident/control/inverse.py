@@ -90,8 +90,9 @@ class Inverse(Showable):
         100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: what the
         inversion leaves; of the span of the model where the motion stands still.
     expected : float or None
-        What the stage will err by [%, as `error`], if that of the model is known: as many metres
-        as on the data of its diagnosis, or its identification, however small the motion is.
+        What the stage will err by [%, as `error`], if that of the model is known, as of its
+        diagnosis or its identification: as many metres as over its range, however small the
+        motion is.
     expected_rms : float or None
         The same [m].
     warnings : tuple of str
@@ -352,7 +353,9 @@ def _ringing(model: StageModel, y: Array, expected: float | None) -> list[str]:
     if expected is None or not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
         return []
     sos = butter(4, mode, btype='highpass', fs=model.sample_rate, output='sos')
-    fast = sosfiltfilt(sos, np.pad(y - y[0], round(model.sample_rate / mode), mode='edge'))
+    fast = sosfiltfilt(
+        sos, np.pad(y - y[0], max(16, round(model.sample_rate / mode)), mode='edge')
+    )
     share = percent_of_stroke(fast, np.zeros_like(fast), float(np.ptp(y)))
     if share <= expected:
         return []

@@ -69,7 +69,7 @@ def _is_better(wide: Fitted, narrow: Fitted) -> bool:
 
 def _is_loose(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     """
-    Return whether H differs from the given one by more than that errs, but for its gain.
+    Return whether H is off the given one, but for its gain, by `LOOSE` times what that errs by.
 
     Of data without kinds of motion nothing else tells what it does under other motion: lags along
     the path may grow, and make up for one another on the motion that was fitted alone.
@@ -80,10 +80,9 @@ def _is_loose(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     u = loops(*map(float, model.scaling.u(rows.driven)))
     one, other = (h(u) - float(h(u).mean()) for h in (fitted.state.hysteresis, given.hysteresis))
     # slow creep takes a part of the gain
-    off = one - other * float(one @ other) / float(other @ other)
+    off = one - other * float(one @ other) / max(float(other @ other), 1e-300)
     e = centred(rows.x - simulator.run(given), rows.of_record)
-    ratio = float(np.mean((model.dynamics.gain * off) ** 2)) / float(np.mean(e * e))
-    return ratio > LOOSE**2
+    return float(np.mean((model.dynamics.gain * off) ** 2)) > LOOSE**2 * float(np.mean(e * e))
 
 
 def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:

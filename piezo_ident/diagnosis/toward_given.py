@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 
@@ -79,8 +80,8 @@ def toward_given(
     weight = rows.n / u.size
     if is_bent:
         # it is off by what the effect made of it then, and may be by what it leaves now
-        e = rows.x - simulator.run(given)
-        weight *= min(1.0, float(fitted.errors.sum()) / float(e @ e))
+        e = centred(rows.x - simulator.run(given), rows.of_record)
+        weight *= min(1.0, float(fitted.errors.sum()) / max(float(e @ e), 1e-300))
     A = weight * (P.T @ P)
 
     def pull_at(state: State, size: int) -> Pull:

@@ -146,13 +146,13 @@ def scaled_unit(role: str, text: str) -> str:
 
     A number before it says what one of the file is.
 
-    >>> scaled_unit('y', ' 10 micron'), scaled_unit('v', '20V'), scaled_unit('y', '0um')
+    >>> scaled_unit('y', ' 10 micron/V'), scaled_unit('v', '20V'), scaled_unit('y', '0um')
     ('10um', '20V', '')
     """
-    found = _SCALED.fullmatch(text)
+    found = _SCALED.fullmatch(text.strip().removesuffix('/V'))
     if not found or plain_unit(found[2]) not in UNITS[role]:
         return ''
-    if found[1] and not (math.isfinite(float(found[1])) and float(found[1]) > 0.0):
+    if found[1] and not SMALL < float(found[1]) < 1.0 / SMALL:
         return ''
     return found[1] + plain_unit(found[2])
 
@@ -169,8 +169,10 @@ def unit_factor(role: str, unit: str) -> float:
     return known.get(found[2], 1.0) / float(found[1] or 1.0) if found else 1.0
 
 
+#: least number before a unit, and the inverse of the largest
+SMALL = 1e-12
 #: a unit, and a number before it
-_SCALED = re.compile(r'\s*(\d+(?:\.\d*)?(?:e[-+]?\d+)?|)\s*(\D+)', re.IGNORECASE)
+_SCALED = re.compile(r'\s*(\d*\.?\d+(?:e[-+]?\d+)?|)\s*(\D+)', re.IGNORECASE)
 _SPELT = {
     **dict.fromkeys(('sec', 'secs', 'second', 'seconds', 'sekunden'), 's'),
     **dict.fromkeys(('msec', 'millisecond', 'milliseconds'), 'ms'),

@@ -23,7 +23,7 @@ from piezo_ident import __version__
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.records import expand
 from piezo_ident.common.config import find_config, shipped_names
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.many.run import MARK
 from piezo_ident.model.files import load
 from piezo_ident.record.record import Piece, Record
@@ -320,7 +320,12 @@ def test_a_folder_of_records_leaves_none_out_unsaid(capsys, tmp_path):
     (tmp_path / 'long.dat').write_text('1.0 2.0\n' * 5000)
     assert [path.name for path in expand([tmp_path], Console())] == taken
     assert 'long.dat: not read, as text may be anything; name' in capsys.readouterr().err
-    (tmp_path / 'long.dat').unlink()
+    (tmp_path / 'long.dat').rename(tmp_path / 'crashed' / 'long.dat')
+    (tmp_path / 'crashed' / 'crashed.mcap').rename(tmp_path / 'crashed.mcap')
+    with pytest.raises(DataError, match=r'long\.dat: not read, .*; name them$'):
+        expand([tmp_path / 'crashed'], Console())
+    (tmp_path / 'crashed' / 'long.dat').unlink()
+    (tmp_path / 'crashed.mcap').rename(tmp_path / 'crashed' / 'crashed.mcap')
     (tmp_path / 'monday').mkdir()
     (tmp_path / 'monday' / 'a.NPZ').write_text('')
     (tmp_path / 'bags' / 'whole').mkdir(parents=True)

@@ -137,3 +137,8 @@ def test_a_motion_in_micrometres_taken_for_metres_is_doubted_where_it_is_refused
     _, model = behind_amplifier
     with pytest.raises(DataError, match=r'out of reach .*; .* is it in metres\?'):
         pi.invert(model, 1e-6 * scan(5.0) - 1e-10)
+
+
+def test_a_motion_of_a_few_samples_is_inverted(behind_amplifier):
+    _, model = behind_amplifier
+    assert pi.invert(model, np.linspace(20e-6, 21e-6, 5), clip=True).v.size >= 5

@@ -103,7 +103,7 @@ def test_an_effect_of_the_voltage_has_bent_the_given_h(refit):
         beside = replace(fitted, state=fitted.state.with_effect(effect))
         return toward_given(simulator, given, beside).pull.A.max()
 
-    e = simulator.rows.x - simulator.run(given)
+    e = centred(simulator.rows.x - simulator.run(given), simulator.rows.of_record)
     left = fitted.errors.sum() / (e @ e)
     assert left < 0.5
     assert weight(CREEP) == pytest.approx(left * weight(HUM), rel=1e-9)
