@@ -32,6 +32,8 @@ WIDTH = 8.0
 MOST = 5e-3
 #: widths that the voltage moves within so many samples where it moves
 MOVES, AROUND = 3.0, 9
+#: samples over which the mean of what a play lags behind is put back
+BACK = 300
 #: rms of second over first differences, sqrt(3) of white noise, below which it is none
 WHITE = 1.4
 #: path of noise [ranges] that does no harm
@@ -88,8 +90,8 @@ def _quiet(v: Vector, width: float) -> Vector:
     still = _played(v, width)
     reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
     # it stands half a width behind: the mean of that is put back, and its noise taken out again
-    near = still + uniform_filter1d(v - still, WINDOW)
-    return np.where(reach > MOVES * width, v, _played(near, 0.5 * width / np.sqrt(WINDOW)))
+    near = still + uniform_filter1d(v - still, BACK)
+    return np.where(reach > MOVES * width, v, _played(near, width / np.sqrt(BACK)))
 
 
 def _played(v: Vector, width: float) -> Vector:
