@@ -137,9 +137,9 @@ def diagnose(
         raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
-    records = [with_quiet_voltage(record) for record in records]
-    part = _beginnings(model, records, settings.most_samples)
-    is_whole = part == records
+    quiet = [with_quiet_voltage(record) for record in records]
+    part = _beginnings(model, quiet, settings.most_samples)
+    is_whole = part == quiet
     try:
         result = _diagnosed(model, part, settings, progress)
     except IdentificationError as error:

@@ -211,10 +211,8 @@ def prepare(records: Sequence[Record]) -> Prepared:
         raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
-    records = [
-        with_quiet_voltage(without_faults(record.first(MOST_SAMPLES // len(records))))
-        for record in records
-    ]
+    measured = [without_faults(record.first(MOST_SAMPLES // len(records))) for record in records]
+    records = [with_quiet_voltage(record) for record in measured]
     rate, left = common_rate(records)
     refuse_undriven(records)
     for record in records:
@@ -237,7 +235,8 @@ def prepare(records: Sequence[Record]) -> Prepared:
                 f'samples or {lost:.2g} s; neither they nor the moment after each were fitted or '
                 'judged'
             )
-    faults += [said for record in records for said in suspicions(record)]
+    # of columns that are swapped, v has the noise of a sensor
+    faults += [said for record in measured for said in suspicions(record)]
     return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
 
 
