@@ -132,7 +132,9 @@ def _selected(
         # no effect is needed for G to be a little off
         again = search.retuned(wide)
         fitted = again if _is_better(again, wide) else wide
-    if _is_loose(simulator, given, fitted):
+    # without effects the whole weight of the given H holds a refit, and what the widest law takes
+    # is no sign of one
+    if found.taken and _is_loose(simulator, given, fitted):
         fitted = _refit(simulator, fitted.state, 'preisach')
     for narrower in _NARROWER:
         is_known = narrower == 'plays' and bool(found.taken)
