@@ -70,7 +70,7 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
             records.append(path)
             continue
         inside: list[Path] = []
-        skipped: list[str] = []
+        skipped, others = list[str](), list[str]()
         for place in sorted(path.glob('[!.]*')):
             if _is_record(place):
                 inside.append(place)
@@ -82,7 +82,8 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
                 # the results of many records are none
                 if len(below) > len(parts) and not (place / MARK).is_file():
                     skipped.append(place.name)
-        others = [p.name for p in sorted(path.glob('[!.]*')) if _may_be_record(p)]
+            elif place.suffix.lower() in UNCERTAIN and place.is_file():
+                others += [place.name] if place.stat().st_size > NOTES else []
         some = ', '.join(others[:3]) + (', ...' if len(others) > 3 else '')
         unread = f'{path}: {some}: not read, as text may be anything; name them too'
         if not inside:
@@ -104,11 +105,6 @@ def _is_record(path: Path) -> bool:
     return (path / 'metadata.yaml').is_file() or (
         path.is_file() and path.suffix.lower() in RECORD_FILES
     )
-
-
-def _may_be_record(path: Path) -> bool:
-    """Return whether a text is too long for notes."""
-    return path.suffix.lower() in UNCERTAIN and path.is_file() and path.stat().st_size > NOTES
 
 
 def expand_apart(

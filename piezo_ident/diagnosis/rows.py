@@ -28,7 +28,7 @@ from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
-from piezo_ident.residual.stretches import block_means, bridged
+from piezo_ident.residual.stretches import block_means, without_spikes
 
 __all__ = ['Rows', 'centred', 'make_rows', 'means']
 
@@ -260,7 +260,7 @@ def make_rows(
     bad = bad or [None] * len(runs)
     # a single wild reading would be noise of all readings
     runs = [
-        run if out is None else replace(run, x=bridged(run.x, out))
+        run if out is None else replace(run, x=without_spikes(run.x, out))
         for run, out in zip(runs, bad, strict=True)
     ]
     use = [_without(run.known, out) for run, out in zip(runs, bad, strict=True)]

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import (
-    connected_pieces,
     crept,
     EARLY,
     early_part,
@@ -31,7 +30,7 @@ from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.faults import without_faults
-from piezo_ident.record.gaps import bridged
+from piezo_ident.record.gaps import bridged, connected_pieces
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
@@ -242,9 +241,9 @@ def _late(model: StageModel, piece: Piece, start: Start) -> int:
     end = early_part(model, piece) if start.creep.size else 0
     if start.memory is None:
         return end
-    v = piece.v
     # a voltage that rests forgets nothing
-    return max(end, forgotten(v, way=forgetting(model)) if v.min() < v.max() else v.size)
+    moves = np.ptp(piece.v) > 0.0
+    return max(end, forgotten(piece.v, way=forgetting(model)) if moves else piece.n)
 
 
 def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:
@@ -296,7 +295,7 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
     ----------
     model : StageModel
     pieces : sequence of Piece
-        From `piezo_ident.model.initial_memory.connected_pieces`.
+        From `piezo_ident.record.gaps.connected_pieces`.
     start : Start, array_like or None
         Of the first, as of `StageModel.simulate`.
     """

@@ -28,12 +28,12 @@ from piezo_ident.effects.creep import Creep
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
-from piezo_ident.record.gaps import follows
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.gaps import connected_pieces
 from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
 
 __all__ = [
-    'connected_pieces',
     'crept',
     'early_part',
     'fit_start',
@@ -119,32 +119,13 @@ def is_at_rest(model: StageModel, piece: Piece) -> bool:
     return abs(float(model.scaling.u(piece.v[0]))) < 0.01
 
 
-def connected_pieces(record: Record) -> list[list[Piece]]:
-    """Return the pieces of a record in groups; within a group, gaps are short."""
-    groups: list[list[Piece]] = []
-    for piece in record:
-        last = groups[-1][-1] if groups else None
-        if (
-            last is not None
-            and follows(last, piece) is not None
-            and set(last.channels) == set(piece.channels)
-        ):
-            groups[-1].append(piece)
-        else:
-            groups.append([piece])
-    return groups
-
-
 def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
     """Return a warning where the voltage alone does not tell the memory at the start."""
     v = [pieces[0].v[0] for pieces in connected_pieces(record) if not is_at_rest(model, pieces[0])]
     if not v:
         return ()
-    h, (low, high) = model.hysteresis, model.hysteresis.span
-    widths = []
-    for u in map(float, model.scaling.u(v)):
-        up, down = (h(np.array([*way, u]))[-1] for way in ([low], [low, high]))
-        widths.append(abs(float(model.dynamics.gain * (down - up))))
+    branches = [_branches(model.hysteresis, float(u)) for u in model.scaling.u(v)]
+    widths = [abs(float(model.dynamics.gain * np.diff(both)[0])) for both in branches]
     return (
         f'{record.name}: starts at {v[int(np.argmax(widths))]:g} V; coming from below and from '
         f'above the stage stands {100.0 * max(widths):.2g} % of its span apart there, and without '
@@ -218,6 +199,12 @@ def _creeps(model: StageModel) -> bool:
     return bool(_elements(model)[0].any())
 
 
+def _branches(h: Hysteresis, u: float) -> NDArray[np.float64]:
+    """Return H at a voltage that came up from the lowest one, and down from the highest."""
+    low, high = h.span
+    return np.array([h(np.array([*way, u]))[-1] for way in ([low], [low, high])])
+
+
 def _fit(
     model: StageModel,
     piece: Piece,
@@ -272,9 +259,7 @@ def _fit(
     whole = np.eye(rest.size)
     whole[:m, :m] = -np.tril(np.ones((m, m))) * falls
     # creep has followed voltages of the range; H stands between its two branches
-    way = np.linspace(*h.span, 65)
-    here = [h(np.array([*come, u0]))[-1] for come in (way[:1], way)]
-    reach = h(way)[:, None] - here
+    reach = h(np.linspace(*h.span, 65))[:, None] - _branches(h, u0)
     far = np.repeat([[reach.min(), -FAR], [reach.max(), FAR]], [c, z], axis=1)
     lags = h.lag_range[:, :k]
     low = np.concatenate([np.zeros(m), np.minimum([*lags[0], *far[0]], rest[m:])])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.record import Piece, Record, Segment
 
-__all__ = ['LONGEST', 'Bridged', 'bridged', 'follows']
+__all__ = ['LONGEST', 'Bridged', 'bridged', 'connected_pieces', 'follows']
 
 #: longest gap that is bridged [s]
 LONGEST = 1.0
@@ -54,8 +54,8 @@ def follows(one: Piece, other: Piece) -> int | None:
     return missing
 
 
-def bridged(record: Record) -> list[Bridged]:
-    """Join the pieces of a record over short gaps."""
+def connected_pieces(record: Record) -> list[list[Piece]]:
+    """Return the pieces of a record in groups; within a group, gaps are short."""
     groups: list[list[Piece]] = []
     for piece in record:
         connects = groups and follows(groups[-1][-1], piece) is not None
@@ -63,7 +63,12 @@ def bridged(record: Record) -> list[Bridged]:
             groups[-1].append(piece)
         else:
             groups.append([piece])
-    return [_joined(group) for group in groups]
+    return groups
+
+
+def bridged(record: Record) -> list[Bridged]:
+    """Join the pieces of a record over short gaps, one for each of `connected_pieces`."""
+    return [_joined(group) for group in connected_pieces(record)]
 
 
 def _joined(pieces: list[Piece]) -> Bridged:

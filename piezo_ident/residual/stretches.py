@@ -26,12 +26,12 @@ __all__ = [
     'Stretch',
     'all_stretches',
     'block_means',
-    'bridged',
     'find_repeats',
     'rests',
     'stretches_of',
     'strokes_of',
     'true_runs',
+    'without_spikes',
 ]
 
 #: bad samples in a row that say nothing of their neighbours
@@ -141,7 +141,7 @@ def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def bridged(e: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+def without_spikes(e: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return a signal with a straight line over up to `SPIKE` bad samples in a row."""
     at = [k for a, b in true_runs(bad) if b - a <= SPIKE for k in range(a, b)]
     if not at or len(at) == e.size:
