@@ -77,11 +77,9 @@ def _deviation(v: Vector) -> float:
         for d in (np.diff(v), np.diff(v, 2))
     )
     quiet = np.percentile(two, QUIET)
-    if quiet == 0.0:
-        return 0.0
     # sines and small multisines were played
     near = (two <= quiet) & (two > 0.5 * quiet)
-    is_white = np.median(two[near] / one[: two.size][near]) > WHITE
+    is_white = near.any() and np.median(two[near] / one[: two.size][near]) > WHITE
     return float(quiet / np.sqrt(6.0)) if is_white else 0.0
 
 

@@ -4,6 +4,7 @@
 """A voltage that was measured: its noise is no motion."""
 
 from dataclasses import replace
+import warnings
 
 import numpy as np
 import piezo_ident as pi
@@ -100,3 +101,12 @@ def test_a_small_motion_beside_a_noisy_piece_was_played():
     pieces = tuple(record(v).pieces[0] for v in (noisy(0.02), small))
     both = pi.Record(pieces, 'both')
     assert with_quiet_voltage(both) is both
+
+
+def test_windows_that_rest_or_move_and_are_nothing_between_are_no_noise():
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        # a tenth of the windows rest, and the next one moves
+        v = np.concatenate([np.full(1150, 1.0), 5 + np.cumsum(np.sin(np.arange(9400) ** 1.5))])
+        one = record(v)
+        assert with_quiet_voltage(one) is one
