@@ -182,7 +182,7 @@ def fit_jointly(
         When an effect cannot run on these data.
     """
     rows = simulator.rows
-    parameters = free_parameters(state, len(rows.names))
+    parameters = free_parameters(state, len(rows.names), rows.longest)
     p = base.columns.shape[1] + len(parameters)
     damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)

@@ -79,8 +79,12 @@ class FreeParameter:
         return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
 
 
-def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
-    """Return every number of G's retuning and of the effects that the fit may move."""
+def free_parameters(state: State, records: int, longest: int = 0) -> tuple[FreeParameter, ...]:
+    """
+    Return every number of G's retuning and of the effects that the fit may move.
+
+    `longest` is the record from whose start a change that H can make as well is counted.
+    """
     found = [
         FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
         for i, size in enumerate(RETUNING[: len(state.retuning)])
@@ -96,7 +100,8 @@ def free_parameters(state: State, records: int) -> tuple[FreeParameter, ...]:
             # the amplitude of what follows time is another one in each record
             per_record = effect.time_driven and p.step > 0.0
             for k in range(records) if per_record else (None,):
-                for index in range(np.size(value)) if p.vector else (None,):
+                held = 1 if p.first_stays and k == longest else 0
+                for index in range(held, np.size(value)) if p.vector else (None,):
                     number = number_of(added.values[0], p.name, index)
                     if np.isfinite(number) and not (is_log and number <= 0.0):
                         found.append(

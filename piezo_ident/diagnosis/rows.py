@@ -167,6 +167,12 @@ class Rows:
         """From the first row to the last of a record, of the longest one [s]."""
         return max(end - begin for begin, end in self._counted.values())
 
+    @property
+    def first(self) -> float:
+        """When the first row of the record that has most comes, by the clock of `time` [s]."""
+        begin = float(self.begin[list(self.record).index(self.longest)])
+        return self._counted[self.longest][0] - begin
+
     @functools.cached_property
     def _counted(self) -> dict[int, tuple[float, float]]:
         """When the rows of each record begin and end [s]."""

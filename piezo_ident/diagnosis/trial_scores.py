@@ -192,5 +192,6 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         max_frequency=rows.highest_frequency,
         thresholds=model.hysteresis.thresholds,
         judged=rows.judged,
+        first=rows.first,
         is_fast=simulator.is_fast,
     )

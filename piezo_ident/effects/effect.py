@@ -55,6 +55,9 @@ class Parameter:
         How a fit moves the parameter: ``linear``, ``log`` (its logarithm) or ``fixed``.
     tries : tuple
         Of a parameter that is no amplitude: values worth trying on any data; for a list, lists.
+    first_stays : bool
+        Of a list that follows time: whether its first number stays in one record, since H can do
+        the same.
     """
 
     name: str
@@ -69,6 +72,7 @@ class Parameter:
     step: float = 0.0
     scale: Literal['linear', 'log', 'fixed'] = 'linear'
     tries: tuple[Any, ...] = ()
+    first_stays: bool = False
 
     def __post_init__(self) -> None:
         if self.default is None and self.is_amplitude:

@@ -67,7 +67,17 @@ class GainDrift(Effect):
         Parameter(
             'time', 's', 'time of each knot, ascending', NAN, -1e9, 1e9, True, scale='fixed'
         ),
-        Parameter('gain', '1', 'change a of the gain there', 0.0, -1.0, 10.0, True, step=1e-3),
+        Parameter(
+            'gain',
+            '1',
+            'change a of the gain there',
+            0.0,
+            -1.0,
+            10.0,
+            True,
+            step=1e-3,
+            first_stays=True,
+        ),
     )
 
     @classmethod
@@ -80,10 +90,14 @@ class GainDrift(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return one to twelve stretches; the first knot stays, as a constant gain is H's."""
+        """
+        Return one to twelve stretches; the first knot stays, as a constant gain is H's.
+
+        It is where the data begin to count: before, the gain could have been any.
+        """
         trials = []
         for stretches in (1, 3, 6, 12):
-            knots = np.linspace(0.0, max(view.duration, 1e-6), stretches + 1)
+            knots = np.linspace(view.first, max(view.duration, view.first + 1e-6), stretches + 1)
             full = cls.trial({'time': knots})
             trials.append(Trial(full.values, full.moves[1:], full.steps[1:]))
         return tuple(trials)

@@ -44,6 +44,8 @@ class View:
         Thresholds of H.
     judged : float
         From the first sample to the last of a record that counts, of the longest one [s].
+    first : float
+        When the first sample that counts comes, in the record that has most [s].
     is_fast : bool
         Whether dynamics matter in these data.
     """
@@ -59,6 +61,7 @@ class View:
     max_frequency: float = 100.0
     thresholds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     judged: float = np.inf
+    first: float = 0.0
     is_fast: bool = True
 
     @property

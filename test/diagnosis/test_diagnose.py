@@ -316,6 +316,21 @@ def test_another_gain_is_no_other_hysteresis():
     assert result.model is model and result.after.overall == result.before.overall > 0.3
 
 
+def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
+    # H with another gain is the same model, so that the first could be any: it was -0.57 here
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+    # the end of the first sine, so that the first of it follows from no known start
+    late = piece.cut(int(0.13 * piece.n), piece.n)
+    gains = 1.0 + 0.03 * np.linspace(0.0, 1.0, late.n)
+    wandering = Record((replace(late, y=gains * late.y, segments=()),), 'wandering')
+    (found,) = diagnose(model, wandering, DiagnosisSettings(effects=('gain_drift',))).effects
+    time, gain = (np.asarray(found.parameters[name].value) for name in ('time', 'gain'))
+    assert gain[0] == 0.0 < time[0]
+    truth = np.interp(time, late.time(0, late.n) - late.start_time, gains)
+    np.testing.assert_allclose(1.0 + gain, truth / truth[0], atol=4e-3)
+
+
 def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
