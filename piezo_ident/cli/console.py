@@ -26,11 +26,8 @@ def deferred_interrupts() -> Iterator[Callable[..., None]]:
     """
     Have Ctrl-C wait until all outputs of a command are whole.
 
-    Yields
-    ------
-    callable
-        Takes whatever it is called with, and raises KeyboardInterrupt when one is waiting; for
-        long work before the first output is in its place.
+    What is yielded takes any arguments, and raises KeyboardInterrupt when one is waiting; for long
+    work before the first output is in its place.
     """
     waiting: list[int] = []
 
@@ -52,14 +49,7 @@ def deferred_interrupts() -> Iterator[Callable[..., None]]:
 
 
 class Console:
-    """
-    Standard output and error of one command.
-
-    Parameters
-    ----------
-    as_json : bool
-        Only JSON goes to standard output.
-    """
+    """Standard output and error of one command; `as_json`: only JSON goes to standard output."""
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json

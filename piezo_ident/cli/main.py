@@ -229,19 +229,7 @@ click.version_option(__version__, message='piezo_ident %(version)s')(cli)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run a command.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments; those of the process when absent.
-
-    Returns
-    -------
-    int
-        Exit code.
-    """
+    """Run a command, with the arguments of the process by default, and return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
 
     def stop(code: int, text: str, kind: str) -> int:

@@ -36,14 +36,7 @@ def _folders() -> Iterator[Path]:
 
 
 def shipped_names(prefix: str = '') -> list[str]:
-    """
-    Return the names of the shipped files, without `prefix` and suffix.
-
-    Parameters
-    ----------
-    prefix : {'program_', 'stage_', ''}
-        Which files.
-    """
+    """Return the names of shipped files with a prefix, ``program_`` or ``stage_``, without it."""
     found = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
     return sorted(name.removeprefix(prefix) for name in found)
 

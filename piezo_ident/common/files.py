@@ -60,13 +60,7 @@ def broken_link(path: str | os.PathLike[str]) -> str | None:
 
 
 def check_regular(path: Path) -> None:
-    """
-    Refuse folders, and devices and pipes, which have no end.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse folders, and devices and pipes, which have no end, with a DataError."""
     if not path.is_file():
         kind = 'a folder' if path.is_dir() else 'a device or a pipe'
         raise DataError(f'{path}: is {kind}, no file; copy the data into a file')
@@ -76,10 +70,7 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     Read a YAML mapping with the safe loader.
 
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read, or `parse_yaml` refuses its text.
+    A file that cannot be read, or that `parse_yaml` refuses, raises ConfigError.
     """
     file = Path(path)
     try:
@@ -201,14 +192,7 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """
-    Write a text file, or replace it, in one step; see `temporary_output`.
-
-    Raises
-    ------
-    DataError
-        When the file cannot be written.
-    """
+    """Write or replace a text file in one step, or raise DataError; see `temporary_output`."""
     with temporary_output(Path(path), overwrite=True) as file:
         # file names and labels need not be Unicode
         file.write_text(text, encoding='utf-8', errors='replace')
@@ -218,17 +202,8 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -
     """
     Write several files into a folder: all of them, or none where there is no room.
 
-    Parameters
-    ----------
-    folder : path
-        Made when it does not exist.
-    files : mapping of str to bytes
-        Contents by file name; put in place in this order.
-
-    Raises
-    ------
-    DataError
-        When the folder cannot be written.
+    The folder is made when it does not exist; files, contents by name, are put in place in their
+    order.  A folder that cannot be written raises DataError.
     """
     folder = Path(folder)
     with _work_folder(folder, folder, 'new') as work:
@@ -240,13 +215,7 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -
 
 
 def check_replaceable(folder: Path) -> None:
-    """
-    Refuse a folder that is no bag, or holds other files: replacing it would delete them.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse a folder that is no bag, or holds other files: replacing it would delete them."""
     try:
         is_bag = 'rosbag2_bagfile_information' in load_yaml(folder / 'metadata.yaml')
     except ConfigError:

@@ -74,14 +74,8 @@ class WorkerProcess:
     """
     A process that does one job at a time and is started again when it has died.
 
-    It ends with the process that made it, however that ends.
-
-    Parameters
-    ----------
-    nice : int, optional
-        By how much it gives way to other processes.
-    warm_up : callable, optional
-        A function of a module that it calls first.
+    It ends with the process that made it, however that ends.  `nice` is by how much it gives way
+    to other processes, `warm_up` a function of a module that it calls first.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:

@@ -281,15 +281,8 @@ class HysteresisInverse:
         """
         Return the voltages under which H comes as near to w as they may, and what H is then.
 
-        Parameters
-        ----------
-        w : ndarray, shape (n,)
-        power : ndarray, shape (n,), optional
-            Of the speed, by which the plays grow; they keep their widths when absent.
-
-        Returns
-        -------
-        u, w : ndarray, shape (n,)
+        All are of shape (n,).  With a `power` of the speed the plays grow; without it they keep
+        their widths.
         """
         u, reached = np.empty(w.size), np.empty(w.size)
         _invert(

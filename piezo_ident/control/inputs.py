@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 
 
 def checked_motion(wanted: ArrayLike) -> Array:
-    """
-    Return a wanted motion as a vector.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return a wanted motion as a vector, or raise DataError."""
     y = _vector(wanted)
     if y.size < 2 or not np.all(np.isfinite(y)):
         raise DataError(
@@ -49,11 +43,9 @@ def checked_limits(
     model: StageModel, limits: tuple[float, float] | None, slew: float
 ) -> tuple[float, float, float]:
     """
-    Return lowest and highest voltage and its speed as numbers; the identified range for None.
+    Return lowest and highest voltage and its speed as numbers, or raise DataError.
 
-    Raises
-    ------
-    DataError
+    None stands for the identified range.
     """
     given = model.scaling.range if limits is None else limits
     try:
@@ -66,13 +58,7 @@ def checked_limits(
 
 
 def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -> dict[str, Array]:
-    """
-    Return the further signals as long as the voltage is.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return the further signals as long as the voltage is; DataError where one does not fit."""
     found = {name: _vector(z) for name, z in channels.items()}
     for name, z in found.items():
         if z.shape != (n,) or not np.all(np.isfinite(z)):

@@ -49,13 +49,8 @@ class Repetition:
     """
     One run of a motion.
 
-    Attributes
-    ----------
-    drive : Inverse
-    measured : ndarray, shape (n,)
-        Displacement under it [m].
-    error : float
-        100 rms(wanted - measured) / (max wanted - min wanted), of what the limits reach.
+    `measured` is the displacement under `drive` [m], shape (n,), and `error` is 100 rms(wanted -
+    measured) / (max wanted - min wanted) of what the limits reach.
     """
 
     drive: Inverse

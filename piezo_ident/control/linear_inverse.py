@@ -75,12 +75,8 @@ class LinearInverse:
     """
     The filter.
 
-    Attributes
-    ----------
-    taps : ndarray, shape (ahead + 1 + behind,)
-        The earliest first.
-    ahead, behind : int
-        Samples after and before the present one that it needs.
+    Its `taps`, shape (ahead + 1 + behind,), begin with the earliest; it needs `ahead` samples
+    after and `behind` before the present one.
     """
 
     taps: Array
@@ -113,12 +109,8 @@ def linear_inverse(model: StageModel) -> LinearInverse:
     """
     Return the inverse of all that is linear and fast in a model: G, the delay, and their changes.
 
-    Its static gain is exact.
-
-    Raises
-    ------
-    ModelError
-        When G has no static gain, or rings or waits for longer than `LONGEST` samples.
+    Its static gain is exact.  ModelError when G has no static gain, or rings or waits for longer
+    than `LONGEST` samples.
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
@@ -170,13 +162,7 @@ def least_preview(model: StageModel) -> float:
 
 
 def check_preview(model: StageModel, preview: int) -> None:
-    """
-    Refuse a preview that is too short for a model.
-
-    Raises
-    ------
-    ModelError
-    """
+    """Refuse a preview that is too short for a model, with a ModelError."""
     if preview < least_preview(model):
         raise ModelError(
             f'a preview of {preview} samples does not reach beyond the delay of the model, '

@@ -111,17 +111,9 @@ class RateInverse:
 
     def process(self, w: Array) -> tuple[Array, Array]:
         """
-        Return the voltages of a motion from rest, and what H is under them, nearly.
+        Return the voltages of a whole motion w of H from rest, and what H is under them, nearly.
 
-        Parameters
-        ----------
-        w : ndarray, shape (n,)
-            What H is wanted to be, the whole motion.
-
-        Returns
-        -------
-        u, w : ndarray, shape (n,)
-            H comes as near as the limits allow.
+        All are of shape (n,).  H comes as near as the limits allow.
         """
         best = self._passed(w)
         if best[0] > SETTLED**2 * w.size * float(np.ptp(w)) ** 2:

@@ -26,12 +26,7 @@ def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOpera
     """
     Return the changes of H with small changes of a voltage from rest at u0, as an operator.
 
-    Parameters
-    ----------
-    effect : RateDependentHysteresis
-    u : ndarray, shape (n,)
-        The voltage at which they are.
-    u0 : float
+    They are those at a voltage u, shape (n,).
     """
     h = effect.hysteresis
     r, q, p1, p2, p0, low, c = h.for_kernel

@@ -89,17 +89,9 @@ class Creep(Effect):
 
     def start_from(self, beyond: NDArray[np.float64]) -> None:
         """
-        Say how far each element is beyond its rest when it is reset.
+        Set how far each element is beyond its rest when it is reset: shape (c,), empty at rest.
 
-        Parameters
-        ----------
-        beyond : ndarray, shape (c,)
-            Empty for elements at rest.
-
-        Raises
-        ------
-        ModelError
-            When there are more or fewer than elements.
+        Another number than that of the elements raises ModelError.
         """
         if beyond.size not in (0, self.array('gain').size):
             raise ModelError(

@@ -105,14 +105,7 @@ class CrossCoupling(Effect):
         return x0
 
     def process(self, block: Block) -> Block:
-        """
-        Return the block with the other axis's share added.
-
-        Raises
-        ------
-        ModelError
-            When the block lacks the channel.
-        """
+        """Return the block with the share of the other axis; ModelError without its channel."""
         name = self.text('channel')
         if name not in block.channels:
             has = ', '.join(sorted(block.channels)) or 'none'

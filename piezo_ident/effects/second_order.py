@@ -40,10 +40,7 @@ def slope_of_mode(frequency: float, sample_rate: float) -> float:
     """
     Return c in ``s/w -> c (1 - z^-1)/(1 + z^-1)``, exact at the mode's own frequency w.
 
-    Raises
-    ------
-    ModelError
-        When the frequency is not below half the sampling rate.
+    A frequency that is not below half the sampling rate raises ModelError.
     """
     if not frequency < sample_rate / 2.0:
         raise ModelError(

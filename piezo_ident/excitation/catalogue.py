@@ -97,16 +97,10 @@ class Setting:
 @dataclass(frozen=True, eq=False)
 class Part:
     """
-    A piece of a program that is played without a ramp inside.
+    A piece of a program that is played without a ramp inside: its voltage v [V], shape (n,).
 
-    Attributes
-    ----------
-    v : ndarray, shape (n,)
-        [V]
-    end : float
-        Level at which the signal would go on after its last sample [V].
-    name : str
-        What tells it from others of its kind; may be empty.
+    `end` is the level at which the signal would go on after its last sample [V]; `name` tells it
+    from others of its kind, and may be empty.
     """
 
     v: NDArray[np.float64]

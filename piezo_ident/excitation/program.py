@@ -49,17 +49,9 @@ _NAME = re.compile(r'[\w.+-]+')
 @dataclass(frozen=True, eq=False)
 class Sequence:
     """
-    The command voltage of a whole program.
+    The command voltage v [V] of a whole program, shape (n,), sampled at a rate [Hz].
 
-    Attributes
-    ----------
-    v : ndarray, shape (n,)
-        [V]
-    sample_rate : float
-        [Hz]
-    segments : tuple of Segment
-        They cover every sample, and no two neighbours share a label.
-    name : str
+    The segments cover every sample, and no two neighbours share a label.
     """
 
     v: NDArray[np.float64]

@@ -45,14 +45,7 @@ MAX_SAMPLES = 50_000_000
 
 
 def sample_count(seconds: float, sample_rate: float) -> int:
-    """
-    Return how many samples a signal has.
-
-    Raises
-    ------
-    ConfigError
-        When it has less than one, or more than a signal may have.
-    """
+    """Return how many samples a signal has; ConfigError for less than one, or too many."""
     n = seconds * sample_rate
     if n < 0.5:
         raise ConfigError(f'{seconds:g} s is shorter than one sample; make it longer')

@@ -169,14 +169,7 @@ def _feedforward(
     kept: tuple[float, float, float],
     preview: int | None,
 ) -> _FeedForward:
-    """
-    Return what inverts a model.
-
-    Raises
-    ------
-    ModelError
-        When it has no inverse.
-    """
+    """Return what inverts a model; ModelError when it has no inverse."""
     HysteresisInverse(model.hysteresis)
     in_front = [link.name for link in front.links]
     rest = tuple(e for e in model.effects if e.name not in in_front)

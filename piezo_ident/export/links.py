@@ -29,14 +29,7 @@ class Link:
     """
     An operator of the chain in C.
 
-    Attributes
-    ----------
-    name : str
-        Of the operator.
-    tag : str
-        Unique within the model; of the member with its state, and of its functions.
-    code : CCode
-    effect : Effect or None
+    Its `tag` is unique within the model: that of the member with its state, and of its functions.
     """
 
     name: str
@@ -102,10 +95,7 @@ def links_of(model: StageModel) -> tuple[LinkGroup, LinkGroup, LinkGroup]:
     """
     Return the links in front of G, G with its delay, and those behind, in their order.
 
-    Raises
-    ------
-    ModelError
-        When an effect is not written in C.
+    An effect that is not written in C raises ModelError.
     """
     front: list[Link] = []
     linear: list[Link] = []

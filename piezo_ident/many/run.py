@@ -57,13 +57,8 @@ class Diagnose:
     """
     Diagnosis of one record.
 
-    Attributes
-    ----------
-    models : Path
-        A model file for all records, or a folder with ``NAME.yaml`` for each, such as the folder
-        that an identification of many records wrote.
-    settings : DiagnosisSettings
-    reading : ReadOptions
+    `models` is a model file for all records, or a folder with ``NAME.yaml`` for each, such as the
+    folder that an identification of many records wrote.
     """
 
     models: Path

@@ -39,17 +39,7 @@ Value = str | float | int | None
 
 @dataclass(frozen=True)
 class Row:
-    """
-    A line of the table.
-
-    Attributes
-    ----------
-    record : str
-    values : mapping of str to Value
-        By column; empty where the record failed.
-    reason : str
-        Why it failed, in one line; empty where it did not.
-    """
+    """A line of the table: its values by column, or in one line why the record failed."""
 
     record: str
     values: Mapping[str, Value] = field(default_factory=dict)

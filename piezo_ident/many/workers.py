@@ -60,11 +60,8 @@ def dask(address: str) -> Iterator[Submit]:
     """
     Yield what submits jobs to the workers of a dask scheduler.
 
-    Raises
-    ------
-    ConfigError
-        When dask.distributed is not installed, no scheduler answers, it has no worker, or a worker
-        has another version of this package.
+    ConfigError when dask.distributed is not installed, no scheduler answers, it has no worker, or
+    a worker has another version of this package.
     """
     try:
         from distributed import Client
