@@ -42,10 +42,7 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
     """
     Return H refitted as plays on a fine grid, and as the widest law.
 
-    Raises
-    ------
-    IdentificationError
-        When the voltage never moves.
+    A voltage that never moves raises IdentificationError.
     """
     if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')

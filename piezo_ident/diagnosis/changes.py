@@ -83,18 +83,10 @@ class Behind:
 
     def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
         """
-        Return by how much the rows change with the incoming signal.
+        Return by how much the rows change with the incoming signal; shape (n // m,).
 
-        Parameters
-        ----------
-        change : ndarray, shape (n,), optional
-            None where only the first link has changed.
-        rest : float
-            Change of the signal at rest, before the first sample.
-
-        Returns
-        -------
-        ndarray, shape (n // m,)
+        The change, shape (n,), is None where only the first link has changed; `rest` is that of
+        the signal at rest, before the first sample.
         """
         m, (links, G) = self._m, self._to_rows
         rest = self._reset(links, rest)
@@ -111,18 +103,9 @@ class Behind:
         Return by how much the rows change when filters of a signal are added in front.
 
         Filters may trade places: these run behind those that come first, side by side.
-
-        Parameters
-        ----------
-        sections : ndarray, shape (k, 5)
-            b_0, b_1, b_2, a_1 and a_2 of each, as of `piezo_ident.operators.dynamics.Dynamics`.
-        signal : ndarray, shape (n,)
-        rest : float
-            The signal at rest.
-
-        Returns
-        -------
-        ndarray, shape (k, n // m)
+        `sections`, shape (k, 5), are b_0, b_1, b_2, a_1 and a_2 of each, as of
+        `piezo_ident.operators.dynamics.Dynamics`; `rest` is the signal, shape (n,), at rest.  The
+        result has shape (k, n // m).
         """
         count = len(sections)
         c = np.zeros((5, count + -count % LANES))

@@ -49,11 +49,7 @@ class NormalEquations:
     """
     Normal equations of columns M and one residual or several, block by block.
 
-    Attributes
-    ----------
-    A : ndarray, shape (blocks, p, p)
-    b : ndarray, shape (blocks, p, k)
-    s : ndarray, shape (blocks, k)
+    A, b and s have shapes (blocks, p, p), (blocks, p, k) and (blocks, k).
     """
 
     A: Array
@@ -68,14 +64,9 @@ class NormalEquations:
 @dataclass(frozen=True, eq=False)
 class Pull:
     """
-    Normal equations of what is known besides the blocks.
+    Normal equations of what is known besides the blocks; s is the sum of squares as it is.
 
-    Attributes
-    ----------
-    A : ndarray, shape (p, p)
-    b : ndarray, shape (p,)
-    s : float
-        Sum of squares as it is.
+    A and b have shapes (p, p) and (p,).
     """
 
     A: Array
@@ -124,11 +115,7 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
     Return the coefficients of a ridge regression; b has shape (p,) or (p, k).
 
     The prior, shape (p,), is added to the diagonal, besides `RIDGE` of the column's own energy.
-
-    Raises
-    ------
-    IdentificationError
-        When the equations are singular.
+    Singular equations raise IdentificationError.
     """
     # of a column that a set holds alone, rounding leaves less than nothing
     size = np.sqrt(np.maximum(np.diag(A), 0.0))

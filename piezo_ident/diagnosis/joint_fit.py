@@ -170,16 +170,10 @@ def fit_jointly(
 
     A step that lowers the mean square by less than `enough` is the last one, and one that promises
     less is not made.  So is one after which the steps that are left, were they like it or falling
-    as they do, would not reach the mean square `goal` of what is fitted.
-    `tick` is called between the steps, and may raise `piezo_ident.common.errors.Cancelled`.
-    `pull_at` gives what is fitted besides the rows, in a state of so many free numbers.
-
-    Raises
-    ------
-    IdentificationError
-        When the equations are singular.
-    ModelError
-        When an effect cannot run on these data.
+    as they do, would not reach the mean square `goal` of what is fitted.  `tick` is called between
+    the steps, and may raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives what is fitted
+    besides the rows, in a state of so many free numbers.  Singular equations raise
+    IdentificationError, an effect that cannot run on these data ModelError.
     """
     rows = simulator.rows
     parameters = free_parameters(state, len(rows.names), rows.longest)

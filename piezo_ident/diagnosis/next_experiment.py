@@ -53,14 +53,9 @@ APART = 2.0
 @dataclass(frozen=True)
 class Experiment:
     """
-    What to measure next.
+    What to measure next, and what is in doubt without, for people.
 
-    Attributes
-    ----------
-    kind : {'sweeps', 'holds'}
-        Motions of many kinds, or steps with long holds.
-    reason : str
-        What is in doubt without, for people.
+    'sweeps' are motions of many kinds, 'holds' steps with long holds.
     """
 
     kind: Kind

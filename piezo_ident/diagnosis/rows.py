@@ -248,12 +248,8 @@ def make_rows(
     """
     Cut records into rows and blocks, by the scaling and sampling rate of a model.
 
-    `bad` are for each run samples that are not used, or None.
-
-    Raises
-    ------
-    IdentificationError
-        When no record has the model's sampling rate, or nothing is left to judge.
+    `bad` are for each run samples that are not used, or None.  IdentificationError when no record
+    has the sampling rate of the model, or nothing is left to judge.
     """
     runs = runs_of(records, model.sample_rate, model.scaling)
     if not runs:

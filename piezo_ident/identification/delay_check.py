@@ -36,13 +36,8 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
     Return the delay of steps or of the scan that a free run upholds, else one that it allows.
 
-    Of two that hold the smaller goes; where none does, half of the largest that does.
-
-    Parameters
-    ----------
-    found : DelayResult
-    fitted, held : (ndarray, ndarray)
-        Input and output of noise, to fit and right behind that to judge by.
+    Of two that hold the smaller goes; where none does, half of the largest that does.  `fitted`
+    and `held` are input and output of noise, to fit and right behind that to judge by.
     """
     asked = [d for d in (found.samples, found.scan) if d is not None]
     tried = sorted({*asked, *(d for d in DELAYS if d < max(asked))})

@@ -87,11 +87,8 @@ def errors_of(
     """
     Return the free-run error of every segment, split into what was fitted and what was not.
 
-    Parameters
-    ----------
-    predictions : sequence of Prediction
-    masks : sequence of (fitted, selection)
-        For each run, the samples that were fitted and those that only chose between models.
+    The masks are for each run the samples that were fitted and those that only chose between
+    models.
     """
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
     rows = []
@@ -159,10 +156,7 @@ def validation_errors(model: StageModel, records: Sequence[Record]) -> list[Erro
     """
     Return the free-run errors of records that were given for validation.
 
-    Raises
-    ------
-    IdentificationError
-        When a record has no piece at the sampling rate of the model.
+    A record without a piece at the sampling rate of the model raises IdentificationError.
     """
     rows: list[ErrorRow] = []
     for record in records:

@@ -163,14 +163,9 @@ def _spread(
 @dataclass(frozen=True, eq=False)
 class FastMotion:
     """
-    What G is found from: pieces of w = H[v] and of the displacement.
+    What G is found from: pieces of w = H[v] and of the displacement, sampled at a rate [Hz].
 
-    Attributes
-    ----------
-    whole, fitted, held : list of Excerpt
-        Pieces with all samples that count, with those fitted, and with those that judge.
-    rate : float
-        [Hz]
+    They are there with all samples that count, with those fitted, and with those that judge.
     """
 
     whole: list[Excerpt]

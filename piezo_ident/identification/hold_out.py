@@ -44,16 +44,8 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
     """
     Return the runs that are fitted, the widest first, and which samples of each.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-    settings : Settings
-        With `hold_out` given it is always the end that is held out.
-
-    Raises
-    ------
-    IdentificationError
-        When what is left to fit or to judge by of the widest is too short.
+    With `hold_out` set it is always the end that is held out.  IdentificationError when what is
+    left of the widest to fit or to judge by is too short.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
     chosen: list[Run] = []
@@ -88,18 +80,7 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
 
 
 def held_out_place(u: NDArray[np.float64], rate: float, n_held: int) -> int:
-    """
-    Return where a stretch to be held out begins.
-
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-        Normalised voltage.
-    rate : float
-        [Hz]
-    n_held : int
-        Length of the stretch [samples].
-    """
+    """Return where a stretch of `n_held` samples of a normalised voltage u is best held out."""
     n = u.size
     above = [rms_above(u, rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]
     bands = [np.maximum(b - h, 0.0) for b, h in itertools.pairwise([*above, np.zeros(n)])]

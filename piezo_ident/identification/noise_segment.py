@@ -30,10 +30,7 @@ def noise_segment(run: Run, signal: NDArray[np.float64], start: int, stop: int) 
     """
     Return the noise between two samples, its input replaced by a signal.
 
-    Raises
-    ------
-    IdentificationError
-        When nothing moves in it.
+    Noise in which nothing moves raises IdentificationError.
     """
     rate = run.piece.sample_rate
     if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
@@ -56,10 +53,7 @@ def longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
     """
     Return the longest unbroken noise: its run, first sample and the one behind the last.
 
-    Raises
-    ------
-    IdentificationError
-        When it is too short.
+    Where it is too short it raises IdentificationError.
     """
     found = [
         (stop - start, run, start, stop)

@@ -200,12 +200,8 @@ def prepare(records: Sequence[Record]) -> Prepared:
     """
     Make records ready for the steps.
 
-    Raises
-    ------
-    IdentificationError
-        When they carry no response of a stage to a voltage.
-    DataError
-        When one holds no displacement.
+    Records that carry no response of a stage to a voltage raise IdentificationError, one without
+    displacement DataError.
     """
     if not records:
         raise IdentificationError('no record was given')
@@ -256,10 +252,7 @@ def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
     """
     Return the sampling rate that carries the most voltage travel, and what is left out.
 
-    Raises
-    ------
-    IdentificationError
-        When the voltage never moves.
+    A voltage that never moves raises IdentificationError.
     """
     travel: dict[float, float] = {}
     time: dict[float, float] = {}
@@ -287,10 +280,7 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
     """
     Return the normalisation: voltage range and stroke to 1, the sign of the gain in Y.
 
-    Raises
-    ------
-    IdentificationError
-        When voltage or displacement never move.
+    Where voltage or displacement never move it raises IdentificationError.
     """
     low = min(float(p.v.min()) for p in pieces)
     high = max(float(p.v.max()) for p in pieces)

@@ -30,17 +30,12 @@ STRAIGHT, BENT = 5e-4, 15.0
 
 def refuse_undriven(records: Sequence[Record]) -> None:
     """
-    Refuse records whose displacement is no answer to the voltage.
+    Refuse records whose displacement is no answer to the voltage, with an IdentificationError.
 
     Somewhere the spectra of voltage and displacement have to be coherent, by more than chance
     (1e-7): for Gaussian noise ``1 - c`` raised to ``L - 1`` is the chance of a coherence c over L
     segments, whatever the displacement does.  A line is taken out of each segment.  Kept, it
     counts where the voltage moves by far more than its own noise: two drifts agree by chance.
-
-    Raises
-    ------
-    IdentificationError
-        When no piece shows it.
     """
     pieces = [piece for record in records for piece in record]
     if any(piece.n < MIN_COHERENCE and np.ptp(piece.v) > 0.0 for piece in pieces):
@@ -94,10 +89,6 @@ def refuse_closed_loop(record: Record) -> None:
     Two signs are known: the drive moves while the position is held, and the position follows a
     straight line more closely than the drive.  A stage under voltage control does neither: it
     creeps, and its hysteresis bends the displacement, not the voltage.
-
-    Raises
-    ------
-    IdentificationError
     """
     span, stroke = float(np.ptp(record.voltage_range)), record.stroke
     if span == 0.0 or stroke == 0.0:
@@ -164,18 +155,9 @@ def _bend(x: NDArray[np.float64]) -> float:
 
 def drive_creep(piece: Piece, start: int, stop: int) -> float | None:
     """
-    Return by how much the drive moves a decade of time while the position is held [V].
+    Return by how much the drive moves a decade of time in a hold of the position [V].
 
-    Parameters
-    ----------
-    piece : Piece
-    start, stop : int
-        The hold.
-
-    Returns
-    -------
-    float or None
-        None where a straight line in time describes the drive as well: that is drift.
+    None where a straight line in time describes the drive as well: that is drift.
     """
     t, v = piece.t[start:stop] - piece.t[start] + 1.0 / piece.sample_rate, piece.v[start:stop]
     left, slope = {}, {}

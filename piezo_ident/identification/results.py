@@ -203,14 +203,7 @@ class DynamicsResult:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """
-    What single steps have found so far.
-
-    Attributes
-    ----------
-    delay : DelayResult or None
-    dynamics : tuple of (DynamicsResult, Dynamics) or None
-    """
+    """What single steps have found so far."""
 
     delay: DelayResult | None = None
     dynamics: tuple[DynamicsResult, Dynamics] | None = None
@@ -311,11 +304,7 @@ def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
     """
     Return the error over some rows together, weighted by samples; NaN without rows.
 
-    Parameters
-    ----------
-    rows : sequence of ErrorRow
-    static : bool, optional
-        Of the hysteresis alone instead of the whole model.
+    `static`: of the hysteresis alone instead of the whole model.
     """
     n = sum(row.n for row in rows)
     squares = sum(row.n * (row.static_percent if static else row.percent) ** 2 for row in rows)

@@ -212,16 +212,8 @@ def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
     """
     Return the runs with the memory at their start, found on what is fitted of their triangles.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-    lag : float, optional
-        As for `fit_starts`.
-
-    Returns
-    -------
-    list of Run
-        Those that do not start at the lowest voltage are known all over then.
+    Those that do not start at the lowest voltage are known all over then; `lag` as for
+    `fit_starts`.
     """
     excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
     driven = [i for i, e in enumerate(excerpts) if e.use.any()]

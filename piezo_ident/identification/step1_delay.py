@@ -102,16 +102,8 @@ def step_responses(
     """
     Return the step responses [m/V], one a row, and the height of each step [V].
 
-    Parameters
-    ----------
-    pieces : sequence of Piece
-    before, after : int, optional
-        Samples ahead of and behind each step.
-
-    Returns
-    -------
-    responses : ndarray, shape (repeats, before + after)
-    heights : ndarray, shape (repeats,)
+    They reach from `before` samples ahead of each step to `after` behind it: shapes (repeats,
+    before + after) and (repeats,).
     """
     rows, heights = [], []
     for piece in pieces:

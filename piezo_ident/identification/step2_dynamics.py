@@ -79,12 +79,8 @@ class ArxFactor:
         """
         Solve one order by least squares.
 
-        Returns
-        -------
-        theta : ndarray, shape (na + nb,)
-            a_1 .. a_na, b_1 .. b_nb.
-        loss : float
-            Mean square of the one-step prediction error.
+        Return a_1 .. a_na, b_1 .. b_nb in one row, and the mean square of the one-step prediction
+        error.
         """
         (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
         x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
@@ -106,10 +102,8 @@ class ArxFactor:
         """
         Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
 
-        Returns
-        -------
-        list of (theta, loss)
-            As from `fit`, which is asked where the data do not tell the columns apart.
+        The results are those of `fit`, which is asked where the data do not tell the columns
+        apart.
         """
         A, scale = self._columns(na, nb_max, d)
         both = np.column_stack([A / scale, self.R[:, -1]])
@@ -133,17 +127,8 @@ def arx_factor(
     """
     Reduce input and output to the triangular factor of their lags.
 
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-        Input and output without their means.
-    na_max, n_lags : int
-        Lags 1..na_max of y and 0..n_lags-1 of u.
-
-    Raises
-    ------
-    IdentificationError
-        When there are fewer samples than lags.
+    u and y, shape (n,), are without their means; the lags are 1 .. na_max of y and 0 .. n_lags - 1
+    of u.  Fewer samples than lags raise IdentificationError.
     """
     first = max(na_max, n_lags - 1)
     n = y.size - first
@@ -248,16 +233,8 @@ def scan_orders(
     """
     Fit all orders up to (na_max, nb_max), and judge each by free run on held-out data.
 
-    Parameters
-    ----------
-    factor : ArxFactor
-    d : int
-        Delay [samples].
-    nb_max : int
-    u_held, y_held : ndarray, shape (n,)
-        Data that were not fitted.
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
+    The data were not fitted; d is the delay [samples].  `tick` is called with the share of the
+    work done, and may raise to stop it.
     """
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)

@@ -111,18 +111,10 @@ def choose_thresholds(
     Refine the thresholds until the held-out error stops falling.
 
     The grid grows; at each size the plays that least squares left without weight are dropped and
-    neighbours merged, and the merged set is kept where it does no worse.
-
-    Parameters
-    ----------
-    fit, held : sequence of Excerpt
-        The same runs in the same order with the fitted and the held-out samples.
-    swing : float
-        Excited range of the normalised voltage.
-    dynamics, delay
-        As in `factorise`.
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
+    neighbours merged, and the merged set is kept where it does no worse.  `fit` and `held` are the
+    same runs in the same order with the fitted and the held-out samples, `swing` is the excited
+    range of the normalised voltage.  `tick` is called with the share of the work done, and may
+    raise to stop it.
     """
     best = even_thresholds(swing, COUNTS[0])
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)
@@ -158,16 +150,7 @@ def with_small(
     Return thresholds with smaller ones, each half of the next, where small motion needs them.
 
     A triangle over the whole range hardly tells how a small loop opens; steps and noise move in
-    such loops.
-
-    Parameters
-    ----------
-    thresholds : ndarray, shape (m,)
-    fit : sequence of Excerpt
-    small : sequence of Excerpt
-        Small motion, which judges.
-    dynamics, delay
-        As in `factorise`.
+    such loops.  The excerpts `small` of such motion judge what is fitted to `fit`.
     """
     finer = np.concatenate([thresholds[0] / 2.0 ** np.arange(SMALL, 0, -1), thresholds])
 
@@ -218,16 +201,9 @@ def choose_law(
     """
     Choose the law of H by parts of the data that are predicted from all others.
 
-    Parameters
-    ----------
-    excerpts : sequence of Excerpt
-    dynamics, delay
-        As in `piezo_ident.identification.step3_hysteresis.factorise`.
-    tick : callable, optional
-        Called with the share of the work done; may raise to stop it.
-    others : sequence of Excerpt, optional
-        Small motion, on which a wider law must not err more than plays, and one with lags must err
-        less: what creeps follows a triangle of one speed as if it lagged along the path.
+    `others` is small motion, on which a wider law must not err more than plays, and one with lags
+    must err less: what creeps follows a triangle of one speed as if it lagged along the path.
+    `tick` is called with the share of the work done, and may raise to stop it.
     """
     low = min(float(e.u[e.use].min()) for e in excerpts)
     high = max(float(e.u[e.use].max()) for e in excerpts)
@@ -341,16 +317,9 @@ def third_step(
     """
     Find H: law and thresholds by held-out error unless their number is given, then the weights.
 
-    Parameters
-    ----------
-    fit, held : sequence of Excerpt
-        The same runs in the same order with the fitted and the held-out samples.
-    whole : sequence of Excerpt, optional
-        What the weights are fitted to in the end; `fit` when absent.
-    plays : bool, optional
-        Whether H has to be a sum of plays.
-    others : sequence of Excerpt, optional
-        Small motion, which can speak against a wider law.
+    `fit` and `held` are the same runs in the same order with the fitted and the held-out samples;
+    `whole` is what the weights are fitted to in the end, `fit` when absent.  `plays` says that H
+    has to be a sum of plays; `others` is small motion, which can speak against a wider law.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit

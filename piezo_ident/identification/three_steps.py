@@ -97,12 +97,8 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     """
     Find the delay from the steps, or else from the scan of the ARX loss over the noise.
 
-    Where both differ, or one is missing, a free run over the noise decides.
-
-    Raises
-    ------
-    IdentificationError
-        When neither tells it.
+    Where both differ, or one is missing, a free run over the noise decides.  Where neither tells
+    the delay, it raises IdentificationError.
     """
     progress('delay', 0.0)
     if settings.delay is not None:
@@ -245,12 +241,8 @@ def second_step(
     """
     Find G, with the hysteresis undone; the dynamics returned are stable, with G(1) = 1.
 
-    Where `lean`, G goes without the pairs of `slow_part.without_pairs`.
-
-    Raises
-    ------
-    IdentificationError
-        When no order gives a stable model.
+    Where `lean`, G goes without the pairs of `slow_part.without_pairs`.  Where no order gives a
+    stable model, it raises IdentificationError.
     """
     d = delay.samples
     run, start, stop = longest_noise(runs)

@@ -41,13 +41,7 @@ def warnings_of(
     """
     Return where the steps contradict each other, or the data do not carry what was fitted.
 
-    Parameters
-    ----------
-    result : Identification
-    records : sequence of Record
-        What was fitted.
-    pieces : sequence of Piece
-        Those of them that have the sampling rate of the model.
+    `records` were fitted; `pieces` are those of them that have the sampling rate of the model.
     """
     warnings = [*_of_fit(result), *_of_band(result.dynamics, result.model)]
     wrong = misspelt([label for record in records for label in record.labels])

@@ -23,18 +23,7 @@ __all__ = ['ResidualAnalysis', 'analyse']
 
 @dataclass(frozen=True, eq=False)
 class ResidualAnalysis:
-    """
-    What the residual of a model shows.
-
-    Attributes
-    ----------
-    parts : tuple of ResidualPart
-        As they were given.
-    floor : NoiseFloor
-    lines : tuple of Line
-    curves : tuple of Curve
-    coherence : Coherence or None
-    """
+    """What the residual of a model shows; the parts are as they were given."""
 
     parts: tuple[ResidualPart, ...]
     floor: NoiseFloor
@@ -48,12 +37,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     Look at the residual of a model from every side.
 
     Faults of the data come first: missed readings and outliers are bridged, clipped ones left out
-    before anything else is read from the residual.
-
-    Raises
-    ------
-    DataError
-        When there is no sound sample.
+    before anything else is read from the residual.  DataError when there is no sound sample.
     """
     if not any(part.mask.any() for part in parts):
         raise DataError('there is no sound sample whose residual could be looked at')

@@ -46,13 +46,8 @@ class ChannelTest:
     """
     Whether a further channel explains what the drive leaves of a residual.
 
-    Attributes
-    ----------
-    channel : str
-    significant : bool
-        A channel without a bearing on the residual is so in one of 100,000 cases.
-    added : tuple of ndarray or None
-        What it adds to the residual of each part [m]; empty when it was not tested.
+    A channel without a bearing on the residual is `significant` in one of 100,000 cases; `added`
+    is what it adds to the residual of each part [m], empty when it was not tested.
     """
 
     channel: str
@@ -64,15 +59,9 @@ def drive_functions(v: Array, rate: float) -> Array:
     """
     Return functions of a drive that a hysteresis, a lag or a creep may be made of, shape (n, k).
 
-    The drive, its square and cube, and plays of it, each with its first and second difference
-    and behind low-passes.  No sum of plays is a real hysteresis: the pairs with the square let
-    its loops lean.
-
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-    rate : float
-        [Hz]
+    The drive v, shape (n,), its square and cube, and plays of it, each with its first and second
+    difference and behind low-passes.  No sum of plays is a real hysteresis: the pairs with the
+    square let its loops lean.
     """
     span = float(np.ptp(v))
     u = (v - v.min()) / span if span > 0.0 else np.zeros(v.size)

@@ -202,14 +202,8 @@ class Spectrum:
     """
     Windowed transform of a series on a grid of frequencies, seen from a time common to all.
 
-    Attributes
-    ----------
-    series : Series
-    values : ndarray of complex, shape (p,)
-    noise : ndarray, shape (p,)
-        Mean square of the transform around each frequency without a line.
-    worth : ndarray, shape (p,)
-        Averages that the noise is worth.
+    `noise` is the mean square of the transform around each frequency without a line, and `worth`
+    the averages that it is worth; all have shape (p,).
     """
 
     series: Series

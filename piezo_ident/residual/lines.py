@@ -50,18 +50,10 @@ HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
 @dataclass(frozen=True)
 class Line:
     """
-    One narrow line.
+    One narrow line [Hz], and its largest amplitude over the records [m].
 
-    Attributes
-    ----------
-    frequency : float
-        [Hz]
-    amplitude : float
-        Largest over the records [m].
-    harmonics : tuple of (int, Line)
-        Order of each harmonic found with it, and the harmonic.
-    records : tuple of (str, float, float)
-        Record, amplitude [m] and phase [rad] of the sine at the record's time zero.
+    The harmonics come with their orders; `records` are (record, amplitude [m], phase [rad] of the
+    sine at time zero of the record).
     """
 
     frequency: float
@@ -72,16 +64,7 @@ class Line:
 
 @dataclass(frozen=True)
 class LineSearch:
-    """
-    The lines found.
-
-    Attributes
-    ----------
-    lines : tuple of Line
-        By falling amplitude.
-    searched : bool
-        Whether a stretch was long enough.
-    """
+    """The lines found, by falling amplitude, and whether a stretch was long enough."""
 
     lines: tuple[Line, ...] = ()
     searched: bool = False

@@ -84,12 +84,7 @@ def ways(
     """
     Return the rms of residuals by the way since the last turn; nothing where none is found.
 
-    Parameters
-    ----------
-    pieces : sequence of (v, sound, sample_rate)
-        Voltage [V], samples that count, and rate [Hz] of each piece.
-    residuals : sequence of sequence of ndarray
-        For each piece, one or more residuals.
+    Each piece is (voltage [V], samples that count, rate [Hz]), and has one or more residuals.
     """
     span = max((float(np.ptp(v)) for v, _, _ in pieces), default=0.0)
     if span == 0.0:

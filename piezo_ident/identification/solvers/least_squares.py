@@ -21,14 +21,7 @@ ROWS = 1024
 
 @contextmanager
 def singular_is_ours() -> Iterator[None]:
-    """
-    Turn a singular fit into an error that says what the data lack.
-
-    Raises
-    ------
-    IdentificationError
-        In place of `numpy.linalg.LinAlgError`.
-    """
+    """Turn numpy's error for a singular fit into one that says what the data lack."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -40,18 +33,9 @@ def singular_is_ours() -> Iterator[None]:
 
 def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDArray[np.float64]:
     """
-    Return R of the QR factorisation of all rows, in constant memory.
+    Return R of the QR factorisation of all rows, in constant memory; shape (width, width).
 
-    Parameters
-    ----------
-    blocks : iterable of ndarray, shape (rows, width)
-    width : int
-        Number of columns.
-
-    Returns
-    -------
-    ndarray, shape (width, width)
-        Upper triangular; ``R'R`` is the Gram matrix of the columns.
+    The blocks have shape (rows, width); ``R'R`` is the Gram matrix of the columns.
     """
     R = np.zeros((width, width))
     for block in blocks:

@@ -35,15 +35,7 @@ SLOW = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class OutputErrorFit:
-    """
-    Result of the refinement.
-
-    Attributes
-    ----------
-    dynamics : Dynamics
-    covariance : ndarray, shape (na + nb, na + nb)
-        Of (a, b), for white output noise.
-    """
+    """Result of the refinement; the covariance is that of (a, b), for white output noise."""
 
     dynamics: Dynamics
     covariance: NDArray[np.float64]

@@ -44,15 +44,9 @@ WORK = 1e7
 @dataclass(frozen=True, eq=False)
 class Quadratic:
     """
-    The objective ``x' P x - 2 g' x + c``.
+    The objective ``x' P x - 2 g' x + c``; P and g have shapes (n, n) and (n,).
 
     With P = A'A, g = A'y and c = y'y it is ``|A x - y|^2`` without the samples.
-
-    Parameters
-    ----------
-    P : array_like, shape (n, n)
-    g : array_like, shape (n,)
-    c : float
     """
 
     P: NDArray[np.float64]
