@@ -129,13 +129,7 @@ def _similar(key: str, known: Iterable[str]) -> str | None:
 
 
 def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name: str) -> None:
-    """
-    Refuse unknown keys, and suggest the known ones that they resemble.
-
-    Raises
-    ------
-    ModelError
-    """
+    """Refuse unknown keys with a ModelError, and suggest the known ones that they resemble."""
     unknown = _unknown(data, known)
     if not unknown:
         return
@@ -147,19 +141,9 @@ def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name
 
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     """
-    Build a model from plain data.
+    Build a model from the contents of a model file, whose name serves messages.
 
-    Parameters
-    ----------
-    data : mapping
-        Contents of a model file.
-    name : str, optional
-        File, for messages.
-
-    Raises
-    ------
-    ModelError
-        When the schema is later than this package knows, or a part is missing or wrong.
+    ModelError when the schema is later than this package knows, or a part is missing or wrong.
     """
     if 'several_axes' in data:
         raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')

@@ -291,13 +291,8 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
     """
     Return the predicted displacement [m] of pieces that follow each other over short gaps.
 
-    Parameters
-    ----------
-    model : StageModel
-    pieces : sequence of Piece
-        From `piezo_ident.record.gaps.connected_pieces`.
-    start : Start, array_like or None
-        Of the first, as of `StageModel.simulate`.
+    They are those of `piezo_ident.record.gaps.connected_pieces`; the start is that of the first
+    one, as of `StageModel.simulate`.
     """
     stream = model.stream(start)
     predicted = [stream.follow(pieces[0])]
@@ -335,15 +330,10 @@ def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) 
 @dataclass(frozen=True, eq=False)
 class PieceRun:
     """
-    The free run of a model on one piece.
+    The free run of a model on one piece of a record.
 
-    Attributes
-    ----------
-    record : str
-        Name of the record.
-    piece : Piece
-    y_hat, y_static : ndarray, shape (n,)
-        Displacement from the whole model, and from its hysteresis alone [m].
+    y_hat and y_static, shape (n,), are the displacement from the whole model, and from its
+    hysteresis alone [m].
     """
 
     record: str
@@ -360,17 +350,8 @@ def piece_runs(
     """
     Run a model over all pieces that have its sampling rate.
 
-    Parameters
-    ----------
-    model : StageModel
-    records : iterable of Record, or Record
-    memories : mapping, optional
-        Play outputs at the start of a piece, by the record's name and the piece's start time.
-
-    Returns
-    -------
-    list of PieceRun
-        Unknown memories are estimated as in `free_run`.
+    `memories` are the play outputs at the start of a piece, by the name of the record and the
+    start time of the piece; unknown ones are estimated as in `free_run`.
     """
     static = model.without_dynamics()
     known = memories or {}

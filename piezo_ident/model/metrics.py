@@ -63,19 +63,10 @@ def percent(rms: float, stroke: float) -> float:
 
 def percent_of_stroke(y: Vector, y_hat: Vector, stroke: float | None = None) -> float:
     """
-    Return ``100 rms(y - y_hat) / (max y - min y)``.
+    Return ``100 rms(y - y_hat) / (max y - min y)``, shapes (n,).
 
-    Parameters
-    ----------
-    y, y_hat : ndarray, shape (n,)
-        Measured and simulated displacement, same unit.
-    stroke : float, optional
-        Replaces ``max y - min y``, where a part of a record is judged by the whole.
-
-    Returns
-    -------
-    float
-        Infinite when the stroke is zero and the error is not.
+    A `stroke` replaces ``max y - min y``, where a part of a record is judged by the whole.
+    Infinite when the stroke is zero and the error is not.
     """
     span = strokes([('', y)])[''] if stroke is None else stroke
     return percent(float(np.sqrt(np.mean((y - y_hat) ** 2))), span)
@@ -83,15 +74,10 @@ def percent_of_stroke(y: Vector, y_hat: Vector, stroke: float | None = None) -> 
 
 def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
     """
-    Return ``max y - min y`` of each record over all its parts.
+    Return ``max y - min y`` of each record over all its parts, which come as (record, y).
 
-    Single wild samples do not count; see `piezo_ident.common.arrays.robust_range`.  Between two
-    records a sensor may be set to zero anew, so their strokes are no common one.
-
-    Parameters
-    ----------
-    parts : iterable of (str, ndarray)
-        Name of a record, and displacement of a part of it; empty ones do not count.
+    Single wild samples and empty parts do not count; see `piezo_ident.common.arrays.robust_range`.
+    Between two records a sensor may be set to another zero, so their strokes are no common one.
     """
     of: dict[str, list[Vector]] = {}
     for record, y in parts:
@@ -107,15 +93,9 @@ def runs_against(
     """
     Return whether measured and predicted displacement move in opposite directions.
 
-    Parameters
-    ----------
-    parts : iterable of (ndarray, ndarray)
-        Measured and predicted displacement of each piece; each may have a zero of its own.
-    span : float
-        Displacement of the model over its range, same unit; a record that moves by little says
-        nothing.
-    below : float
-        Correlation from which they do.
+    The pieces (y, y_hat) may have a zero of their own each.  A record that moves by little of
+    `span`, the displacement of the model over its range, says nothing; `below` is the correlation
+    from which they do.
     """
     yy = pp = yp = reach = 0.0
     for y, y_hat in parts:
@@ -129,14 +109,7 @@ def runs_against(
 
 
 def doubts(parts: Sequence[tuple[Vector, Vector]], span: float) -> Iterator[str]:
-    """
-    Yield why a measured displacement may not be that of the stage.
-
-    Parameters
-    ----------
-    parts, span
-        As of `runs_against`.
-    """
+    """Yield why measured displacement may not be the stage's; arguments as of `runs_against`."""
     if runs_against(parts, span):
         yield REVERSED
     squares = np.array([(y.size * np.var(y), y.size * np.var(y_hat)) for y, y_hat in parts])
@@ -159,14 +132,7 @@ def nrmse_fit(error: float, spread: float) -> float:
 
 
 def fit_percent(y: Vector, y_hat: Vector) -> float:
-    """
-    Return the NRMSE fit ``100 (1 - |y - y_hat| / |y - mean y|)``, as MATLAB's ``compare`` does.
-
-    Parameters
-    ----------
-    y, y_hat : ndarray, shape (n,)
-        Measured and simulated displacement, same unit.
-    """
+    """Return the NRMSE fit ``100 (1 - |y - y_hat| / |y - mean y|)`` of MATLAB's ``compare``."""
     return nrmse_fit(float(np.linalg.norm(y - y_hat)), float(np.linalg.norm(y - y.mean())))
 
 

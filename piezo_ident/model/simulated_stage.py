@@ -43,22 +43,11 @@ _SENSOR = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
 @dataclass(frozen=True)
 class Converter:
     """
-    A converter between numbers and a physical quantity.
+    A converter between numbers and a physical quantity, with a range in the unit of the quantity.
 
     Its codes are ``low + k (high - low) / 2^bits``, k = 0 .. 2^bits - 1, so that zero is a code of
-    every symmetric range and `high` itself lies one step above the last.
-
-    Parameters
-    ----------
-    bits : int
-        Resolution.
-    low, high : float
-        Range, in the unit of the quantity.
-
-    Raises
-    ------
-    ConfigError
-        When the resolution is not within 1 .. 32 bits, or the range is empty.
+    every symmetric range and `high` itself lies one step above the last.  ConfigError when the
+    resolution is not within 1 .. 32 bits, or the range is empty.
     """
 
     bits: int
@@ -91,16 +80,9 @@ class Converter:
 @dataclass(frozen=True)
 class Sensor:
     """
-    The converters and the sensor between computer and stage.
+    The white noise of the sensor [m, rms], and the converters between computer and stage.
 
-    Attributes
-    ----------
-    noise_rms : float
-        White noise of the displacement sensor [m].
-    dac : Converter or None
-        In front of the amplifier [V]; ideal when None.
-    adc : Converter or None
-        Behind the sensor [m]; ideal when None.
+    The DAC is in front of the amplifier [V], the ADC behind the sensor [m]; None is an ideal one.
     """
 
     noise_rms: float = 0.0
@@ -238,12 +220,8 @@ class StageRun:
     """
     One run of a simulated stage, block by block, in volts and metres.
 
-    The stage is at rest under the first command.
-
-    Attributes
-    ----------
-    clipped_input, clipped_output : int
-        Samples so far that left the range of the DAC and of the ADC.
+    The stage is at rest under the first command.  `clipped_input` and `clipped_output` are the
+    samples so far that left the range of the DAC and of the ADC.
     """
 
     def __init__(self, stage: SimulatedStage, rng: np.random.Generator) -> None:
@@ -265,16 +243,10 @@ class StageRun:
         channels: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> NDArray[np.float64]:
         """
-        Return the sensor's readings [m] for the next samples of command [V].
+        Return the sensor's readings [m] for the next samples of command [V], shape (n,).
 
-        Parameters
-        ----------
-        v : array_like, shape (n,)
-            Command [V].
-        t : array_like, shape (n,), optional
-            Time [s]; counted from the first sample when absent.
-        channels : mapping of str to ndarray, optional
-            Further signals that effects of the model depend on.
+        The time [s] is counted from the first sample when absent; `channels` are further signals
+        that effects of the model depend on.
         """
         sensor = self.stage.sensor
         command = np.asarray(v, dtype=np.float64)
@@ -297,12 +269,8 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
     """
     Build a simulated stage from plain data; see `SimulatedStage.load`.
 
-    Parameters
-    ----------
-    data : mapping
-        A model's keys, and ``sensor`` and ``seed``.  A plain model file is an ideal stage.
-    name : str, optional
-        What to call it in messages.
+    The data are those of a model, and ``sensor`` and ``seed``: a plain model file is an ideal
+    stage.
     """
     sensor = data.get('sensor') or {}
     if not isinstance(sensor, Mapping):

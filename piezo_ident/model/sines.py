@@ -65,10 +65,6 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
 
     The first second and at least one period of each segment do not count; a segment that is then
     shorter than a period is left out.
-
-    Parameters
-    ----------
-    runs : sequence of PieceRun
     """
     rows = []
     for run in runs:
@@ -96,18 +92,9 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
 
 def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
     """
-    Return the steady-state error of every sine segment of a record, as `sines_of` does.
+    Return what `sines_of` does of a record whose segments tell their frequency, as ``sine:50Hz``.
 
-    Parameters
-    ----------
-    model : StageModel
-    record : Record
-        With segments labelled by their frequency, as ``sine:50Hz``.
-
-    Raises
-    ------
-    ModelError
-        When a piece with sines has another sampling rate than the model.
+    A piece with sines that has another sampling rate than the model raises ModelError.
     """
     for piece in record:
         if piece.find('sine'):

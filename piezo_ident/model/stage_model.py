@@ -44,10 +44,7 @@ class EffectSetting:
     """
     An effect in a model: its name and parameters.
 
-    Raises
-    ------
-    ModelError
-        When the name is unknown or a parameter is not as the effect declares.
+    ModelError when the name is unknown or a parameter is not as the effect declares.
     """
 
     name: str

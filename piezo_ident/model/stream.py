@@ -110,10 +110,7 @@ class Stream:
         """
         Bring amplifier and plays into their state after a past voltage; the rest is at rest.
 
-        Parameters
-        ----------
-        v, t : ndarray, shape (n,)
-            Voltage [V] and time [s]; the stage was at rest before the first sample.
+        Voltage [V] and time [s] have shape (n,); the stage was at rest before the first sample.
         """
         self.reset(float(v[0]))
         if self._cascade is not None:
@@ -136,15 +133,10 @@ class Stream:
         channels: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> NDArray[np.float64]:
         """
-        Return the displacement [m] for the next samples of voltage [V].
+        Return the displacement [m] for the next samples of voltage [V], shape (n,).
 
-        Parameters
-        ----------
-        v : array_like, shape (n,)
-        t : array_like, shape (n,), optional
-            Time [s]; counted from the first sample when absent.
-        channels : mapping of str to ndarray, optional
-            Further measured signals.
+        The time [s] is counted from the first sample when absent; `channels` are further measured
+        signals.
         """
         x = np.asarray(v, dtype=np.float64)
         if x.size == 0:

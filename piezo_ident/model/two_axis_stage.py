@@ -159,10 +159,7 @@ class TwoAxisRun:
     """
     One run of a stage of two axes, block by block; how it is cut changes no bit.
 
-    Attributes
-    ----------
-    clipped_input, clipped_output : int
-        Always 0: there are no converters.
+    There are no converters: `clipped_input` and `clipped_output` are always 0.
     """
 
     def __init__(self, stage: TwoAxisStage, rng: np.random.Generator) -> None:
@@ -181,11 +178,6 @@ class TwoAxisRun:
         Return the readings [m], shape (n, 2), for the next commands [V], shape (n, 2).
 
         A reading is taken before the command of its own sample acts.
-
-        Raises
-        ------
-        DataError
-            When the commands have another shape.
         """
         u = np.ascontiguousarray(v, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != 2:
@@ -271,13 +263,7 @@ def load_stage(name_or_path: str | os.PathLike[str]) -> SimulatedStage | TwoAxis
 
 
 def two_axis_stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> TwoAxisStage:
-    """
-    Build a stage from plain data; see ``config/stage_two_axes.yaml``.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Build a stage from plain data, or raise ConfigError; see ``config/stage_two_axes.yaml``."""
     try:
         return _stage(data, name)
     except ModelError as error:

@@ -59,17 +59,9 @@ class Operator(Protocol):
 
     def reset(self, v0: float, x0: float) -> float:
         """
-        Come to rest under a constant command.
+        Come to rest under a constant command v0 and incoming signal x0, both normalised.
 
-        Parameters
-        ----------
-        v0, x0 : float
-            Command and incoming signal at rest, normalised.
-
-        Returns
-        -------
-        float
-            The outgoing signal at rest.
+        Return the outgoing signal at rest.
         """
         ...
 

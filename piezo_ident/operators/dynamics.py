@@ -35,14 +35,9 @@ MAX_MEMORY = 2**40
 @dataclass(frozen=True)
 class Mode:
     """
-    An oscillating pair of poles in continuous time.
+    An oscillating pair of poles in continuous time, with standard deviations of its numbers.
 
-    Attributes
-    ----------
-    frequency, frequency_std : float
-        Natural frequency and its standard deviation [Hz].
-    damping, damping_std : float
-        Damping ratio and its standard deviation.
+    The natural frequency is in Hz; the damping is a ratio.
     """
 
     frequency: float
@@ -54,19 +49,10 @@ class Mode:
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """
-    The rational part of G.
+    The rational part of G: ``A(z) = 1 + a_1 z^-1 + ...`` and ``B(z) = b_1 + b_2 z^-1 + ...``.
 
-    Parameters
-    ----------
-    a : array_like, shape (na,)
-        Coefficients a_1 .. a_na of ``A(z) = 1 + a_1 z^-1 + ...``.
-    b : array_like, shape (nb,)
-        Coefficients b_1 .. b_nb of ``B(z) = b_1 + b_2 z^-1 + ...``.
-
-    Raises
-    ------
-    ModelError
-        When a coefficient is not finite, or b is empty.
+    a and b, shapes (na,) and (nb,), are a_1 .. a_na and b_1 .. b_nb.  ModelError when a
+    coefficient is not finite, or b is empty.
     """
 
     a: NDArray[np.float64]
@@ -130,14 +116,7 @@ class Dynamics:
         return min(MAX_MEMORY, self.b.size + int(np.log(share) / np.log(radius)))
 
     def normalised(self) -> Dynamics:
-        """
-        Return the same dynamics with G(1) = 1.
-
-        Raises
-        ------
-        ModelError
-            When the static gain is zero or not finite.
-        """
+        """Return the same dynamics with G(1) = 1; ModelError for a gain of zero or infinity."""
         gain = self.gain
         if not np.isfinite(gain) or gain == 0.0:
             raise ModelError(f'dynamics: static gain {gain} cannot be scaled to one')
@@ -145,17 +124,9 @@ class Dynamics:
 
     def without_slow_poles(self, slowest: float, sample_rate: float) -> Dynamics:
         """
-        Return the dynamics without real poles below a frequency and their nearest zeros.
+        Return the dynamics without real poles below a frequency [Hz] and their nearest zeros.
 
-        Parameters
-        ----------
-        slowest, sample_rate : float
-            [Hz]
-
-        Returns
-        -------
-        Dynamics
-            With the same gain at ten times that frequency; unchanged without such poles.
+        They have the same gain at ten times that frequency, and are unchanged without such poles.
         """
         radius = np.exp(-2.0 * np.pi * slowest / sample_rate)
         poles, zeros = self.poles, np.roots(self.b)
@@ -176,20 +147,7 @@ class Dynamics:
         return Dynamics(a=faster.a, b=faster.b * float(gain[0] * sign[0]))
 
     def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
-        """
-        Return the frequency response.
-
-        Parameters
-        ----------
-        frequency : array_like, shape (n,)
-            Frequencies [Hz].
-        sample_rate : float
-            [Hz]
-
-        Returns
-        -------
-        ndarray of complex, shape (n,)
-        """
+        """Return the complex frequency response at frequencies [Hz], shape (n,)."""
         z = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) / sample_rate)
         numerator = np.polyval(self.b[::-1], z)
         denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
@@ -201,13 +159,8 @@ class Dynamics:
         """
         Return each oscillating pair of poles as a mode, by frequency.
 
-        Parameters
-        ----------
-        sample_rate : float
-            [Hz]
-        covariance : ndarray, optional
-            Of (a, b).  To first order, a change of a_i moves a pole p by ``-p^(na-i) / A'(p)``;
-            without a covariance the standard deviations are NaN.
+        With a covariance of (a, b) the modes have standard deviations, else NaN: to first order, a
+        change of a_i moves a pole p by ``-p^(na-i) / A'(p)``.
         """
         na = self.a.size
         block = np.full((na, na), math.nan)
@@ -234,19 +187,9 @@ def filter_arx(
     at_rest: bool = True,
 ) -> NDArray[np.float64]:
     """
-    Return B(z)/A(z) x.
+    Return B(z)/A(z) x, shape (n,); a and b as in `Dynamics`.
 
-    Parameters
-    ----------
-    a, b : ndarray
-        As in `Dynamics`.
-    x : ndarray, shape (n,)
-    at_rest : bool, optional
-        Start in equilibrium with the first sample (default) instead of from zero.
-
-    Returns
-    -------
-    ndarray, shape (n,)
+    `at_rest`: start in equilibrium with the first sample instead of from zero.
     """
     past_w, past_y = b.size - 1, a.size
     w, y = np.empty(past_w + x.size), np.empty(past_y + x.size)
@@ -282,12 +225,8 @@ class DynamicsOperator:
     """
     G as an operator.
 
-    Attributes
-    ----------
-    b, a : ndarray, shape (nb,) and (na,)
-        Coefficients from the oldest sample to the newest.
-    change : str
-        As of `piezo_ident.effects.effect.Effect`.
+    b and a, shapes (nb,) and (na,), are the coefficients from the oldest sample to the newest;
+    `change` is as of `piezo_ident.effects.effect.Effect`.
     """
 
     change = 'filtered'
@@ -327,19 +266,9 @@ class DynamicsOperator:
 @dataclass(frozen=True)
 class Delay:
     """
-    The pure delay.
+    The pure delay: whole samples d >= 0, and 0 <= fraction < 1 of one by linear interpolation.
 
-    Parameters
-    ----------
-    samples : int
-        Whole samples d >= 0.
-    fraction : float, optional
-        Further part of a sample, 0 <= fraction < 1, by linear interpolation.
-
-    Raises
-    ------
-    ModelError
-        When out of range.
+    What is out of range raises ModelError.
     """
 
     samples: int

@@ -194,16 +194,7 @@ class Hysteresis:
         return rows[0], rows[1], self.p1, self.p2, self.p0, self.span[0], rows[2:]
 
     def rise(self, outputs: ArrayLike, v: float = 0.0) -> NDArray[np.float64]:
-        """
-        Return dw/dF_i of each play at its output, under a voltage; shape (m,).
-
-        Parameters
-        ----------
-        outputs : array_like, shape (m,)
-            F_i, normalised.
-        v : float, optional
-            Matters to a bias alone.
-        """
+        """Return dw/dF_i of each play at its output, shapes (m,); v matters to a bias alone."""
         if not self._is_curved:
             return self.weights
         c1, c2, c3, bias, width = self._wide
@@ -265,18 +256,10 @@ class Hysteresis:
 
     def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> NDArray[np.float64]:
         """
-        Return w for an input v.
+        Return w for a normalised input v, shapes (n,).
 
-        Parameters
-        ----------
-        v : array_like, shape (n,)
-            Normalised input.
-        memory : array_like, shape (m,) or (m + k,), optional
-            Play outputs before the first sample, and the lags along the path behind them.
-
-        Returns
-        -------
-        ndarray, shape (n,)
+        The memory, shape (m,) or (m + k,), holds the play outputs before the first sample, and the
+        lags along the path behind them.
         """
         x = np.asarray(v, dtype=np.float64)
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)

@@ -149,13 +149,7 @@ class HysteresisLaw:
             yield width * np.interp(r, nodes, np.eye(NODES)[j])
 
     def hysteresis(self, coefficients: ArrayLike) -> Hysteresis:
-        """
-        Return the H of coefficients; those below their bound by rounding are set on it.
-
-        Parameters
-        ----------
-        coefficients : array_like, shape (size,)
-        """
+        """Return the H of coefficients, shape (size,); those below their bound are set on it."""
         theta = np.maximum(np.asarray(coefficients, dtype=np.float64), self.lower)
         return self._of(theta @ self._parameters, self.thresholds)
 
@@ -216,21 +210,11 @@ class HysteresisLaw:
         places: Sequence[int] | None = None,
     ) -> Iterator[NDArray[np.float64]]:
         """
-        Give what H adds for each coefficient, one after the other.
+        Give what H adds for each coefficient under a normalised v; shapes (n,).
 
-        Parameters
-        ----------
-        v : ndarray, shape (n,)
-            Normalised input.
-        memory : array_like, shape (m,), optional
-            Play outputs before the first sample; those of a stage that last came down to zero
-            when absent.
-        places : sequence of int, optional
-            Of the coefficients that are wanted; all when absent.
-
-        Yields
-        ------
-        ndarray, shape (n,)
+        The memory, shape (m,), holds the play outputs before the first sample, those of a stage
+        that last came down to zero when absent; `places` are the coefficients that are wanted, all
+        when absent.
         """
         start = None if memory is None else np.asarray(memory, dtype=np.float64)
         places = range(self.size) if places is None else places
@@ -258,10 +242,7 @@ class HysteresisLaw:
         """
         Return the coefficients of an H of this family, shape (size,).
 
-        Raises
-        ------
-        ModelError
-            When it has other thresholds, or is none of this family.
+        ModelError when it has other thresholds, or is none of this family.
         """
         h, m = hysteresis, self.thresholds.size
         if not np.array_equal(h.thresholds, self.thresholds):

@@ -198,14 +198,9 @@ def dynamics(
     """
     Continue y by eqs. (4) and (5), without the delay.
 
-    Parameters
-    ----------
-    w : ndarray, shape (nb - 1 + n,)
-        Input, the earlier samples first.
-    b, a : ndarray, shape (nb,) and (na,)
-        Coefficients from the oldest sample to the newest: b_nb .. b_1 and a_na .. a_1.
-    y : ndarray, shape (na + n,)
-        Earlier outputs, and room for the new ones.
+    w, shape (nb - 1 + n,), begins with the earlier samples, and y, shape (na + n,), with the
+    earlier outputs.  The coefficients b_nb .. b_1 and a_na .. a_1 go from the oldest sample to the
+    newest.
     """
     nb, na = b.size, a.size
     for start in range(0, y.size - na, STRETCH):

@@ -23,18 +23,8 @@ def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
     """
     Return the play outputs of a stage that last came down to zero and then went to `v0`.
 
-    That is the state ``F_r = 0`` at ``v = 0`` of the paper, moved to `v0` in one stroke.
-
-    Parameters
-    ----------
-    v0 : float
-        Normalised input.
-    thresholds : array_like, shape (m,)
-        Play thresholds r, normalised.
-
-    Returns
-    -------
-    ndarray, shape (m,)
+    That is the state ``F_r = 0`` at ``v = 0`` of the paper, moved to `v0` in one stroke.  Voltage
+    and thresholds, shape (m,), are normalised.
     """
     r = np.asarray(thresholds, dtype=np.float64)
     return np.maximum(v0 - r, np.minimum(v0, np.zeros_like(r)))

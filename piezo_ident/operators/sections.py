@@ -54,17 +54,8 @@ def sections_of(
     """
     Return G as sections, or nothing where eq. (5) serves.
 
-    Parameters
-    ----------
-    a, b : ndarray, shape (na,) and (nb,)
-        Of `piezo_ident.operators.dynamics.Dynamics`.
-    gain : float
-        The static gain, which the sections keep to the last digit.
-
-    Returns
-    -------
-    ndarray, shape (n, 5), or None
-        b_0, b_1, b_2, a_1 and a_2 of each.
+    The sections, shape (n, 5), are b_0, b_1, b_2, a_1 and a_2 of each; they keep the static gain
+    to the last digit.
     """
     begins = abs(b[0]) > NOTHING * np.abs(b).max()
     if not begins or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:

@@ -50,16 +50,9 @@ class Dimension(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Samples:
     """
-    A block of samples of one quantity.
+    A block of samples of one quantity: time [s] and values [SI], shapes (n,).
 
-    Attributes
-    ----------
-    t, values : ndarray, shape (n,)
-        Time [s] and value [SI].
-    segment : str
-        Label of the segment; empty for none.
-    quantity : str
-        What the values are.
+    The label of the segment is empty for none.
     """
 
     t: NDArray[np.float64]

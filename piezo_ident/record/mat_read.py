@@ -41,13 +41,8 @@ def read_variables(
 
     `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
     arrays of str.  Where the file lacks one of those `needed`, or they are None, all numbers in it
-    are returned, those in structs too (see `flat`), and the names are theirs.
-
-    Raises
-    ------
-    ValueError
-        When the file is damaged or too large, or a wanted variable is no array of numbers or
-        texts.
+    are returned, those in structs too (see `flat`), and the names are theirs.  ValueError when the
+    file is damaged or too large, or a wanted variable is no array of numbers or texts.
     """
     asked = '*' if needed is None else ','.join(needed)
     with tempfile.TemporaryDirectory(prefix='piezo_ident_mat_') as folder:

@@ -192,13 +192,10 @@ def parse_columns(text: str) -> dict[str, str]:
     """
     Return which column carries what; a part with a comma in it stands in double quotes.
 
+    DataError when a part is no pair, or a quantity comes twice.
+
     >>> parse_columns('t=time_s, v=U [V],"y=x, filtered"')
     {'t': 'time_s', 'v': 'U [V]', 'y': 'x, filtered'}
-
-    Raises
-    ------
-    DataError
-        When a part is no pair, or a quantity comes twice.
     """
     columns: dict[str, str] = {}
     for part in next(csv.reader([text], skipinitialspace=True), []):

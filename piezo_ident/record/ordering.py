@@ -54,12 +54,7 @@ def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRo
     """
     Drop repeated rows of finite numbers, and return the rows at which the clock restarts, with 0.
 
-    What is met is added to `met`.
-
-    Raises
-    ------
-    DataError
-        When time is unsorted, or one time has two different samples.
+    What is met is added to `met`.  DataError when time is unsorted, or has two samples at once.
     """
     n = table.t.size
     # first what stands right behind its twin, so that the loop below only sees real jumps

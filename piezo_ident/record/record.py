@@ -162,10 +162,7 @@ class Piece:
         """
         Return samples ``start`` to ``stop - 1`` as a piece of its own, segments included.
 
-        Raises
-        ------
-        DataError
-            When the range is empty or leaves the piece.
+        DataError when the range is empty or leaves the piece.
         """
         if not 0 <= start < stop <= self.n:
             raise DataError(f'cannot cut samples {start}..{stop} out of a piece of {self.n}')
@@ -347,14 +344,7 @@ class Record(Showable):
 
 
 def records_of(records: Record | Iterable[Record], where: str) -> list[Record]:
-    """
-    Return one record, or several, as a list.
-
-    Raises
-    ------
-    DataError
-        When something else is given.
-    """
+    """Return one record, or several, as a list; DataError when something else is given."""
     single = isinstance(records, (Record, str)) or not isinstance(records, Iterable)
     several: list[Any] = [records] if single else list(records)
     for record in several:

@@ -63,11 +63,7 @@ def without_scatter(t: Vector, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
     """
     Return where to cut increasing stamps [s] when steps that scatter are no breaks.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    cuts : ndarray of int
-        First samples behind breaks, as steps between neighbours tell them.
+    `cuts` are the first samples behind breaks, as steps between neighbours tell them.
     """
     if not cuts.size:
         return cuts

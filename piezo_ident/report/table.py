@@ -37,14 +37,7 @@ class Table:
     """
     A table of text cells.
 
-    Attributes
-    ----------
-    title : str
-    head : tuple of str
-        Not shown when all of it is empty.
-    rows : sequence of tuple of str
-    note : str
-        Stands below on a page: units and formulas.
+    A `head` of empty cells is not shown; the `note` stands below on a page: units and formulas.
     """
 
     title: str

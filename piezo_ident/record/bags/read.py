@@ -62,11 +62,8 @@ def opened_bag(path: str | Path) -> Iterator[Bag]:
     """
     Open a rosbag2 folder, or a single .mcap or .db3 file, as far as it was finished.
 
-    Raises
-    ------
-    DataError
-        When it is no bag, or damaged beyond what a killed recorder leaves; its messages raise
-        it too, for damage that shows itself later.
+    DataError when it is no bag, or damaged beyond what a killed recorder leaves; its messages
+    raise it too, for damage that shows itself later.
     """
     path = Path(path)
     try:
@@ -173,14 +170,7 @@ def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, in
 
 
 def carried_quantities(bag: Bag) -> dict[str, str]:
-    """
-    Return what each topic carries, as its first message says.
-
-    Raises
-    ------
-    DataError
-        When no topic carries samples.
-    """
+    """Return what each topic carries, by its first message; DataError when none has samples."""
     carried = {}
     for connection in bag.connections:
         if connection.msgtype != MESSAGE_TYPE or connection.topic in carried:

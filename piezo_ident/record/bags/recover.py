@@ -113,14 +113,7 @@ def metadata(folder: Path) -> dict[str, Any]:
 
 
 def is_unfinished(path: Path) -> bool:
-    """
-    Return whether a bag lacks what closing it writes.
-
-    Raises
-    ------
-    DataError
-        For a folder without a bag in it.
-    """
+    """Return whether a bag lacks what closing it writes; DataError for a folder without a bag."""
     files = _storage_files(path)
     if path.is_dir() and not (path / 'metadata.yaml').is_file():
         return True
@@ -189,14 +182,7 @@ class _Part(NamedTuple):
 
 
 def recovered_bag(path: Path, stack: ExitStack) -> Bag:
-    """
-    Open an unfinished bag; `stack` closes it.
-
-    Raises
-    ------
-    DataError
-        When there is no whole message in it.
-    """
+    """Open an unfinished bag, which `stack` closes; DataError when no whole message is in it."""
     parts = []
     for file in _storage_files(path):
         part = _mcap_part(file) if file.suffix == '.mcap' else _sqlite_part(file, stack)

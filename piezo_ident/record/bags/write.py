@@ -183,10 +183,7 @@ class BagWriter:
         """
         Add a topic by its full name, once, with what its publishers offer.
 
-        Raises
-        ------
-        DataError
-            When the type is none of Jazzy's, or the bag cannot be written any more.
+        DataError when the type is none of Jazzy's, or the bag cannot be written any more.
         """
         if not knows_type(message_type):
             raise DataError(f'{topic}: type {message_type} is not known here; leave the topic out')
@@ -204,10 +201,7 @@ class BagWriter:
         """
         Write a serialised message under its log time [ns] on a topic that was added.
 
-        Raises
-        ------
-        DataError
-            When the bag cannot be written any more.
+        DataError when the bag cannot be written any more.
         """
         with self._disk_errors():
             self._writer.write(self._connections[topic], stamp, raw)
@@ -217,12 +211,8 @@ class BagWriter:
         """
         Hand all that was written to the system, so that no end of this process loses it.
 
-        The next part is begun when it is time.
-
-        Raises
-        ------
-        DataError
-            When the bag cannot be written any more, or the next one not be made.
+        The next part is begun when it is time.  DataError when that cannot be made, or the bag
+        cannot be written any more.
         """
         with self._disk_errors():
             self._hand_over()
@@ -237,10 +227,7 @@ class BagWriter:
         """
         Finish the bag: index and metadata.yaml.
 
-        Raises
-        ------
-        DataError
-            When that cannot be written; what was written before can be recovered.
+        DataError when that cannot be written; what was written before can be recovered.
         """
         try:
             with self._disk_errors():

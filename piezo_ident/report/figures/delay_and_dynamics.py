@@ -39,12 +39,7 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Fi
     """
     Draw the averaged step response with the delay, and the scan of the ARX loss.
 
-    `runs` hold the response of the model to the same steps.
-
-    Raises
-    ------
-    NothingToDraw
-        Without steps and without scan.
+    `runs` hold the response of the model to the same steps.  NothingToDraw without steps and scan.
     """
     result = identification.delay
     step = result.step if result.step is not None and result.step.repeats else None
@@ -141,10 +136,7 @@ def response_figure(identification: Identification) -> Figure:
     """
     Draw the frequency response, measured and modelled.
 
-    Raises
-    ------
-    NothingToDraw
-        When G = 1 and no response was measured.
+    NothingToDraw when G = 1 and no response was measured.
     """
     model, dynamics = identification.model, identification.dynamics
     measured = dynamics.response
@@ -239,10 +231,7 @@ def orders_figure(identification: Identification) -> Figure:
     """
     Draw the held-out error of every order, with the chosen one and what the criteria prefer.
 
-    Raises
-    ------
-    NothingToDraw
-        When no table of orders was made, or it is a single line.
+    NothingToDraw when no table of orders was made, or it is a single line.
     """
     table = identification.dynamics.table
     if table is None:

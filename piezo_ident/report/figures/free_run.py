@@ -37,11 +37,7 @@ def loops_figure(runs: Sequence[PieceRun]) -> Figure:
     Draw displacement over voltage, measured and modelled, with the error below.
 
     The triangle that covers the widest range is drawn, or the whole piece without one.
-
-    Raises
-    ------
-    NothingToDraw
-        When the voltage does not move.
+    NothingToDraw when the voltage does not move.
     """
     run, s = _widest_loop(runs)
     part = slice(s.start, s.stop)
@@ -169,14 +165,9 @@ def _name_segments(axes: Axes, run: PieceRun) -> None:
 
 def segments_figure(runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], str]) -> Figure:
     """
-    Draw a readable stretch of every segment with its error below.
+    Draw a readable stretch of every segment with its error below; NothingToDraw without any.
 
     `errors` holds a text on the error of each (record, segment label).
-
-    Raises
-    ------
-    NothingToDraw
-        Without labelled segments.
     """
     cells = [
         (run, s)
@@ -236,14 +227,7 @@ def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, remark: s
 
 
 def sines_figure(errors: Sequence[SineError]) -> Figure:
-    """
-    Draw the steady-state error over the frequency of the sines.
-
-    Raises
-    ------
-    NothingToDraw
-        Without sine errors.
-    """
+    """Draw the steady-state error over the frequency of the sines; NothingToDraw without any."""
     if not errors:
         raise NothingToDraw(
             'no segment is labelled sine:<f>Hz and lasts a period longer than its first second '

@@ -64,10 +64,7 @@ def residual_figure(residual: Residual) -> Figure:
     """
     Draw the residual of a piece before and after, on one scale, its segments shaded.
 
-    Raises
-    ------
-    NothingToDraw
-        When no sample counts.
+    NothingToDraw when no sample counts.
     """
     if not residual.sound.any():
         raise NothingToDraw(f'{residual.record}: no sample counts')
@@ -162,10 +159,7 @@ def residual_spectrum_figure(
     """
     Draw the amplitude density of the longest residual, the noise floor, and the lines in it.
 
-    Raises
-    ------
-    NothingToDraw
-        When no stretch is long enough for a spectrum.
+    NothingToDraw when no stretch is long enough for a spectrum.
     """
     i = max(range(len(before.parts)), key=lambda i: before.parts[i].piece.n)
     shown = before.parts[i]
@@ -217,10 +211,7 @@ def residual_dependence_figure(
     """
     Draw the mean residual over voltage, speed, and the time since the last step.
 
-    Raises
-    ------
-    NothingToDraw
-        When no curve has points.
+    NothingToDraw when no curve has points.
     """
     names = [name for name in AXES if _curves(before, name)]
     if not names:
@@ -302,14 +293,7 @@ def _signed_log(axes: Axes, curves: Sequence[Curve]) -> None:
 def residual_coherence_figure(
     before: ResidualAnalysis, after: ResidualAnalysis | None = None
 ) -> Figure:
-    """
-    Draw the coherence of voltage and residual.
-
-    Raises
-    ------
-    NothingToDraw
-        When there is too little data.
-    """
+    """Draw the coherence of voltage and residual; NothingToDraw when there is too little data."""
     first = before.coherence
     if first is None:
         raise NothingToDraw('too few samples for a coherence')
