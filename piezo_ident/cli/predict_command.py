@@ -10,11 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
@@ -75,10 +74,10 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     console.result({**data, **data_of(record), **files})
 
 
-def _write_prediction(record: Record, pieces: Sequence[NDArray[np.float64]], path: Path) -> None:
+def _write_prediction(record: Record, pieces: Sequence[Array], path: Path) -> None:
     blocks = blocks_of(record, y_hat=pieces)
 
-    def columns() -> Iterator[dict[str, NDArray[np.float64]]]:
+    def columns() -> Iterator[dict[str, Array]]:
         for block in blocks():
             yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Arrays that cannot be changed, and the range of numbers that single wild ones do not widen."""
+"""Types of arrays, arrays that cannot be changed, and a range that wild numbers do not widen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ['frozen_array', 'robust_range']
+__all__ = ['Array', 'Integers', 'Mask', 'frozen_array', 'robust_range']
+
+#: real numbers, which ones count, and places
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 #: numbers taken together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
@@ -19,7 +24,7 @@ _CHUNK = 1 << 20
 _LONE, _STEPS = 0.25, 4.0
 
 
-def frozen_array(values: ArrayLike) -> NDArray[np.float64]:
+def frozen_array(values: ArrayLike) -> Array:
     """Return `values` as a read-only float64 vector, copied only when it must be."""
     array = np.asarray(values, dtype=np.float64)
     if array.flags.writeable:
@@ -29,7 +34,7 @@ def frozen_array(values: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def robust_range(parts: Iterable[NDArray[np.float64]]) -> tuple[float, float]:
+def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
     Return the smallest and largest of measured numbers, but for wild ones.
 
@@ -75,9 +80,7 @@ def robust_range(parts: Iterable[NDArray[np.float64]]) -> tuple[float, float]:
     return smallest, largest
 
 
-def _chunks(
-    parts: Sequence[NDArray[np.float64]], overlap: int = 0
-) -> Iterator[NDArray[np.float64]]:
+def _chunks(parts: Sequence[Array], overlap: int = 0) -> Iterator[Array]:
     for x in parts:
         for i in range(0, x.size, _CHUNK):
             yield x[i : i + _CHUNK + overlap]

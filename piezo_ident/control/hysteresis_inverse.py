@@ -17,15 +17,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, curve_slope, held
 
 __all__ = ['HysteresisInverse']
-
-Array = NDArray[np.float64]
 
 #: largest difference of H from what is wanted at a root, normalised
 TOLERANCE = 1e-13
@@ -40,13 +39,7 @@ NARROW = 0.02
 
 
 @kernel
-def _plays(
-    u: float,
-    band: Array,
-    q: Array,
-    memory: Array,
-    after: Array,
-) -> tuple[float, float]:
+def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tuple[float, float]:
     """
     Return what the plays of H add at u, and its slope; `after` takes their outputs.
 
@@ -63,13 +56,7 @@ def _plays(
 
 @kernel
 def _wide_plays(
-    u: float,
-    band: Array,
-    q: Array,
-    low: float,
-    c: Array,
-    memory: Array,
-    after: Array,
+    u: float, band: Array, q: Array, low: float, c: Array, memory: Array, after: Array
 ) -> tuple[float, float]:
     """Do as `_plays`, with curves and bias; in one loop, which is a third faster than two."""
     w, slope = 0.0, 0.0

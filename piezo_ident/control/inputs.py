@@ -9,13 +9,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['checked_limits', 'checked_motion', 'padded']
-
-Array = NDArray[np.float64]
 
 
 def checked_motion(wanted: ArrayLike) -> Array:

@@ -20,7 +20,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
@@ -37,8 +38,6 @@ from scipy.optimize import brentq
 from scipy.signal import butter, sosfiltfilt
 
 __all__ = ['Inverse', 'invert']
-
-Array = NDArray[np.float64]
 
 #: passes of the iteration, at most
 PASSES = 30
@@ -112,7 +111,7 @@ class Inverse(Showable):
     wanted: Array
     predicted: Array
     lead: int
-    clipped: NDArray[np.bool_]
+    clipped: Mask
     passes: int
     error: float
     expected: float | None

@@ -23,7 +23,8 @@ from functools import partial
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
@@ -31,8 +32,6 @@ from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['Learning', 'Repetition']
-
-Array = NDArray[np.float64]
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95

@@ -25,6 +25,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
@@ -45,8 +46,6 @@ __all__ = [
     'lowest_mode',
     'smoothed',
 ]
-
-Array = NDArray[np.float64]
 
 #: gain of G, as a share of the static one, below which it is not made up for: of a model that is
 #: exact, and of one from data, which knows little of what hardly moves

@@ -20,7 +20,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.inputs import checked_limits
@@ -36,8 +37,6 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['PREVIEW', 'Driven', 'LiveInverse']
-
-Array = NDArray[np.float64]
 
 #: samples that a wanted motion is known ahead
 PREVIEW = 400
@@ -66,7 +65,7 @@ class Driven(NamedTuple):
     """
 
     v: Array
-    clipped: NDArray[np.bool_]
+    clipped: Mask
 
 
 class LiveInverse:
@@ -319,9 +318,7 @@ class _Pass:
         self._d = np.append(past, s.x(y) if self._is_first else np.zeros(v.size))[v.size :]
         return y
 
-    def process(
-        self, x: Array, d: Array, w: Array
-    ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    def process(self, x: Array, d: Array, w: Array) -> tuple[Array, Array, Array, Array, Mask]:
         """
         Return what the next pass works on, of as many samples as are known far enough ahead.
 

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.control.rate_tangent import tangent
@@ -30,8 +30,6 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 __all__ = ['RateInverse']
-
-Array = NDArray[np.float64]
 
 #: times that the speed is taken anew, and the corner of its smoothing in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.operators.kernels import curve_slope
 from scipy.sparse.linalg import LinearOperator
 
 __all__ = ['tangent']
-
-Array = NDArray[np.float64]
 
 
 def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOperator:

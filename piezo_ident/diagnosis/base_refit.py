@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds
@@ -49,7 +49,7 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
     return _refit(simulator, given, 'plays'), _refit(simulator, given, LAWS[-1])
 
 
-def base_thresholds(swing: float) -> NDArray[np.float64]:
+def base_thresholds(swing: float) -> Array:
     """Return nineteen even thresholds over the swing, and four fine ones near zero."""
     fine = np.array([0.005, 0.012, 0.025, 0.037])
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])

@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.diagnosis.row_filter import group_of, RowFilter, serves
 from piezo_ident.operators.chain import Block, Operator
@@ -24,8 +24,6 @@ from piezo_ident.operators.dynamics import DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
 __all__ = ['Behind']
-
-Array = NDArray[np.float64]
 
 #: samples that pass all links while they are in the cache, about
 STRETCH = 1 << 14

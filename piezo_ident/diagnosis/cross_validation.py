@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import HARM, HARM_OF_REFIT, OF_SHAPE, STANDARD_ERRORS
 from piezo_ident.diagnosis.rows import centred, Rows
@@ -38,8 +38,6 @@ __all__ = [
     'with_columns',
 ]
 
-Array = NDArray[np.float64]
-
 #: share of a column's own energy that is added to the diagonal: keeps collinear columns small
 RIDGE = 1e-9
 
@@ -56,7 +54,7 @@ class NormalEquations:
     b: Array
     s: Array
 
-    def only(self, chosen: NDArray[np.bool_]) -> NormalEquations:
+    def only(self, chosen: Mask) -> NormalEquations:
         """Return those of some columns; shape (p,)."""
         return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
 
@@ -73,7 +71,7 @@ class Pull:
     b: Array
     s: float
 
-    def only(self, chosen: NDArray[np.bool_]) -> Pull:
+    def only(self, chosen: Mask) -> Pull:
         """Return those of some columns; shape (p,)."""
         return Pull(self.A[np.ix_(chosen, chosen)], self.b[chosen], self.s)
 
@@ -141,10 +139,7 @@ def summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]
 
 
 def held_out_errors(
-    equations: NormalEquations,
-    sets: NDArray[np.int64],
-    prior: Array,
-    pull: Pull | None = None,
+    equations: NormalEquations, sets: Integers, prior: Array, pull: Pull | None = None
 ) -> Array:
     """
     Return the squares of every block, each predicted from other sets; shape (blocks, k).
@@ -164,12 +159,7 @@ def held_out_errors(
 
 
 def held_out_residual(
-    rows: Rows,
-    M: Array,
-    e: Array,
-    prior: Array,
-    sets: NDArray[np.int64],
-    pull: Pull | None = None,
+    rows: Rows, M: Array, e: Array, prior: Array, sets: Integers, pull: Pull | None = None
 ) -> Array:
     """
     Return the residual of every row, predicted with parameters fitted to other blocks.

@@ -14,15 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import centred, Rows
 from scipy.optimize import lsq_linear
 
 __all__ = ['WORSE', 'BaseColumns', 'FitStep', 'Scale', 'next_damping']
-
-Array = NDArray[np.float64]
 
 #: factor of the damping after a step that failed; its square after the next one, and so on
 WORSE = 3.0
@@ -87,12 +85,7 @@ class FitStep:
     """Normal equations of a step, scaled to columns of length one."""
 
     def __init__(
-        self,
-        base: BaseColumns,
-        moving: Array,
-        e: Array,
-        prior: Array,
-        pull: Pull | None = None,
+        self, base: BaseColumns, moving: Array, e: Array, prior: Array, pull: Pull | None = None
     ) -> None:
         # one pass over the many columns
         known = base.columns.T @ np.concatenate([moving.T, e[None]]).T

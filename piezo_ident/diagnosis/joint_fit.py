@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.criteria import EARLIER_COST, WEIGHT_SPREAD, WIDE_SPREAD
 from piezo_ident.diagnosis.cross_validation import (
@@ -40,7 +40,6 @@ __all__ = [
     'fit_jointly',
 ]
 
-Array = NDArray[np.float64]
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
 #: first damping, a share of the energy of each column, and the least
@@ -81,7 +80,7 @@ class Fitted:
     base: BaseColumns
     e: Array
     moving: Array
-    free: NDArray[np.bool_]
+    free: Mask
     parameters: tuple[FreeParameter, ...]
     prior: Array
     errors: Array
@@ -114,7 +113,7 @@ class Fitted:
         """
         return max(self.mean_square, float(self.e @ self.e / self.e.size))
 
-    def held_out_residual(self, rows: Rows, sets: NDArray[np.int64] | None = None) -> Array:
+    def held_out_residual(self, rows: Rows, sets: Integers | None = None) -> Array:
         """
         Return the residual of every row, fitted to other blocks; shape (n,), normalised.
 
@@ -348,11 +347,7 @@ def _only_adds(state: State, parameter: FreeParameter) -> bool:
 
 
 def _moved(
-    state: State,
-    parameters: tuple[FreeParameter, ...],
-    step: Array,
-    lower: Array,
-    factor: float,
+    state: State, parameters: tuple[FreeParameter, ...], step: Array, lower: Array, factor: float
 ) -> State:
     """Return the state after a step, that of H divided by a factor, but for steps to a bound."""
     m, k = state.coefficients.size, state.only_adds.size

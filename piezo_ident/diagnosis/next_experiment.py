@@ -18,7 +18,7 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.effects import find_effect
 from piezo_ident.model.sines import sine_frequency
@@ -135,7 +135,7 @@ def _has_rest(records: Sequence[Record], span: float) -> bool:
     return any(t >= REST - SLACK for t, _ in _rests(records))
 
 
-def _segments(records: Sequence[Record]) -> Iterator[tuple[str, NDArray[np.float64], float]]:
+def _segments(records: Sequence[Record]) -> Iterator[tuple[str, Array, float]]:
     """Yield label, voltage and sampling rate of every segment; a piece without any is one."""
     for record in records:
         for piece in record:
@@ -145,7 +145,7 @@ def _segments(records: Sequence[Record]) -> Iterator[tuple[str, NDArray[np.float
                 yield '', piece.v, piece.sample_rate
 
 
-def _speed(v: NDArray[np.float64], rate: float) -> float:
+def _speed(v: Array, rate: float) -> float:
     """Return the highest speed [V/s], over 1 ms so that converter steps count less."""
     m = max(1, min(v.size - 1, round(1e-3 * rate)))
     return float(np.abs(v[m:] - v[:-m]).max(initial=0.0)) * rate / m

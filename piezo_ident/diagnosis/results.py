@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
@@ -195,10 +194,10 @@ class Residual:
 
     record: str
     piece: Piece
-    given: NDArray[np.float64]
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    sound: NDArray[np.bool_]
+    given: Array
+    before: Array
+    after: Array
+    sound: Mask
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.operators.dynamics import Dynamics
 
 __all__ = ['BEYOND', 'RETUNING', 'retuned', 'retuning_factor', 'retuning_terms']
@@ -52,7 +52,7 @@ def retuning_factor(
     return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
 
 
-def retuning_terms(sample_rate: float, band: float) -> NDArray[np.float64]:
+def retuning_terms(sample_rate: float, band: float) -> Array:
     """Return what the factor holds of each coefficient: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
     p = _limit(sample_rate, band)
     q, qq = 1.0 - p, (1.0 - p) ** 2
@@ -65,7 +65,7 @@ def _limit(sample_rate: float, band: float) -> float:
     return float(np.exp(-2.0 * np.pi * band / sample_rate))
 
 
-def _poles(sample_rate: float) -> list[NDArray[np.float64]]:
+def _poles(sample_rate: float) -> list[Array]:
     """Return ``1 - p_j z^-1`` of each relaxation."""
     return [np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS]
 

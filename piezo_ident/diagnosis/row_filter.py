@@ -16,14 +16,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.sections import rounding_of
 
 __all__ = ['RowFilter', 'group_of', 'serves']
-
-Array = NDArray[np.float64]
 
 #: samples in a row and in a run from which it is quicker than G itself
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000

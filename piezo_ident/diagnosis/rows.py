@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
@@ -31,10 +31,6 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means, without_spikes
 
 __all__ = ['Rows', 'centred', 'make_rows', 'means']
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
@@ -241,9 +237,7 @@ def means(x: Array, of_record: Integers) -> Array:
 
 
 def make_rows(
-    model: StageModel,
-    records: Sequence[Record],
-    bad: Sequence[Mask | None] | None = None,
+    model: StageModel, records: Sequence[Record], bad: Sequence[Mask | None] | None = None
 ) -> Rows:
     """
     Cut records into rows and blocks, by the scaling and sampling rate of a model.

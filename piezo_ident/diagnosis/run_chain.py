@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.effects import Effect
 from piezo_ident.operators.chain import Block, Operator
@@ -18,8 +18,6 @@ from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 __all__ = ['RunChain', 'asked_once', 'columns_of', 'effects_around', 'place_of', 'place_of_core']
-
-Array = NDArray[np.float64]
 
 #: the largest of a derivative, as the small change that a link which bends sees
 SMALL = 1e-6

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.fit_steps import BaseColumns
@@ -34,8 +33,6 @@ from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 __all__ = ['Round', 'gains_of', 'search_round', 'stands_out', 'takes']
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +234,7 @@ def _begun(
 
 
 def _to_the_end(
-    simulator: Simulator,
-    fitted: Fitted,
-    noise: float,
-    goal: float,
-    tick: Callable[[], None],
+    simulator: Simulator, fitted: Fitted, noise: float, goal: float, tick: Callable[[], None]
 ) -> Fitted:
     """Return a fit with fresh columns of H, as long as that makes a difference that shows."""
     enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.rows import Rows
@@ -31,8 +31,6 @@ from scipy.ndimage import uniform_filter1d
 
 __all__ = ['follows_motion', 'has_place', 'shows']
 
-Array = NDArray[np.float64]
-
 #: what dynamics leave behind a motion has died away after this time at rest [s]
 SETTLED = 0.05
 #: fewest rows of a rest or a motion
@@ -41,7 +39,7 @@ FEWEST = 20
 LOCAL = 0.25
 
 #: rows, shape (k,), and columns of what may differ there, shape (k, p)
-Place = tuple[NDArray[np.int64], Array]
+Place = tuple[Integers, Array]
 
 
 def has_place(name: str) -> bool:

@@ -19,7 +19,7 @@ import os
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
@@ -47,7 +47,6 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
 __all__ = ['Simulator']
 
-Array = NDArray[np.float64]
 T = TypeVar('T')
 
 #: runs that go side by side at most

@@ -11,15 +11,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import with_number
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 __all__ = ['CREEP', 'Added', 'State']
-
-Array = NDArray[np.float64]
 
 #: effect that goes on when the motion has ended
 CREEP = 'creep'

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.criteria import ON_AMPLITUDE
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
@@ -32,8 +32,6 @@ from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
 
 __all__ = ['Scored', 'Tick', 'best_trials', 'score_trials', 'started']
-
-Array = NDArray[np.float64]
 
 #: called with the share of the work that is done; may raise `Cancelled`
 Tick = Callable[[float], None]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
@@ -17,9 +17,7 @@ __all__ = ['AmplifierLag']
 
 
 @kernel
-def _follow(
-    x: NDArray[np.float64], pole: float, state: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _follow(x: Array, pole: float, state: Array) -> Array:
     out = np.empty(x.size)
     y, share = state[0], 1.0 - pole
     for k in range(x.size):

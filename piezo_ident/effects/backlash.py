@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
@@ -18,7 +18,7 @@ __all__ = ['Backlash']
 
 
 @kernel
-def _play(x: NDArray[np.float64], width: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
+def _play(x: Array, width: float, state: Array) -> Array:
     out = np.empty(x.size)
     p = state[0]
     for k in range(x.size):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection, sections_in_c
 from piezo_ident.effects.trials import ladder
@@ -68,7 +68,7 @@ class ChangedDynamics(Effect):
     @classmethod
     def section(
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> NDArray[np.float64] | None:
+    ) -> Array | None:
         """Return a mode, which its gains scale."""
         if name not in ('gain', 'rate_gain'):
             return None

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
@@ -26,12 +26,7 @@ BACK = 0.5
 
 
 @kernel
-def _crept(
-    h: NDArray[np.float64],
-    c: NDArray[np.float64],
-    share: NDArray[np.float64],
-    state: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _crept(h: Array, c: Array, share: Array, state: Array) -> Array:
     # share: 1 - a_i; written as a difference, so that an element that has caught up rests
     out = np.empty(h.size)
     for k in range(h.size):
@@ -87,7 +82,7 @@ class Creep(Effect):
         self._share = -np.expm1(-1.0 / (self.sample_rate * times))
         self._beyond = np.zeros(self._c.size)
 
-    def start_from(self, beyond: NDArray[np.float64]) -> None:
+    def start_from(self, beyond: Array) -> None:
         """
         Set how far each element is beyond its rest when it is reset: shape (c,), empty at rest.
 
@@ -103,7 +98,7 @@ class Creep(Effect):
     @classmethod
     def section(
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> NDArray[np.float64] | None:
+    ) -> Array | None:
         """Return an element, which its share scales."""
         if name != 'gain':
             return None

@@ -12,7 +12,7 @@ import reprlib
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.trials import Trial, View
 from piezo_ident.operators.c_code import CCode
@@ -24,7 +24,7 @@ __all__ = ['NAN', 'Effect', 'Parameter', 'Trial', 'Value', 'View']
 #: neutral value of a parameter without one
 NAN = float('nan')
 
-Value = float | str | NDArray[np.float64]
+Value = float | str | Array
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ class Effect:
     @classmethod
     def section(
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> NDArray[np.float64] | None:
+    ) -> Array | None:
         """
         Return the filter of the signal that a number of a list scales and adds.
 
@@ -326,7 +326,7 @@ class Effect:
         """
         return None
 
-    def slopes(self, block: Block) -> Mapping[str, NDArray[np.float64]]:
+    def slopes(self, block: Block) -> Mapping[str, Array]:
         """
         Return the derivatives of what `process` would make of a block, by names of parameters.
 
@@ -339,7 +339,7 @@ class Effect:
         """Return a scalar parameter."""
         return float(self.values[name])
 
-    def array(self, name: str) -> NDArray[np.float64]:
+    def array(self, name: str) -> Array:
         """Return a parameter as a vector."""
         return np.atleast_1d(np.asarray(self.values[name], dtype=np.float64))
 

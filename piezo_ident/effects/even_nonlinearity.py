@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
@@ -62,7 +62,7 @@ class EvenNonlinearity(Effect):
         step = 'x += u * u * (square + u * u * (fourth + u * u * sixth));\n'
         return CCode({name: self.number(name) for name in names}, rest=step, step=step)
 
-    def _even(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _even(self, x: Array) -> Array:
         p0, p4, p6 = (self.number(name) for name in ('square', 'fourth', 'sixth'))
         square = x * x
         return square * (p0 + square * (p4 + square * p6))

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import ordered_kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
@@ -20,13 +20,7 @@ __all__ = ['GainDrift']
 
 
 @ordered_kernel
-def _with_gain(
-    x: NDArray[np.float64],
-    t: NDArray[np.float64],
-    at: NDArray[np.int64],
-    knots: NDArray[np.float64],
-    gains: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _with_gain(x: Array, t: Array, at: Integers, knots: Array, gains: Array) -> Array:
     # t ascends; at: the first sample of each knot; the gain between two is a straight line
     out = x.copy()
     for i in range(-1, knots.size):

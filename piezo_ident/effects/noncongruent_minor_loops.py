@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
@@ -22,14 +22,7 @@ __all__ = ['NoncongruentMinorLoops']
 
 
 @kernel
-def _tilted(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    bend: NDArray[np.float64],
-    bias: float,
-    memory: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _tilted(v: Array, r: Array, slope: Array, bend: Array, bias: float, memory: Array) -> Array:
     out = np.empty(v.size)
     for k in range(v.size):
         x = v[k]
@@ -145,8 +138,8 @@ class NoncongruentMinorLoops(Effect):
         numbers['bias'] = self.number('bias')
         return CCode(numbers, f'double f[{n}];\n', f'{start}{{{more}}}\n', more)
 
-    def _more(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        out: NDArray[np.float64] = _tilted(
+    def _more(self, x: Array) -> Array:
+        out: Array = _tilted(
             x, self._r, self._slope, self._bend, self.number('bias'), self._memory
         )
         return out

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, STILL
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode, Numbers
@@ -24,19 +24,19 @@ SLOW = 1e-3
 
 @kernel
 def _widened(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
+    v: Array,
+    r: Array,
+    q: Array,
     low_v: float,
-    c: NDArray[np.float64],
-    power: NDArray[np.float64],
+    c: Array,
+    power: Array,
     gain: float,
     stretch: float,
     lead: float,
     lead_stretch: float,
-    memory: NDArray[np.float64],
-    still: NDArray[np.float64],
-    out: NDArray[np.float64],
+    memory: Array,
+    still: Array,
+    out: Array,
 ) -> None:
     # memory: plays with growing thresholds; still: the same plays with fixed ones;
     # low_v and c: as in `wide_hysteresis`; loops of few arrays each run in vector lanes
@@ -65,19 +65,19 @@ def _widened(
 
 @kernel
 def _slopes(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
+    v: Array,
+    r: Array,
+    q: Array,
     low_v: float,
-    c: NDArray[np.float64],
-    power: NDArray[np.float64],
-    bends: NDArray[np.float64],
+    c: Array,
+    power: Array,
+    bends: Array,
     gain: float,
     stretch: float,
     lead: float,
     lead_stretch: float,
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
+    memory: Array,
+    out: Array,
 ) -> None:
     # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
     # bends, shape (j, n): slopes of the power; rows of out: gain, stretch, lead, lead_stretch, j
@@ -134,9 +134,7 @@ def _slopes(
 
 
 @kernel
-def _low_pass(
-    v: NDArray[np.float64], pole: float, rate: float, state: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _low_pass(v: Array, pole: float, rate: float, state: Array) -> Array:
     # state: the last input and the last speed
     speed = np.empty(v.size)
     last, s = state[0], state[1]
@@ -260,7 +258,7 @@ class RateDependentHysteresis(Effect):
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
 
-    def slopes(self, block: Block) -> dict[str, NDArray[np.float64]]:
+    def slopes(self, block: Block) -> dict[str, Array]:
         """Return the derivatives by all numbers, of one pass; see `Effect.slopes`."""
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
@@ -329,13 +327,11 @@ class RateDependentHysteresis(Effect):
         """,
         )
 
-    def power(self, v: NDArray[np.float64], v0: float) -> NDArray[np.float64]:
+    def power(self, v: Array, v0: float) -> Array:
         """Return ``|s|^eps`` under an input from rest at v0, both shapes (n,)."""
         return self._power(np.ascontiguousarray(v), np.array([v0, 0.0]))
 
-    def power_and_slope(
-        self, v: NDArray[np.float64], v0: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def power_and_slope(self, v: Array, v0: float) -> tuple[Array, Array]:
         """Return what `power` returns, and its slope with the speed s."""
         speed = _low_pass(
             np.ascontiguousarray(v), self.pole, self.sample_rate, np.array([v0, 0.0])
@@ -349,9 +345,7 @@ class RateDependentHysteresis(Effect):
         slope = exponent * near * np.sign(speed) / levelled**2
         return (np.abs(speed) / levelled) ** exponent, slope
 
-    def _bent_power(
-        self, v: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _bent_power(self, v: Array) -> tuple[Array, Array]:
         """Return `_power`, and its slopes with exponent, levelling and cutoff, shape (3, n)."""
         exponent, levelling, cutoff = map(self.number, ('exponent', 'levelling', 'cutoff'))
         near = float(np.exp(-2 * np.pi * cutoff * (1.0 + NEAR) / self.sample_rate))
@@ -370,7 +364,7 @@ class RateDependentHysteresis(Effect):
         ]
         return power, np.stack(bends)
 
-    def _power(self, v: NDArray[np.float64], state: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _power(self, v: Array, state: Array) -> Array:
         power = np.abs(_low_pass(v, self.pole, self.sample_rate, state))
         if self.number('levelling') > 0.0:
             power /= 1.0 + self.number('levelling') * power

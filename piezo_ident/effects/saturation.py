@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from math import exp, inf, log1p
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
@@ -25,7 +25,7 @@ _SMOOTH = 'z < 0.0 ? log1p(exp(z)) : z + log1p(exp(-z))'
 
 
 @kernel
-def _soften(x: NDArray[np.float64], low: float, high: float, knee: float) -> NDArray[np.float64]:
+def _soften(x: Array, low: float, high: float, knee: float) -> Array:
     out = np.empty(x.size)
     for k in range(x.size):
         v = x[k]
@@ -124,11 +124,11 @@ class Saturation(Effect):
         step = step if np.isfinite([*ends.values()]).any() else ''
         return CCode({**ends, 'knee': knee, 'knees': FAR}, rest=step, step=step)
 
-    def _limited(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _limited(self, x: Array) -> Array:
         low, high, knee = (self.number(name) for name in ('low', 'high', 'knee'))
         if low == -inf and high == inf:
             return x
         if knee == 0.0:
             return np.clip(x, low, high)
-        out: NDArray[np.float64] = _soften(np.ascontiguousarray(x), low, high, knee)
+        out: Array = _soften(np.ascontiguousarray(x), low, high, knee)
         return out

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.operators.c_code import CCode
@@ -17,9 +17,7 @@ __all__ = ['SecondOrderSection', 'sections_in_c', 'slope_of_mode']
 
 
 @kernel
-def _run(
-    x: NDArray[np.float64], c: NDArray[np.float64], state: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _run(x: Array, c: Array, state: Array) -> Array:
     # c: n0, n1, a1, a2; state: the last input and two numbers of the transposed direct form.
     # The filter works on differences of its input, so that it is at rest to the last bit.
     n0, n1, a1, a2 = c[0], c[1], c[2], c[3]
@@ -89,12 +87,12 @@ class SecondOrderSection:
         self._state = np.zeros(3)
 
     @property
-    def coefficients(self) -> NDArray[np.float64]:
+    def coefficients(self) -> Array:
         """n_0, n_1, a_1 and a_2 of the filter of differences."""
         return self._c
 
     @property
-    def section(self) -> NDArray[np.float64]:
+    def section(self) -> Array:
         """b_0, b_1, b_2, a_1 and a_2 of the filter."""
         n0, n1, a1, a2 = self._c
         return np.array([n0, n1 - n0, -n1, a1, a2])
@@ -103,9 +101,9 @@ class SecondOrderSection:
         """Come to rest under a constant input; the output is zero then."""
         self._state = np.array([x0, 0.0, 0.0])
 
-    def process(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def process(self, x: Array) -> Array:
         """Return the filtered signal, shape (n,)."""
-        out: NDArray[np.float64] = _run(np.ascontiguousarray(x), self._c, self._state)
+        out: Array = _run(np.ascontiguousarray(x), self._c, self._state)
         return out
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
@@ -62,6 +62,6 @@ class SensorNonlinearity(Effect):
         names = ('square', 'cubic', 'fourth')
         return CCode({name: self.number(name) for name in names}, rest=step, step=step)
 
-    def _read(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _read(self, x: Array) -> Array:
         c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))
         return x + x * x * (c2 + x * (c3 + x * c4))

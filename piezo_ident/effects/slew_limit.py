@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
@@ -17,7 +17,7 @@ __all__ = ['SlewLimit']
 
 
 @kernel
-def _limit(x: NDArray[np.float64], most: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
+def _limit(x: Array, most: float, state: Array) -> Array:
     out = np.empty(x.size)
     y = state[0]
     for k in range(x.size):

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 
 __all__ = ['Trial', 'View', 'ladder', 'number_of', 'with_number']
 
@@ -53,13 +53,13 @@ class View:
     sample_rate: float
     low: float
     high: float
-    speeds: NDArray[np.float64]
+    speeds: Array
     duration: float
     channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     lines: tuple[float, ...] = ()
     modes: tuple[tuple[float, float], ...] = ()
     max_frequency: float = 100.0
-    thresholds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    thresholds: Array = field(default_factory=lambda: np.empty(0))
     judged: float = np.inf
     first: float = 0.0
     is_fast: bool = True

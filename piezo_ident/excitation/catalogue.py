@@ -12,7 +12,7 @@ import reprlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as excitation
 
@@ -103,7 +103,7 @@ class Part:
     from others of its kind, and may be empty.
     """
 
-    v: NDArray[np.float64]
+    v: Array
     end: float
     name: str = ''
 
@@ -141,7 +141,7 @@ def _signal(name: str, kind: str = '', **options: Option) -> Callable[[Maker], M
     return enter
 
 
-def _periodic(v: NDArray[np.float64], name: str = '') -> list[Part]:
+def _periodic(v: Array, name: str = '') -> list[Part]:
     return [Part(v, float(v[0]), name)]
 
 

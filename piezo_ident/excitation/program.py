@@ -25,8 +25,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.arrays import Array, frozen_array
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import load_yaml, parse_yaml
@@ -54,7 +53,7 @@ class Sequence:
     The segments cover every sample, and no two neighbours share a label.
     """
 
-    v: NDArray[np.float64]
+    v: Array
     sample_rate: float
     segments: tuple[Segment, ...]
     name: str = 'program'
@@ -73,7 +72,7 @@ class Sequence:
         return self.n / self.sample_rate
 
     @property
-    def t(self) -> NDArray[np.float64]:
+    def t(self) -> Array:
         """Time of each sample [s], from zero."""
         return np.arange(self.n) / self.sample_rate
 
@@ -228,11 +227,11 @@ class Program:
 
     def _join(self, parts: Iterable[tuple[str, Part]], setting: Setting) -> Sequence:
         low, high = setting.limits
-        pieces: list[NDArray[np.float64]] = []
+        pieces: list[Array] = []
         segments: list[Segment] = []
         level, n = self.rest, 0
 
-        def append(label: str, v: NDArray[np.float64]) -> None:
+        def append(label: str, v: Array) -> None:
             nonlocal n
             if segments and segments[-1].label == label:
                 label += '-2' if ':' in label else ':2'

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence as Many
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import ConfigError
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
@@ -62,7 +62,7 @@ def _below_nyquist(frequency: float, sample_rate: float) -> None:
         )
 
 
-def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[np.float64]:
+def ramp(start: float, stop: float, slew: float, sample_rate: float) -> Array:
     """
     Return a soft way from one level to another [V]; `stop` is the sample after the last.
 
@@ -75,14 +75,14 @@ def ramp(start: float, stop: float, slew: float, sample_rate: float) -> NDArray[
     return start + (stop - start) * (tau - np.sin(2 * np.pi * tau) / (2 * np.pi))
 
 
-def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> NDArray[np.float64]:
+def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> Array:
     """Return levels [V] that are jumped to, each held for its time [s]."""
     n = [sample_count(t, sample_rate) for t in hold]
     sample_count(sum(n) / sample_rate, sample_rate)
     return np.repeat(np.asarray(levels, dtype=np.float64), n)
 
 
-def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np.float64]:
+def corners(levels: Many[float], slope: float, sample_rate: float) -> Array:
     """
     Return straight lines through levels [V], all with the same magnitude of slope [V/s].
 
@@ -97,9 +97,7 @@ def corners(levels: Many[float], slope: float, sample_rate: float) -> NDArray[np
     return np.interp(np.arange(at[-1]), at, v)
 
 
-def triangle(
-    peaks: Many[float], base: float, slope: float, sample_rate: float
-) -> NDArray[np.float64]:
+def triangle(peaks: Many[float], base: float, slope: float, sample_rate: float) -> Array:
     """
     Return triangles from a base to each of the peaks and back.
 
@@ -118,7 +116,7 @@ def triangle(
 
 def settling_sweep(
     bias: float, amplitude: float, cycles: int, frequency: float, sample_rate: float
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Return sine cycles about a bias that die out linearly after a full first one.
 
@@ -139,7 +137,7 @@ def sine(
     periods: int,
     sample_rate: float,
     phase: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Return a whole number of periods of ``bias + amplitude sin(2 pi f t + phase)``.
 
@@ -160,7 +158,7 @@ def noise(
     rng: np.random.Generator,
     crest: float = 2.5,
     fade: float = 0.01,
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Return Gaussian noise with a flat spectrum up to a cut-off and limited peaks.
 
@@ -202,11 +200,11 @@ def noise(
     edge = np.minimum(np.arange(n), n - np.arange(n)) / max(1.0, fade * sample_rate)
     x = x * (0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, edge)))
     peak = float(np.abs(x).max())
-    scaled: NDArray[np.float64] = bias + amplitude * x / max(peak, np.finfo(float).tiny)
+    scaled: Array = bias + amplitude * x / max(peak, np.finfo(float).tiny)
     return scaled
 
 
-def odd_lines(lowest: int, highest: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def odd_lines(lowest: int, highest: int, rng: np.random.Generator) -> Integers:
     """
     Return odd harmonic numbers, with one of every `GROUP` left out at random.
 
@@ -223,12 +221,12 @@ def odd_lines(lowest: int, highest: int, rng: np.random.Generator) -> NDArray[np
 def multisine(
     bias: float,
     amplitude: float,
-    lines: NDArray[np.int64],
+    lines: Integers,
     period: float,
     periods: int,
     sample_rate: float,
     rng: np.random.Generator,
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Return whole periods of a random-phase multisine with equal lines.
 

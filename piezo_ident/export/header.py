@@ -20,9 +20,8 @@ import textwrap
 from typing import Any
 
 import jinja2
-import numpy as np
-from numpy.typing import NDArray
 from piezo_ident import __version__
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, TOLERANCE, TRIALS
@@ -51,7 +50,7 @@ WIDTH = 88
 class _FeedForward:
     """What the template of the feed-forward needs."""
 
-    taps: NDArray[np.float64]
+    taps: Array
     ahead: int
     gain: str
     lowest: str

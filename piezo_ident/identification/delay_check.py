@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.identification.results import DelayResult
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
@@ -23,7 +23,7 @@ from piezo_ident.identification.step2_dynamics import (
 
 __all__ = ['upheld']
 
-Signals = tuple[NDArray[np.float64], NDArray[np.float64]]
+Signals = tuple[Array, Array]
 
 #: orders (n, n), and delays below those that are asked about [samples], that are tried
 ORDERS = (4, 8, 12)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.fast_motion import high_passed
 from piezo_ident.identification.prepare import Run, runs_of
@@ -47,9 +47,9 @@ class Prediction:
     """
 
     run: Run
-    y_hat: NDArray[np.float64]
-    y_static: NDArray[np.float64]
-    judged: NDArray[np.bool_]
+    y_hat: Array
+    y_static: Array
+    judged: Mask
 
 
 def key_of(run: Run) -> tuple[str, float]:
@@ -81,8 +81,7 @@ def predictions_of(
 
 
 def errors_of(
-    predictions: Sequence[Prediction],
-    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    predictions: Sequence[Prediction], masks: Sequence[tuple[Mask, Mask]]
 ) -> list[ErrorRow]:
     """
     Return the free-run error of every segment, split into what was fitted and what was not.

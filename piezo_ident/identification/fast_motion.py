@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step1_delay import find_jumps
 from scipy import ndimage, signal
@@ -30,9 +30,6 @@ __all__ = [
     'moving',
     'rms_above',
 ]
-
-Vector = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: below this the signals are taken away before G is fitted [Hz]
 HIGH_PASS = 30.0
@@ -55,7 +52,7 @@ WARM_UP = 0.15
 BLOCK, EVERY = 0.005, 4
 
 
-def moving(u: Vector, rate: float, swing: float) -> Mask:
+def moving(u: Array, rate: float, swing: float) -> Mask:
     """
     Return the samples at which the voltage moves, or did a moment ago.
 
@@ -69,7 +66,7 @@ def moving(u: Vector, rate: float, swing: float) -> Mask:
     return np.asarray(found if found.sum() > u.size // 10 else np.ones(u.size, dtype=bool))
 
 
-def rms_above(u: Vector, rate: float, edge: float) -> Vector:
+def rms_above(u: Array, rate: float, edge: float) -> Array:
     """Return the rms above a frequency around each sample."""
     if 4.0 * edge > rate:
         return np.zeros(u.size)
@@ -81,7 +78,7 @@ def rms_above(u: Vector, rate: float, edge: float) -> Vector:
     return np.asarray(np.sqrt(np.maximum(power, 0.0)))
 
 
-def _windows(u: Vector, rate: float) -> Mask:
+def _windows(u: Array, rate: float) -> Mask:
     """Return the samples behind each jump of the voltage."""
     use = np.zeros(u.size, dtype=bool)
     before = min(50, u.size // 10)
@@ -126,7 +123,7 @@ class FastAndCalm:
         return cls(fast, calm)
 
 
-def _purity(u: Vector, rate: float) -> Vector:
+def _purity(u: Array, rate: float) -> Array:
     """Return the share of fast motion in all motion around each sample: H errs with the rest."""
     width = max(1, int(WINDOW * rate))
     u = u - u.mean()
@@ -187,7 +184,7 @@ class FastMotion:
         return cls(whole, fitted, held, rate)
 
 
-def high_passed(x: Vector, rate: float) -> Vector:
+def high_passed(x: Array, rate: float) -> Array:
     """Return a signal above `HIGH_PASS`; all but its start where the rate is too low for that."""
     if 4.0 * HIGH_PASS > rate:
         return np.asarray(x - x[0])
@@ -195,7 +192,7 @@ def high_passed(x: Vector, rate: float) -> Vector:
     return np.asarray(signal.sosfilt(sos, x - x[0]))
 
 
-def _held_blocks(e: Excerpt, size: int) -> NDArray[np.bool_]:
+def _held_blocks(e: Excerpt, size: int) -> Mask:
     """Return blocks all over the samples that count; a short stretch is one block."""
     held = np.zeros(e.use.size, dtype=bool)
     i = 0
@@ -208,7 +205,7 @@ def _held_blocks(e: Excerpt, size: int) -> NDArray[np.bool_]:
     return held
 
 
-def _cut(w: Vector, x: Vector, use: NDArray[np.bool_], warm_up: int) -> list[Excerpt]:
+def _cut(w: Array, x: Array, use: Mask, warm_up: int) -> list[Excerpt]:
     """Return the samples that count with what comes before them, without the rest."""
     pieces: list[list[int]] = []
     for start, stop in Excerpt(w, x, use).stretches:

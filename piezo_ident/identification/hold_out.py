@@ -14,15 +14,13 @@ from collections.abc import Sequence
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.fast_motion import EDGES, FAINT, HIGH_PASS, rms_above
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import Settings
 
 __all__ = ['MOVES', 'fitted_parts', 'held_out_place']
-
-Mask = NDArray[np.bool_]
 
 #: samples at the end of an unlabelled record that an error needs at least
 MIN_HELD = 10
@@ -79,7 +77,7 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
     return chosen, masks
 
 
-def held_out_place(u: NDArray[np.float64], rate: float, n_held: int) -> int:
+def held_out_place(u: Array, rate: float, n_held: int) -> int:
     """Return where a stretch of `n_held` samples of a normalised voltage u is best held out."""
     n = u.size
     above = [rms_above(u, rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]

@@ -17,7 +17,7 @@ import platform
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
@@ -264,7 +264,7 @@ class _Fitted:
     left: float
 
 
-def _residual(model: StageModel, run: Run) -> NDArray[np.float64]:
+def _residual(model: StageModel, run: Run) -> Array:
     """Return what a model leaves of a run [m]."""
     memory = run.start(model.hysteresis.thresholds)
     return run.piece.y - model.predict_piece(run.piece, memory)

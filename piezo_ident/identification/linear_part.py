@@ -17,6 +17,7 @@ import functools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.identification.fast_motion import FastMotion
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.slow_part import without_pairs, without_slow_part
@@ -42,8 +43,6 @@ __all__ = [
     'find_linear_part',
     'refined_linear_part',
 ]
-
-Vector = NDArray[np.float64]
 
 #: na of further starts by instrumental variables
 INSTRUMENTS = (4, 8)
@@ -84,7 +83,7 @@ class LinearPart:
     delay: Delay
     fit: OutputErrorFit | None
     scan: int | None
-    loss: Vector | None
+    loss: Array | None
     errors: dict[str, float]
     judged: int = 0
 
@@ -134,7 +133,7 @@ def _pure_delay(motion: FastMotion) -> tuple[Delay, float]:
     return Delay(int(total), total - int(total)), error(total)
 
 
-def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128], Vector]:
+def _modal(G: Dynamics) -> tuple[NDArray[np.complex128], NDArray[np.complex128], Array]:
     """Return residues and poles of G, and the terms without a pole."""
     residues, poles, direct = signal.residuez(G.b, np.concatenate([[1.0], G.a]))
     return residues, poles, np.real(np.atleast_1d(direct))
@@ -150,7 +149,7 @@ def _supported(G: Dynamics, motion: FastMotion) -> bool:
     longest = max(e.u.size for e in motion.whole)
 
     @functools.cache
-    def coherence(size: int) -> Vector | None:
+    def coherence(size: int) -> Array | None:
         sums = [cross_spectra(e.u, e.x, size) for e in motion.whole if e.u.size >= size]
         if not sums:
             return None
@@ -200,10 +199,7 @@ def _smaller(G: Dynamics, motion: FastMotion, error: float) -> Dynamics | None:
 
 
 def _refined(
-    motion: FastMotion,
-    G: Dynamics,
-    delay: int,
-    tick: Callable[[], None] = lambda: None,
+    motion: FastMotion, G: Dynamics, delay: int, tick: Callable[[], None] = lambda: None
 ) -> tuple[OutputErrorFit, float] | None:
     """Return G by output error without slow poles and pairs, and its held-out error."""
     stretches = _moved(motion.fitted, delay)

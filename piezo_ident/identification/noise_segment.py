@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import END_HELD, Run
 from piezo_ident.identification.spectra import excited_band, prefilter
@@ -21,12 +21,12 @@ __all__ = ['NoiseSegment', 'band_of', 'longest_noise', 'noise_segment']
 class NoiseSegment:
     """Input and output of a noise segment, prefiltered to its band [Hz]; the end is held out."""
 
-    fitted: tuple[NDArray[np.float64], NDArray[np.float64]]
-    held: tuple[NDArray[np.float64], NDArray[np.float64]]
+    fitted: tuple[Array, Array]
+    held: tuple[Array, Array]
     band: float
 
 
-def noise_segment(run: Run, signal: NDArray[np.float64], start: int, stop: int) -> NoiseSegment:
+def noise_segment(run: Run, signal: Array, start: int, stop: int) -> NoiseSegment:
     """
     Return the noise between two samples, its input replaced by a signal.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
@@ -62,12 +62,12 @@ class Excerpt:
         which last came down to zero when absent.
     """
 
-    u: NDArray[np.float64]
-    x: NDArray[np.float64]
-    use: NDArray[np.bool_]
-    memory: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    u: Array
+    x: Array
+    use: Mask
+    memory: Callable[[Array], Array] | None = None
 
-    def start(self, thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def start(self, thresholds: Array) -> Array:
         """Return the play outputs before the first sample."""
         if self.memory is None:
             return initial_memory(float(self.u[0]), thresholds)
@@ -111,17 +111,17 @@ class Run(Excerpt):
 
     record: str
     piece: Piece
-    known: NDArray[np.bool_]
+    known: Mask
 
-    def through(self, hysteresis: Hysteresis) -> NDArray[np.float64]:
+    def through(self, hysteresis: Hysteresis) -> Array:
         """Return what H makes of the input, from the start of this run."""
         return hysteresis(self.u, self.start(hysteresis.thresholds))
 
-    def excerpt(self, use: NDArray[np.bool_]) -> Excerpt:
+    def excerpt(self, use: Mask) -> Excerpt:
         """Return this run with other samples that count."""
         return Excerpt(self.u, self.x, use, self.memory)
 
-    def mask(self, *kinds: str) -> NDArray[np.bool_]:
+    def mask(self, *kinds: str) -> Mask:
         """Return which samples belong to segments of these kinds."""
         chosen = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
@@ -142,7 +142,7 @@ class Run(Excerpt):
                 whole[a:b] = False
         return [(start + a, start + b) for a, b in true_runs(whole)]
 
-    def held_out(self) -> NDArray[np.bool_]:
+    def held_out(self) -> Mask:
         """
         Return which samples of triangle, noise and steps are kept from every fit.
 

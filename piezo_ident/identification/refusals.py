@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.residual.coherence import cross_spectra
@@ -55,7 +55,7 @@ def refuse_undriven(records: Sequence[Record]) -> None:
     )
 
 
-def _moves(v: NDArray[np.float64]) -> bool:
+def _moves(v: Array) -> bool:
     """Return whether a voltage moves by far more than its noise."""
     rows = v[: v.size // 64 * 64].reshape(64, -1)
     noise = float(np.median(np.std(signal.detrend(rows), axis=1)))
@@ -146,7 +146,7 @@ def _refuse_ramp(name: str, piece: Piece, span: float, stroke: float) -> None:
                 )
 
 
-def _bend(x: NDArray[np.float64]) -> float:
+def _bend(x: Array) -> float:
     """Return the rms deviation from a straight line, as a share of the line's travel."""
     k = np.linspace(-0.5, 0.5, x.size)
     travel = float(k @ x / (k @ k))

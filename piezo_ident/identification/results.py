@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.showable import Showable
 from piezo_ident.identification.spectra import FrequencyResponse
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
-Memories = dict[tuple[str, float], NDArray[np.float64]]
+Memories = dict[tuple[str, float], Array]
 #: called with the name of the step and the share of it that is done; raises `Cancelled` to stop
 Progress = Callable[[str, float], None]
 
@@ -145,7 +145,7 @@ class DelayResult:
     std: float
     source: str
     step: StepDelay | None = None
-    loss: NDArray[np.float64] | None = None
+    loss: Array | None = None
     scan: int | None = None
     fraction: float = 0.0
 
@@ -187,7 +187,7 @@ class DynamicsResult:
     order: tuple[int, int]
     table: OrderTable | None
     methods: dict[str, float]
-    covariance: NDArray[np.float64]
+    covariance: Array
     response: FrequencyResponse | None = None
     bias: float = float('nan')
     slope_measured: float = float('nan')
@@ -292,7 +292,7 @@ class FitOutcome:
     delay: DelayResult
     dynamics: DynamicsResult
     hysteresis: HysteresisFit
-    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
+    masks: Sequence[tuple[Mask, Mask]]
     warnings: Sequence[str]
     not_identified: Sequence[tuple[str, str]] = ()
     memories: Memories = field(default_factory=dict)
@@ -361,7 +361,7 @@ class Identification(Showable):
     not_identified: tuple[tuple[str, str], ...]
     settings: Settings
     records: tuple[Record, ...] = ()
-    memories: Mapping[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
+    memories: Mapping[tuple[str, float], Array] = field(default_factory=dict)
 
     def error(self, data: str) -> float:
         """

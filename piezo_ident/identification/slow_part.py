@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.operators.dynamics import Dynamics
 
 __all__ = ['fast_part', 'without_pairs', 'without_slow_part']
@@ -66,15 +67,13 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     return Dynamics(a[1:], b * G.gain * a.sum() / b.sum())
 
 
-def _size(roots: ArrayLike, rate: float) -> NDArray[np.float64]:
+def _size(roots: ArrayLike, rate: float) -> Array:
     """Return the natural frequencies of roots [Hz]."""
     z = np.asarray(roots, dtype=complex)
     return np.asarray(np.abs(np.log(np.where(z == 0.0, 1e-300, z))) * rate / (2.0 * np.pi))
 
 
-def _decaying(
-    roots: NDArray[np.complex128], low: float, high: float, rate: float
-) -> NDArray[np.bool_]:
+def _decaying(roots: NDArray[np.complex128], low: float, high: float, rate: float) -> Mask:
     """Return the roots that do not ring, with frequencies between two [Hz]."""
     size = _size(roots, rate)
     decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)

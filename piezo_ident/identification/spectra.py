@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.coherence import cross_spectra
 from scipy import fft, signal
 
@@ -30,7 +31,7 @@ TRUSTED = 0.1
 POINTS = 20
 
 
-def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3) -> float:
+def excited_band(u: Array, sample_rate: float, depth: float = 1e-3) -> float:
     """
     Return the highest frequency at which the input still has power [Hz].
 
@@ -52,7 +53,7 @@ def excited_band(u: NDArray[np.float64], sample_rate: float, depth: float = 1e-3
     return float(f[np.flatnonzero(power >= depth * power.max())[-1]])
 
 
-def prefilter(x: NDArray[np.float64], sample_rate: float, cutoff: float) -> NDArray[np.float64]:
+def prefilter(x: Array, sample_rate: float, cutoff: float) -> Array:
     """Return x without its mean and without what lies above the cut-off; shape (n,)."""
     centred = np.asarray(x - x.mean())
     if cutoff >= 0.45 * sample_rate:
@@ -78,19 +79,19 @@ class FrequencyResponse:
         Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))`` of L segments.
     """
 
-    frequency: NDArray[np.float64]
+    frequency: Array
     response: NDArray[np.complex128]
-    coherence: NDArray[np.float64]
-    std: NDArray[np.float64]
+    coherence: Array
+    std: Array
 
-    def at(self, kept: NDArray[np.bool_]) -> FrequencyResponse:
+    def at(self, kept: Mask) -> FrequencyResponse:
         """Return the response at some of its frequencies."""
         names = ('frequency', 'response', 'coherence', 'std')
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
 
 def frequency_response(
-    u: NDArray[np.float64], y: NDArray[np.float64], sample_rate: float, band: float | None = None
+    u: Array, y: Array, sample_rate: float, band: float | None = None
 ) -> FrequencyResponse:
     """
     Estimate a frequency response by Welch's method.
@@ -114,8 +115,7 @@ def frequency_response(
 
 
 def broadband_response(
-    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]],
-    sample_rate: float,
+    parts: Sequence[tuple[Array, Array, Array]], sample_rate: float
 ) -> FrequencyResponse | None:
     """
     Estimate the response of what follows a hysteresis from any motion.
@@ -152,9 +152,7 @@ def _power_of_two(n: int) -> int:
 
 
 def _response(
-    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    segment: int,
-    sample_rate: float,
+    parts: Sequence[tuple[Array, Array]], segment: int, sample_rate: float
 ) -> FrequencyResponse:
     sums = [cross_spectra(u, y, segment) for u, y in parts]
     s_uu, s_yy = (np.sum([each[i] for each in sums], axis=0) for i in (0, 1))
@@ -170,7 +168,7 @@ def _response(
     )
 
 
-def highest_frequency(u: NDArray[np.float64], rate: float) -> float:
+def highest_frequency(u: Array, rate: float) -> float:
     """Return the frequency [Hz] below which all but a millionth of the moving power lies."""
     du = np.diff(u)
     if du.size == 0:

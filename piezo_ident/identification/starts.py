@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult
 from piezo_ident.identification.solvers.least_squares import (
@@ -37,8 +37,7 @@ from piezo_ident.operators.play import play_columns
 
 __all__ = ['fit_starts', 'lag_of', 'with_starts', 'without_harm']
 
-Vector = NDArray[np.float64]
-Rule = Callable[[Vector], Vector]
+Rule = Callable[[Array], Array]
 
 #: blocks into which a run is thinned; of each, the extremes and the last sample stay
 BLOCKS = 4000
@@ -74,9 +73,7 @@ class _Thinned:
         self.x = np.interp(at[used], np.arange(n), excerpt.x)
         self.top, self.bottom = np.maximum.accumulate(self.u), np.minimum.accumulate(self.u)
 
-    def columns(
-        self, r: Vector, memory: Vector
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def columns(self, r: Array, memory: Array) -> tuple[Array, Array]:
         """Return the plays at the rows, and 1 where a play still stands at its start."""
         plays = play_columns(self.u, r, memory)[:, self.rows]
         top, bottom = self.top[self.rows], self.bottom[self.rows]
@@ -85,11 +82,11 @@ class _Thinned:
         return plays.T, free.T.astype(np.float64)
 
 
-def _guesses(u0: float, r: Vector) -> list[Vector]:
+def _guesses(u0: float, r: Array) -> list[Array]:
     """Return shares of a stage that came up from the lowest voltage, down, or from between."""
     steps = np.diff(np.concatenate([[0.0], r]))
 
-    def shares(memory: Vector) -> Vector:
+    def shares(memory: Array) -> Array:
         fall = -np.diff(np.concatenate([[u0], memory]))
         return np.asarray(np.clip(fall / steps, 0.0, 1.0))
 
@@ -137,14 +134,14 @@ def fit_starts(
     known = k + m + 2
     places = {i: slice(known + m * j, known + m * (j + 1)) for j, i in enumerate(sought)}
 
-    def memory(i: int, shares: dict[int, Vector]) -> Vector:
+    def memory(i: int, shares: dict[int, Array]) -> Array:
         if i in shares:
             return np.asarray(starts[i] - np.cumsum(shares[i] * steps))
         return excerpts[i].start(r)
 
     def solve(
-        shares: dict[int, Vector], weights: Vector | None, prior: dict[int, Vector]
-    ) -> tuple[Vector, dict[int, Vector], float]:
+        shares: dict[int, Array], weights: Array | None, prior: dict[int, Array]
+    ) -> tuple[Array, dict[int, Array], float]:
         """Return weights and changes of the shares, and the loss of the weights before."""
         free = {} if weights is None else places
         width = known + m * len(free) + 1
@@ -248,7 +245,7 @@ def without_harm(
     return [replace(run, use=run.use & run.known) for run in runs], known
 
 
-def _rise_and_fall(u: Vector) -> float:
+def _rise_and_fall(u: Array) -> float:
     """Return the smaller of the largest rise and the largest fall of a voltage."""
     if not u.size:
         return 0.0
@@ -256,10 +253,10 @@ def _rise_and_fall(u: Vector) -> float:
     return float(min(rise.max(), fall.max()))
 
 
-def _rule(u0: float, r: Vector, memory: Vector) -> Rule:
+def _rule(u0: float, r: Array, memory: Array) -> Rule:
     places, curve = np.concatenate([[0.0], r]), np.concatenate([[u0], memory])
 
-    def rule(thresholds: Vector) -> Vector:
+    def rule(thresholds: Array) -> Array:
         found = np.interp(thresholds, places, curve)
         return np.asarray(np.clip(found, u0 - thresholds, u0))
 

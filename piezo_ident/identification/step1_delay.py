@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.record.record import Piece
 
 __all__ = ['StepDelay', 'delay_from_loss', 'delay_from_steps', 'find_jumps', 'step_responses']
@@ -55,11 +55,11 @@ class StepDelay:
     repeats: int
     noise: float
     threshold: float
-    lag: NDArray[np.int64]
-    response: NDArray[np.float64]
+    lag: Integers
+    response: Array
 
 
-def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.int64]:
+def find_jumps(v: Array, before: int, after: int) -> Integers:
     """
     Return the samples at which v jumps out of a quiet stretch.
 
@@ -98,7 +98,7 @@ def find_jumps(v: NDArray[np.float64], before: int, after: int) -> NDArray[np.in
 
 def step_responses(
     pieces: Sequence[Piece], before: int = 100, after: int = 60
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """
     Return the step responses [m/V], one a row, and the height of each step [V].
 
@@ -117,9 +117,7 @@ def step_responses(
     return np.array(rows).reshape(-1, before + after), np.array(heights)
 
 
-def _first_rise(
-    mean: NDArray[np.float64], before: int, rounding: float
-) -> tuple[int | None, float, float]:
+def _first_rise(mean: Array, before: int, rounding: float) -> tuple[int | None, float, float]:
     noise = float(np.std(mean[:before], ddof=2))
     # a quantised, noise-free record still has its last digit
     threshold = THRESHOLD * max(noise, rounding, 1e-6 * float(np.abs(mean[before:]).max()))
@@ -184,7 +182,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 
-def delay_from_loss(loss: NDArray[np.float64]) -> int | None:
+def delay_from_loss(loss: Array) -> int | None:
     """
     Return the delay that a scan of the ARX loss points to.
 

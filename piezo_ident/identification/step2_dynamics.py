@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
@@ -62,20 +62,18 @@ class ArxFactor:
         Lags of the output; those of the input come behind them, from lag 0 on.
     """
 
-    R: NDArray[np.float64]
+    R: Array
     n: int
     na_max: int
 
-    def _columns(
-        self, na: int, nb: int, d: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _columns(self, na: int, nb: int, d: int) -> tuple[Array, Array]:
         # those of an order, and their lengths
         A = self.R[:, [*range(na), *range(self.na_max + d, self.na_max + d + nb)]]
         scale = np.linalg.norm(A, axis=0)
         scale[scale == 0.0] = 1.0
         return A, scale
 
-    def fit(self, na: int, nb: int, d: int) -> tuple[NDArray[np.float64], float]:
+    def fit(self, na: int, nb: int, d: int) -> tuple[Array, float]:
         """
         Solve one order by least squares.
 
@@ -89,7 +87,7 @@ class ArxFactor:
         theta[:na] *= -1.0
         return theta, loss
 
-    def losses(self, order: int, delays: int) -> NDArray[np.float64]:
+    def losses(self, order: int, delays: int) -> Array:
         """Return the one-step loss of na = nb = `order` for so many delays from 0 on."""
         return np.array([self.fit(order, order, d)[1] for d in range(delays)])
 
@@ -98,7 +96,7 @@ class ArxFactor:
         theta, _ = self.fit(na, nb, d)
         return Dynamics(a=theta[:na], b=theta[na:])
 
-    def fits(self, na: int, nb_max: int, d: int) -> list[tuple[NDArray[np.float64], float]]:
+    def fits(self, na: int, nb_max: int, d: int) -> list[tuple[Array, float]]:
         """
         Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
 
@@ -121,9 +119,7 @@ class ArxFactor:
         return found
 
 
-def arx_factor(
-    u: NDArray[np.float64], y: NDArray[np.float64], na_max: int, n_lags: int
-) -> ArxFactor:
+def arx_factor(u: Array, y: Array, na_max: int, n_lags: int) -> ArxFactor:
     """
     Reduce input and output to the triangular factor of their lags.
 
@@ -140,7 +136,7 @@ def arx_factor(
     windows_y = np.lib.stride_tricks.sliding_window_view(y, na_max + 1)
     windows_u = np.lib.stride_tricks.sliding_window_view(u, n_lags)
 
-    def rows() -> Iterator[NDArray[np.float64]]:
+    def rows() -> Iterator[Array]:
         for start in range(first, y.size, ROWS):
             stop = min(start + ROWS, y.size)
             past_y = windows_y[start - na_max : stop - na_max, ::-1]
@@ -151,9 +147,7 @@ def arx_factor(
     return ArxFactor(R, n, na_max)
 
 
-def factor_of(
-    parts: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], na_max: int, n_lags: int
-) -> ArxFactor:
+def factor_of(parts: Sequence[tuple[Array, Array]], na_max: int, n_lags: int) -> ArxFactor:
     """Reduce stretches of input and output, none of them too short, to one triangular factor."""
     factors = [arx_factor(u, y, na_max, n_lags) for u, y in parts]
     R = triangular_factor([factor.R for factor in factors], na_max + n_lags + 1)
@@ -175,10 +169,10 @@ class OrderTable:
         Free-run rms error on the held-out part, infinite for an unstable model.
     """
 
-    loss: NDArray[np.float64]
-    aic: NDArray[np.float64]
-    bic: NDArray[np.float64]
-    held_out: NDArray[np.float64]
+    loss: Array
+    aic: Array
+    bic: Array
+    held_out: Array
 
     def best(self, criterion: str) -> tuple[int, int]:
         """Return (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
@@ -199,18 +193,12 @@ class OrderTable:
         return [orders for *_, orders in sorted(order)]
 
 
-def delayed(u: NDArray[np.float64], d: int) -> NDArray[np.float64]:
+def delayed(u: Array, d: int) -> Array:
     """Return a signal delayed by whole samples, zeros first; shape (n,)."""
     return np.concatenate([np.zeros(d), u[: u.size - d]])
 
 
-def free_run_error(
-    model: Dynamics,
-    d: int,
-    u: NDArray[np.float64],
-    y: NDArray[np.float64],
-    first: int | None = None,
-) -> float:
+def free_run_error(model: Dynamics, d: int, u: Array, y: Array, first: int | None = None) -> float:
     """
     Return the rms free-run error but for an offset, infinite for an unstable model.
 
@@ -226,8 +214,8 @@ def scan_orders(
     factor: ArxFactor,
     d: int,
     nb_max: int,
-    u_held: NDArray[np.float64],
-    y_held: NDArray[np.float64],
+    u_held: Array,
+    y_held: Array,
     tick: Callable[[float], None] = lambda share: None,
 ) -> OrderTable:
     """
@@ -271,21 +259,16 @@ def stabilised(dynamics: Dynamics) -> Dynamics:
     return Dynamics(a=a, b=b)
 
 
-_Lags = tuple[NDArray[np.float64], int, float, int]
+_Lags = tuple[Array, int, float, int]
 
 
-def _inner(one: _Lags, other: _Lags, n: int) -> NDArray[np.float64]:
+def _inner(one: _Lags, other: _Lags, n: int) -> Array:
     """Return the sums of products of two groups of lags, each (signal, first row, sign, lags)."""
     (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
     return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
 
 
-def instrumental_variables(
-    u: NDArray[np.float64],
-    y: NDArray[np.float64],
-    start: Dynamics,
-    d: int,
-) -> Dynamics:
+def instrumental_variables(u: Array, y: Array, start: Dynamics, d: int) -> Dynamics:
     """
     Refine an ARX model by instrumental variables.
 
@@ -341,7 +324,7 @@ def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
     return model
 
 
-def _filtered(e: Excerpt, model: Dynamics) -> list[NDArray[np.float64]]:
+def _filtered(e: Excerpt, model: Dynamics) -> list[Array]:
     """Return displacement, input and simulated output, filtered by 1/A."""
     y_sim = filter_arx(model.a, model.b, e.u, at_rest=False)
     return [filter_arx(model.a, np.ones(1), x, at_rest=False) for x in (e.x, e.u, y_sim)]

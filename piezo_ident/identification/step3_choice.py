@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.results import Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
@@ -61,7 +61,7 @@ WORTH = 0.25
 NO_WORSE = 1.1
 
 
-def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
+def merged(hysteresis: Hysteresis) -> Array:
     """
     Return fewer thresholds in better places, from a fit on a fine grid.
 
@@ -90,10 +90,10 @@ def merged(hysteresis: Hysteresis) -> NDArray[np.float64]:
 def _held_loss(
     fit: Sequence[Excerpt],
     held: Sequence[Excerpt],
-    thresholds: NDArray[np.float64],
+    thresholds: Array,
     dynamics: Dynamics,
     delay: Delay,
-) -> tuple[float, NDArray[np.float64]]:
+) -> tuple[float, Array]:
     result = fit_hysteresis(factorise(fit, thresholds, dynamics, delay), thresholds)
     R = factorise(held, thresholds, dynamics, delay)
     return float(np.sqrt(result.left(R))), merged(result.hysteresis)
@@ -106,7 +106,7 @@ def choose_thresholds(
     dynamics: Dynamics,
     delay: Delay,
     tick: Callable[[float], None] = lambda share: None,
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Refine the thresholds until the held-out error stops falling.
 
@@ -140,12 +140,12 @@ def choose_thresholds(
 
 
 def with_small(
-    thresholds: NDArray[np.float64],
+    thresholds: Array,
     fit: Sequence[Excerpt],
     small: Sequence[Excerpt],
     dynamics: Dynamics,
     delay: Delay,
-) -> NDArray[np.float64]:
+) -> Array:
     """
     Return thresholds with smaller ones, each half of the next, where small motion needs them.
 
@@ -154,7 +154,7 @@ def with_small(
     """
     finer = np.concatenate([thresholds[0] / 2.0 ** np.arange(SMALL, 0, -1), thresholds])
 
-    def error(r: NDArray[np.float64]) -> float:
+    def error(r: Array) -> float:
         h = fit_hysteresis(factorise(fit, r, dynamics, delay), r).hysteresis
         # the rows below the offsets know nothing of them
         R = factorise(small, h.thresholds, dynamics, delay)[len(small) :, len(small) :]
@@ -215,7 +215,7 @@ def choose_law(
     tick(0.3)
     whole = triangular_factor(parts, parts[0].shape[1])
 
-    def fitted(R: NDArray[np.float64], law: HysteresisLaw) -> HysteresisFit:
+    def fitted(R: Array, law: HysteresisLaw) -> HysteresisFit:
         return fit_hysteresis(_of(R, law, all_terms), law)
 
     # no law can do better than all their columns with any weights
@@ -223,7 +223,7 @@ def choose_law(
     floor = float(np.sum((whole[:, :-1] @ least - whole[:, -1]) ** 2))
     if len(parts) < PARTS or floor > (1.0 - WORTH) ** 2 * fitted(whole, law_of['plays']).loss:
         return Choice(None)
-    losses: dict[str, NDArray[np.float64]] = {}
+    losses: dict[str, Array] = {}
     for i, (name, law) in enumerate(law_of.items()):
         found = [fitted(_but(parts, j), law).coefficients for j in range(len(parts))]
         both = zip(parts, found, strict=True)
@@ -259,13 +259,13 @@ def choose_law(
     return Choice(law_of[chosen], errors)
 
 
-def _upper(difference: NDArray[np.float64]) -> float:
+def _upper(difference: Array) -> float:
     return float(difference.mean() + difference.std(ddof=1) / np.sqrt(difference.size))
 
 
 def _parts(
     excerpts: Sequence[Excerpt], law: HysteresisLaw, dynamics: Dynamics, delay: Delay
-) -> list[NDArray[np.float64]]:
+) -> list[Array]:
     """Return the factor of each part, with the columns of `factorise`."""
     total = sum(e.rows for e in excerpts)
     parts = []
@@ -275,14 +275,12 @@ def _parts(
     return parts
 
 
-def _but(parts: Sequence[NDArray[np.float64]], j: int) -> NDArray[np.float64]:
+def _but(parts: Sequence[Array], j: int) -> Array:
     """Return the factor of all parts but one."""
     return triangular_factor([R for i, R in enumerate(parts) if i != j], parts[j].shape[1])
 
 
-def _of(
-    R: NDArray[np.float64], law: HysteresisLaw, all_terms: HysteresisLaw
-) -> NDArray[np.float64]:
+def _of(R: Array, law: HysteresisLaw, all_terms: HysteresisLaw) -> Array:
     """Return the factor for one law, and the offsets there are, from that for all terms."""
     k = R.shape[1] - all_terms.size - 1
     offsets = np.flatnonzero(np.any(R[:, :k], axis=0))
@@ -291,10 +289,7 @@ def _of(
 
 
 def _left_out(
-    R: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-    law: HysteresisLaw,
-    all_terms: HysteresisLaw,
+    R: Array, coefficients: Array, law: HysteresisLaw, all_terms: HysteresisLaw
 ) -> float:
     """Return the mean square of a part around its own offset."""
     R = _of(R, law, all_terms)
@@ -329,7 +324,7 @@ def third_step(
         choice = choose_law(
             fitted, G, delay, lambda share: progress('hysteresis', 0.2 * share), others
         )
-    law: HysteresisLaw | NDArray[np.float64]
+    law: HysteresisLaw | Array
     if choice.law is not None:
         law = choice.law
     elif settings.thresholds is not None:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.identification.prepare import Excerpt
@@ -57,7 +57,7 @@ PULL = 0.01
 FORGOTTEN = 1e-13
 
 
-def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
+def even_thresholds(swing: float, count: int) -> Array:
     """
     Return `count` evenly spaced thresholds from 0 over the excited swing, without the 0.
 
@@ -81,7 +81,7 @@ def even_thresholds(swing: float, count: int) -> NDArray[np.float64]:
     return swing * np.arange(1, count) / count
 
 
-def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
+def fine_thresholds(swing: float, excursion: float) -> Array:
     """
     Return thresholds for an H that only serves to find G.
 
@@ -93,9 +93,7 @@ def fine_thresholds(swing: float, excursion: float) -> NDArray[np.float64]:
 
 
 @kernel
-def _average(
-    x: NDArray[np.float64], stretches: NDArray[np.int64], row: int, out: NDArray[np.float64]
-) -> None:
+def _average(x: Array, stretches: Integers, row: int, out: Array) -> None:
     # a mean never reaches across a hole in the mask; the last incomplete row is left out
     place = 0
     for m in range(stretches.shape[0]):
@@ -106,11 +104,8 @@ def _average(
 
 
 def factorise(
-    excerpts: Sequence[Excerpt],
-    law: HysteresisLaw | NDArray[np.float64],
-    dynamics: Dynamics,
-    delay: Delay,
-) -> NDArray[np.float64]:
+    excerpts: Sequence[Excerpt], law: HysteresisLaw | Array, dynamics: Dynamics, delay: Delay
+) -> Array:
     """
     Reduce the data to the factor R of ``[offsets | G times the columns of the law | y]``.
 
@@ -135,7 +130,7 @@ def factorise(
 
 def filtered_rows(
     excerpts: Sequence[Excerpt], law: HysteresisLaw, dynamics: Dynamics, delay: Delay
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[Array]:
     """Give the rows that `factorise` reduces, in their order in time, excerpt by excerpt."""
     k, r = len(excerpts), law.thresholds
     # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
@@ -163,11 +158,11 @@ def filtered_rows(
         yield block.T
 
 
-def _law(law: HysteresisLaw | NDArray[np.float64]) -> HysteresisLaw:
+def _law(law: HysteresisLaw | Array) -> HysteresisLaw:
     return law if isinstance(law, HysteresisLaw) else HysteresisLaw('plays', law)
 
 
-def _independent(A: NDArray[np.float64], m: int, densities: int) -> NDArray[np.bool_]:
+def _independent(A: Array, m: int, densities: int) -> Mask:
     """
     Return which columns of m plays, further densities and the powers of v the data tell apart.
 
@@ -227,16 +222,16 @@ class HysteresisFit:
     """
 
     hysteresis: Hysteresis
-    offsets: NDArray[np.float64]
+    offsets: Array
     solver: Solver
     polished: bool
     loss: float
     swarm_loss: float | None
     optimum_loss: float
     n: int
-    std: NDArray[np.float64]
+    std: Array
     swarm: OptimizeResult | None
-    coefficients: NDArray[np.float64]
+    coefficients: Array
     law: LawName = 'plays'
     errors_of_laws: Mapping[str, float] = field(default_factory=dict)
 
@@ -245,15 +240,15 @@ class HysteresisFit:
         """Root mean square of the residual, averaged over the rows of the fit, normalised."""
         return float(np.sqrt(self.loss / self.n))
 
-    def left(self, R: NDArray[np.float64]) -> float:
+    def left(self, R: Array) -> float:
         """Return the sum of squares that it leaves of the same runs as `factorise` has them."""
         theta = np.concatenate([self.offsets, self.coefficients])
         return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
 
 
 def fit_hysteresis(
-    R: NDArray[np.float64],
-    law: HysteresisLaw | NDArray[np.float64],
+    R: Array,
+    law: HysteresisLaw | Array,
     n: int = 1,
     *,
     solver: Solver = 'least_squares',

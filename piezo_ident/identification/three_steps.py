@@ -18,7 +18,7 @@ from dataclasses import replace
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.delay_check import upheld
 from piezo_ident.identification.noise_segment import (
@@ -137,7 +137,7 @@ def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
     return upheld(found, noise.fitted, noise.held)
 
 
-def _scan(runs: Sequence[Run], kind: str) -> NDArray[np.float64] | None:
+def _scan(runs: Sequence[Run], kind: str) -> Array | None:
     """Return the one-step loss over the delay, from all segments of a kind."""
     lags, parts = SCAN_ORDER + MAX_DELAY, []
     for run in runs:

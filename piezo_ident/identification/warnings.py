@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Mask
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import DynamicsResult, Identification
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
@@ -150,9 +150,7 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     return warnings
 
 
-def warn_of_range(
-    runs: Sequence[Run], fitted: Sequence[NDArray[np.bool_]], scaling: Scaling
-) -> list[str]:
+def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:
     """Return a warning when the held-out parts leave the voltages of the fitted ones."""
     pairs = list(zip(runs, fitted, strict=True))
     parts = [run.u[mask] for run, mask in pairs], [run.u[~mask] for run, mask in pairs]

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import (
@@ -44,8 +45,6 @@ __all__ = [
     'run_pieces',
     'same_part_errors',
 ]
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class FreeRun(Showable):
     """
 
     record: Record
-    pieces: tuple[Vector, ...]
+    pieces: tuple[Array, ...]
     estimated: tuple[bool, ...]
     late: tuple[int, ...]
     errors: FreeRunErrors
@@ -124,12 +123,12 @@ class FreeRun(Showable):
     warnings: tuple[str, ...] = ()
 
     @property
-    def predicted(self) -> Vector:
+    def predicted(self) -> Array:
         """Predicted displacement of all pieces [m], shape (n,)."""
         return np.concatenate(self.pieces)
 
     @property
-    def measured(self) -> Vector:
+    def measured(self) -> Array:
         """Measured displacement of all pieces [m], shape (n,)."""
         return np.concatenate([piece.y for piece in self.record])
 
@@ -210,7 +209,7 @@ def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
     return [_errors(run.record, run.pieces, late) for run in runs]
 
 
-def predict(model: StageModel, record: Record) -> tuple[NDArray[np.float64], ...]:
+def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
     """
     Return the displacement that the voltage of a record causes, whatever was measured.
 
@@ -278,8 +277,8 @@ def _predicted(
     record: Record,
     groups: Sequence[Sequence[Piece]],
     starts: Sequence[Start | None],
-) -> list[Vector]:
-    predicted: list[Vector] = []
+) -> list[Array]:
+    predicted: list[Array] = []
     for pieces, start in zip(groups, starts, strict=True):
         predicted += run_pieces(model, pieces, start)
     if not all(np.isfinite(y_hat).all() for y_hat in predicted):
@@ -287,7 +286,7 @@ def _predicted(
     return predicted
 
 
-def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> list[Vector]:
+def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> list[Array]:
     """
     Return the predicted displacement [m] of pieces that follow each other over short gaps.
 
@@ -302,11 +301,11 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
     return predicted
 
 
-def _errors(record: Record, predicted: Sequence[Vector], starts: Sequence[int]) -> FreeRunErrors:
+def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -> FreeRunErrors:
     """Return the errors of each piece from a sample on, in blocks for the sake of memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
-    def total(f: Callable[[Vector, Vector], Vector]) -> float:
+    def total(f: Callable[[Array, Array], Array]) -> float:
         return sum(
             float(np.sum(f(piece.y[i : i + BLOCK], y_hat[i : i + BLOCK])))
             for piece, y_hat, start in pieces
@@ -338,8 +337,8 @@ class PieceRun:
 
     record: str
     piece: Piece
-    y_hat: Vector
-    y_static: Vector
+    y_hat: Array
+    y_static: Array
 
 
 def piece_runs(

@@ -10,8 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import robust_range
+from piezo_ident.common.arrays import Array, robust_range
 
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
@@ -43,7 +42,6 @@ AGAINST = -0.5
 #: share of the span of a model below which a record does not move
 STILL = 0.02
 
-Vector = NDArray[np.float64]
 
 #: samples per block, so that temporaries stay small beside a long record
 BLOCK = 1 << 20
@@ -61,7 +59,7 @@ def percent(rms: float, stroke: float) -> float:
     return 100.0 * float(rms) / stroke
 
 
-def percent_of_stroke(y: Vector, y_hat: Vector, stroke: float | None = None) -> float:
+def percent_of_stroke(y: Array, y_hat: Array, stroke: float | None = None) -> float:
     """
     Return ``100 rms(y - y_hat) / (max y - min y)``, shapes (n,).
 
@@ -72,14 +70,14 @@ def percent_of_stroke(y: Vector, y_hat: Vector, stroke: float | None = None) -> 
     return percent(float(np.sqrt(np.mean((y - y_hat) ** 2))), span)
 
 
-def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
+def strokes(parts: Iterable[tuple[str, Array]]) -> dict[str, float]:
     """
     Return ``max y - min y`` of each record over all its parts, which come as (record, y).
 
     Single wild samples and empty parts do not count; see `piezo_ident.common.arrays.robust_range`.
     Between two records a sensor may be set to another zero, so their strokes are no common one.
     """
-    of: dict[str, list[Vector]] = {}
+    of: dict[str, list[Array]] = {}
     for record, y in parts:
         if y.size:
             of.setdefault(record, []).append(y)
@@ -88,7 +86,7 @@ def strokes(parts: Iterable[tuple[str, Vector]]) -> dict[str, float]:
 
 
 def runs_against(
-    parts: Iterable[tuple[Vector, Vector]], span: float, below: float = AGAINST
+    parts: Iterable[tuple[Array, Array]], span: float, below: float = AGAINST
 ) -> bool:
     """
     Return whether measured and predicted displacement move in opposite directions.
@@ -108,7 +106,7 @@ def runs_against(
     return reach > STILL * abs(span) and yp < below * math.sqrt(yy * pp)
 
 
-def doubts(parts: Sequence[tuple[Vector, Vector]], span: float) -> Iterator[str]:
+def doubts(parts: Sequence[tuple[Array, Array]], span: float) -> Iterator[str]:
     """Yield why measured displacement may not be the stage's; arguments as of `runs_against`."""
     if runs_against(parts, span):
         yield REVERSED
@@ -131,7 +129,7 @@ def nrmse_fit(error: float, spread: float) -> float:
     return 100.0 * (1.0 - float(error) / float(spread))
 
 
-def fit_percent(y: Vector, y_hat: Vector) -> float:
+def fit_percent(y: Array, y_hat: Array) -> float:
     """Return the NRMSE fit ``100 (1 - |y - y_hat| / |y - mean y|)`` of MATLAB's ``compare``."""
     return nrmse_fit(float(np.linalg.norm(y - y_hat)), float(np.linalg.norm(y - y.mean())))
 

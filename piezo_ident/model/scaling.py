@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 
 __all__ = ['Scaling']
@@ -44,7 +45,7 @@ class Scaling:
         if self.range[0] >= self.range[1]:
             raise ModelError('scaling: range must be [lowest, highest] voltage')
 
-    def u(self, v: ArrayLike) -> NDArray[np.float64]:
+    def u(self, v: ArrayLike) -> Array:
         """Return the normalised input."""
         return (np.asarray(v, dtype=np.float64) - self.v0) / self.V
 
@@ -52,10 +53,10 @@ class Scaling:
         """Return volts from the normalised input."""
         return self.v0 + self.V * float(u)
 
-    def y(self, x: ArrayLike) -> NDArray[np.float64]:
+    def y(self, x: ArrayLike) -> Array:
         """Return metres from the normalised output."""
         return self.y0 + self.Y * np.asarray(x, dtype=np.float64)
 
-    def x(self, y: ArrayLike) -> NDArray[np.float64]:
+    def x(self, y: ArrayLike) -> Array:
         """Return the normalised output from metres."""
         return (np.asarray(y, dtype=np.float64) - self.y0) / self.Y

@@ -19,7 +19,8 @@ import reprlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import load_yaml
@@ -67,12 +68,12 @@ class Converter:
         """Smallest difference between two codes."""
         return (self.high - self.low) / 2.0**self.bits
 
-    def quantise(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def quantise(self, x: Array) -> Array:
         """Return the nearest codes; values outside the range become its last ones."""
         code = np.clip(np.rint((x - self.low) / self.step), 0.0, 2.0**self.bits - 1.0)
         return np.asarray(self.low + self.step * code)
 
-    def outside(self, x: NDArray[np.float64]) -> int:
+    def outside(self, x: Array) -> int:
         """Return how many values lie outside the range."""
         return int(np.count_nonzero((x < self.low) | (x > self.high)))
 
@@ -231,17 +232,14 @@ class StageRun:
         self._rng = rng
         self._stream = stage.model.stream()
 
-    def applied(self, v: ArrayLike) -> NDArray[np.float64]:
+    def applied(self, v: ArrayLike) -> Array:
         """Return the output of the DAC for a command [V], shape (n,)."""
         command, dac = np.asarray(v, dtype=np.float64), self.stage.sensor.dac
         return command if dac is None else dac.quantise(command)
 
     def process(
-        self,
-        v: ArrayLike,
-        t: ArrayLike | None = None,
-        channels: Mapping[str, NDArray[np.float64]] | None = None,
-    ) -> NDArray[np.float64]:
+        self, v: ArrayLike, t: ArrayLike | None = None, channels: Mapping[str, Array] | None = None
+    ) -> Array:
         """
         Return the sensor's readings [m] for the next samples of command [V], shape (n,).
 
@@ -261,7 +259,7 @@ class StageRun:
         return y
 
 
-def _piece(sequence: Sequence, y: NDArray[np.float64]) -> Piece:
+def _piece(sequence: Sequence, y: Array) -> Piece:
     return Piece(v=sequence.v, y=y, sample_rate=sequence.sample_rate, segments=sequence.segments)
 
 

@@ -18,7 +18,8 @@ from typing import Any, TYPE_CHECKING
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
@@ -171,7 +172,7 @@ class StageModel:
     def _operators(self, slot: Slot) -> list[Operator]:
         return [find_effect(s.name)(self.sample_rate, s.parameters) for s in self.effects_in(slot)]
 
-    def hysteresis_input(self, piece: Piece) -> NDArray[np.float64]:
+    def hysteresis_input(self, piece: Piece) -> Array:
         """Return the normalised voltage behind the effects of the input slot, shape (n,)."""
         u = self.scaling.u(piece.v)
         chain = Chain(tuple(self._operators('input')))
@@ -206,7 +207,7 @@ class StageModel:
         *,
         channels: Mapping[str, ArrayLike] | None = None,
         start: StartLike = None,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """
         Return the displacement that a voltage causes, in free run; warn outside the range.
 
@@ -294,7 +295,7 @@ class StageModel:
         """
         return Stream(self, start)
 
-    def predict_piece(self, piece: Piece, start: StartLike = None) -> NDArray[np.float64]:
+    def predict_piece(self, piece: Piece, start: StartLike = None) -> Array:
         """
         Return the predicted displacement of one piece [m], shape (n,).
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
@@ -41,7 +42,7 @@ class Start:
     """
 
     memory: ArrayLike | None = None
-    creep: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    creep: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def of(cls, start: StartLike) -> Start:
@@ -80,7 +81,7 @@ class Stream:
             return self._cascade.reset(u0)
         return float(self.model.scaling.y(self._chain.reset(u0, u0)))
 
-    def follow(self, piece: Piece) -> NDArray[np.float64]:
+    def follow(self, piece: Piece) -> Array:
         """Return the displacement [m] for the next samples, a piece or a part of one."""
         y = np.empty(piece.n)
         for start in range(0, piece.n, CHUNK):
@@ -99,14 +100,14 @@ class Stream:
             return
         share = np.arange(1, missing + 1) / (missing + 1)
 
-        def line(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+        def line(before: Array, after: Array) -> Array:
             return np.asarray(before[-1] + (after[0] - before[-1]) * share)
 
         channels = {k: line(x, other.channels[k]) for k, x in one.channels.items()}
         time = line(one.time(one.n - 1, one.n), other.time(0, 1))
         self.process(line(one.v, other.v), time, channels)
 
-    def recall(self, v: NDArray[np.float64], t: NDArray[np.float64]) -> None:
+    def recall(self, v: Array, t: Array) -> None:
         """
         Bring amplifier and plays into their state after a past voltage; the rest is at rest.
 
@@ -127,11 +128,8 @@ class Stream:
                 block = operator.process(block)
 
     def process(
-        self,
-        v: ArrayLike,
-        t: ArrayLike | None = None,
-        channels: Mapping[str, NDArray[np.float64]] | None = None,
-    ) -> NDArray[np.float64]:
+        self, v: ArrayLike, t: ArrayLike | None = None, channels: Mapping[str, Array] | None = None
+    ) -> Array:
         """
         Return the displacement [m] for the next samples of voltage [V], shape (n,).
 
@@ -183,7 +181,7 @@ class _Cascade:
         y0, Y = self._scale[2:]
         return float(y0 + Y * rest)
 
-    def run(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def run(self, v: Array) -> Array:
         """Return the displacement [m] for the next samples, shape (n,)."""
         out = np.empty(v.size)
         # a frozen array would be another type to the compiler

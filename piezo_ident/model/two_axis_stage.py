@@ -30,7 +30,8 @@ import os
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, DataError, ModelError
 from piezo_ident.common.files import load_yaml
@@ -88,13 +89,13 @@ class TwoAxisStage:
     axes: tuple[str, ...]
     sample_rate: float
     gain: float
-    frequency: NDArray[np.float64]
-    damping: NDArray[np.float64]
-    shape: NDArray[np.float64]
+    frequency: Array
+    damping: Array
+    shape: Array
     hysteresis: tuple[float, float, float]
     creep_axis: int
-    creep_gain: NDArray[np.float64]
-    creep_time: NDArray[np.float64]
+    creep_gain: Array
+    creep_time: Array
     noise_rms: float = 0.0
     seed: int = 0
 
@@ -173,7 +174,7 @@ class TwoAxisRun:
         # position and speed of either mode; s and z of either actuator
         self._state, self._memory = np.zeros((2, 2)), np.zeros((2, 2))
 
-    def process(self, v: ArrayLike) -> NDArray[np.float64]:
+    def process(self, v: ArrayLike) -> Array:
         """
         Return the readings [m], shape (n, 2), for the next commands [V], shape (n, 2).
 
@@ -194,7 +195,7 @@ class TwoAxisRun:
         return y
 
 
-def _sampled(stage: TwoAxisStage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sampled(stage: TwoAxisStage) -> tuple[Array, Array]:
     """Return transition and input of each mode over a step, shapes (2, 2, 2) and (2, 2)."""
     a, b = np.empty((2, 2, 2)), np.empty((2, 2))
     for i, (frequency, zeta) in enumerate(zip(stage.frequency, stage.damping, strict=True)):
@@ -208,21 +209,21 @@ def _sampled(stage: TwoAxisStage) -> tuple[NDArray[np.float64], NDArray[np.float
 
 @ordered_kernel
 def _move(
-    u: NDArray[np.float64],
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    shape: NDArray[np.float64],
+    u: Array,
+    a: Array,
+    b: Array,
+    inverse: Array,
+    shape: Array,
     h: float,
     c: float,
     z0: float,
-    creep: NDArray[np.float64],
-    creep_gain: NDArray[np.float64],
-    crept: NDArray[np.float64],
+    creep: Array,
+    creep_gain: Array,
+    crept: Array,
     creep_axis: int,
-    state: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    y: NDArray[np.float64],
+    state: Array,
+    memory: Array,
+    y: Array,
 ) -> None:
     f = np.zeros(2)
     for k in range(u.shape[0]):
@@ -311,7 +312,7 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
 
 def _check(stage: TwoAxisStage, name: str) -> None:
     """Refuse numbers that no stage has."""
-    sizes: Many[tuple[str, NDArray[np.float64], tuple[int, ...]]] = (
+    sizes: Many[tuple[str, Array, tuple[int, ...]]] = (
         ('frequency', stage.frequency, (2,)),
         ('damping', stage.damping, (2,)),
         ('shape', stage.shape, (2, 2)),

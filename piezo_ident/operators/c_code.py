@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import path_lines
@@ -23,7 +23,7 @@ from piezo_ident.operators.kernels import path_lines
 __all__ = ['CCode', 'Numbers', 'delay_in_c', 'dynamics_in_c', 'hysteresis_in_c']
 
 #: constants of an operator by name
-Numbers = dict[str, float | int | NDArray[np.float64]]
+Numbers = dict[str, float | int | Array]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 
 __all__ = ['Block', 'Chain', 'Operator', 'Slot']
 
@@ -41,12 +40,12 @@ class Block:
         Further measured signals in their own units.
     """
 
-    t: NDArray[np.float64]
-    v: NDArray[np.float64]
-    x: NDArray[np.float64]
-    channels: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    t: Array
+    v: Array
+    x: Array
+    channels: Mapping[str, Array] = field(default_factory=dict)
 
-    def with_signal(self, x: NDArray[np.float64]) -> Block:
+    def with_signal(self, x: Array) -> Block:
         """Return the block with another signal."""
         block = object.__new__(Block)
         # replace() is slow for short blocks

@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.arrays import Array, frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.operators.chain import Block
@@ -55,8 +55,8 @@ class Dynamics:
     coefficient is not finite, or b is empty.
     """
 
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
+    a: Array
+    b: Array
 
     def __post_init__(self) -> None:
         a, b = frozen_array(self.a), frozen_array(self.b)
@@ -83,7 +83,7 @@ class Dynamics:
         return _static_gain(self.b, self.a)
 
     @cached_property
-    def sections(self) -> NDArray[np.float64] | None:
+    def sections(self) -> Array | None:
         """Sections of second order where eq. (5) would lose digits, shape (n, 5), or nothing."""
         return sections_of(self.a, self.b, self.gain)
 
@@ -153,9 +153,7 @@ class Dynamics:
         denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
         return np.asarray(numerator / denominator, dtype=np.complex128)
 
-    def modes(
-        self, sample_rate: float, covariance: NDArray[np.float64] | None = None
-    ) -> list[Mode]:
+    def modes(self, sample_rate: float, covariance: Array | None = None) -> list[Mode]:
         """
         Return each oscillating pair of poles as a mode, by frequency.
 
@@ -180,12 +178,7 @@ class Dynamics:
         return sorted(found, key=lambda mode: mode.frequency)
 
 
-def filter_arx(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    x: NDArray[np.float64],
-    at_rest: bool = True,
-) -> NDArray[np.float64]:
+def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
     """
     Return B(z)/A(z) x, shape (n,); a and b as in `Dynamics`.
 
@@ -201,7 +194,7 @@ def filter_arx(
 
 
 @kernel
-def _is_stable(a: NDArray[np.float64]) -> bool:
+def _is_stable(a: Array) -> bool:
     # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the last
     # coefficient is below one in magnitude and the polynomial of one order less passes too
     a = a.copy()
@@ -216,7 +209,7 @@ def _is_stable(a: NDArray[np.float64]) -> bool:
     return True
 
 
-def _static_gain(b: NDArray[np.float64], a: NDArray[np.float64]) -> float:
+def _static_gain(b: Array, a: Array) -> float:
     numerator, denominator = float(b.sum()), 1.0 + float(a.sum())
     return numerator / denominator if denominator != 0.0 else float('inf')
 
@@ -287,7 +280,7 @@ class Delay:
         """Delay in samples, with its fraction."""
         return self.samples + self.fraction
 
-    def apply(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, x: Array) -> Array:
         """Return a signal delayed, preceded by its own first value; shape (n,)."""
         operator = DelayOperator(self)
         operator.reset(0.0, float(x[0]))
@@ -312,7 +305,7 @@ class DelayOperator:
         """Return the block delayed."""
         return block.with_signal(self.shift(block.x))
 
-    def shift(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def shift(self, x: Array) -> Array:
         """Return the signal delayed; shape (n,)."""
         if self.delay.total == 0.0:
             return x

@@ -30,16 +30,14 @@ import functools
 import itertools
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.arrays import frozen_array
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, frozen_array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import hysteresis, relaxing, wide_hysteresis
 from piezo_ident.operators.play import initial_memory
 
 __all__ = ['LANES', 'Hysteresis', 'HysteresisOperator']
-
-Array = NDArray[np.float64]
 
 #: powers t^2 .. t^4 that a curve of a play may have
 POWERS = 3
@@ -88,15 +86,15 @@ class Hysteresis:
     [0.0, 1.625, 1.125]
     """
 
-    thresholds: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    thresholds: Array
+    weights: Array
     p1: float
     p2: float
     p0: float = 0.0
-    curves: NDArray[np.float64] | None = None
-    bias: NDArray[np.float64] | None = None
+    curves: Array | None = None
+    bias: Array | None = None
     span: tuple[float, float] = (0.0, 1.0)
-    relaxations: NDArray[np.float64] | None = None
+    relaxations: Array | None = None
 
     def __post_init__(self) -> None:
         r, q = frozen_array(self.thresholds), frozen_array(self.weights)
@@ -131,7 +129,7 @@ class Hysteresis:
         if self.curves is not None or self.bias is not None:
             self._check_wide(r, q)
 
-    def _check_wide(self, r: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+    def _check_wide(self, r: Array, q: Array) -> None:
         """Check span, curves and bias, and freeze them."""
         low, high = map(float, self.span)
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
@@ -171,7 +169,7 @@ class Hysteresis:
         return self.p0 != 0.0 or self.curves is not None or self.bias is not None
 
     @functools.cached_property
-    def _wide(self) -> NDArray[np.float64]:
+    def _wide(self) -> Array:
         """The rows c_1 .. c_3, kappa and widths of `wide_hysteresis`; none where H is plain."""
         m, low, high = self.thresholds.size, *self.span
         if not self._is_curved:
@@ -193,7 +191,7 @@ class Hysteresis:
         rows[:2, :m], rows[2:, :m] = (self.thresholds, self.weights), self._wide
         return rows[0], rows[1], self.p1, self.p2, self.p0, self.span[0], rows[2:]
 
-    def rise(self, outputs: ArrayLike, v: float = 0.0) -> NDArray[np.float64]:
+    def rise(self, outputs: ArrayLike, v: float = 0.0) -> Array:
         """Return dw/dF_i of each play at its output, shapes (m,); v matters to a bias alone."""
         if not self._is_curved:
             return self.weights
@@ -242,7 +240,7 @@ class Hysteresis:
         )
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
+    def numbers(self) -> Array:
         """All parameters in a row: r, q, p0, p1, p2, curves, bias."""
         polynomial = np.array([self.p0, self.p1, self.p2])
         parts = [self.thresholds, self.weights, polynomial, self._wide.ravel()]
@@ -250,11 +248,11 @@ class Hysteresis:
             parts.append(self.relaxations.ravel())
         return np.concatenate(parts)
 
-    def initial_memory(self, v0: float) -> NDArray[np.float64]:
+    def initial_memory(self, v0: float) -> Array:
         """Return the play outputs at `v0` of a stage that last came down to zero."""
         return initial_memory(v0, self.thresholds)
 
-    def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> NDArray[np.float64]:
+    def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> Array:
         """
         Return w for a normalised input v, shapes (n,).
 
@@ -266,7 +264,7 @@ class Hysteresis:
         return self.follow(x, start)[0]
 
     @functools.cached_property
-    def lag_range(self) -> NDArray[np.float64]:
+    def lag_range(self) -> Array:
         """Least and largest phi_j over the span, between which a lag stays; shape (2, k)."""
         if self.relaxations is None:
             return np.empty((2, 0))
@@ -274,7 +272,7 @@ class Hysteresis:
         phi = self.relaxations[:, 1:] @ np.array([v, v**2, v**3])
         return np.array([phi.min(axis=1), phi.max(axis=1)])
 
-    def settled(self, v0: float) -> NDArray[np.float64]:
+    def settled(self, v0: float) -> Array:
         """
         Return the lags along the path of a stage that was swept, came down, and went to `v0`.
 

@@ -27,8 +27,8 @@ from math import comb
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.arrays import frozen_array
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, frozen_array, Integers, Mask
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.hysteresis import Hysteresis, POWERS
 from piezo_ident.operators.play import play_columns
@@ -73,7 +73,7 @@ class HysteresisLaw:
     """
 
     name: LawName
-    thresholds: NDArray[np.float64]
+    thresholds: Array
     span: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
@@ -97,12 +97,12 @@ class HysteresisLaw:
         return int(self._parameters.shape[0])
 
     @property
-    def lower(self) -> NDArray[np.float64]:
+    def lower(self) -> Array:
         """Lower bounds of the coefficients, shape (size,)."""
         return np.where(np.arange(self.size) < self.densities, 0.0, -np.inf)
 
     @functools.cached_property
-    def _parameters(self) -> NDArray[np.float64]:
+    def _parameters(self) -> Array:
         """
         The parameters of H in each coefficient, shape (size, 5 m + 3 + lags).
 
@@ -112,7 +112,7 @@ class HysteresisLaw:
         m = self.thresholds.size
         plays = np.zeros((m, POWERS + 2, m))
         plays[:, 0] = np.eye(m)
-        more: list[NDArray[np.float64]] = []
+        more: list[Array] = []
         low, high = self.span
         for hat in self._hats() if self.name in ('bias', 'any') else ():
             for q, kappa in ((0.0, 1.0 / (high - low)), (1.0, -1.0 / (high - low))):
@@ -136,7 +136,7 @@ class HysteresisLaw:
         whole[n + k :, rows[0].size : rows[0].size + 3] = powers
         return whole
 
-    def _hats(self) -> Iterator[NDArray[np.float64]]:
+    def _hats(self) -> Iterator[Array]:
         """Give piecewise linear functions of the threshold, as shares of a density; shape (m,)."""
         r = self.thresholds
         if not r.size:
@@ -153,7 +153,7 @@ class HysteresisLaw:
         theta = np.maximum(np.asarray(coefficients, dtype=np.float64), self.lower)
         return self._of(theta @ self._parameters, self.thresholds)
 
-    def _of(self, x: NDArray[np.float64], thresholds: NDArray[np.float64]) -> Hysteresis:
+    def _of(self, x: Array, thresholds: Array) -> Hysteresis:
         n = (POWERS + 2) * thresholds.size
         plays, (p0, p1, p2) = x[:n].reshape(POWERS + 2, -1), x[n : n + 3]
         lags = None
@@ -172,7 +172,7 @@ class HysteresisLaw:
             relaxations=lags,
         )
 
-    def deviations(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def deviations(self, covariance: Array) -> Array:
         """Return the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
         m = self.thresholds.size
         n = (POWERS + 2) * m
@@ -181,7 +181,7 @@ class HysteresisLaw:
         variance = np.sum(T * (covariance @ T), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, NDArray[np.bool_]]]:
+    def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, Mask]]:
         """Give the H of each coefficient in some places alone, and which thresholds it has."""
         r, m = self.thresholds, self.thresholds.size
         n = (POWERS + 2) * m
@@ -204,11 +204,8 @@ class HysteresisLaw:
             yield part, moved
 
     def columns(
-        self,
-        v: NDArray[np.float64],
-        memory: ArrayLike | None = None,
-        places: Sequence[int] | None = None,
-    ) -> Iterator[NDArray[np.float64]]:
+        self, v: Array, memory: ArrayLike | None = None, places: Sequence[int] | None = None
+    ) -> Iterator[Array]:
         """
         Give what H adds for each coefficient under a normalised v; shapes (n,).
 
@@ -224,7 +221,7 @@ class HysteresisLaw:
             single = i < self.thresholds.size
             yield play_columns(v, part.thresholds, own)[0] if single else part(v, own)
 
-    def within(self, wider: HysteresisLaw) -> NDArray[np.int64]:
+    def within(self, wider: HysteresisLaw) -> Integers:
         """
         Return the places of the coefficients among those of a wider law, shape (size,).
 
@@ -238,7 +235,7 @@ class HysteresisLaw:
         lags = range(n, n + self.lags)
         return np.array([*range(m), *range(start, stop), *lags, *powers])
 
-    def coefficients(self, hysteresis: Hysteresis) -> NDArray[np.float64]:
+    def coefficients(self, hysteresis: Hysteresis) -> Array:
         """
         Return the coefficients of an H of this family, shape (size,).
 
@@ -272,7 +269,7 @@ class HysteresisLaw:
         return theta
 
 
-def _bernstein() -> Iterator[NDArray[np.float64]]:
+def _bernstein() -> Iterator[Array]:
     """Give the coefficients of 1, s, s^2, ... of each Bernstein polynomial on 0 .. 1."""
     for j in range(DEGREE + 1):
         b = np.zeros(DEGREE + 1)

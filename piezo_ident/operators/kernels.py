@@ -23,7 +23,7 @@ loop is kept on disk until its own file changes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
 __all__ = [
@@ -52,12 +52,7 @@ def held(f: float, low: float, high: float) -> float:
 
 
 @kernel
-def plays(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
+def plays(v: Array, r: Array, memory: Array, out: Array) -> None:
     """Write F_r[v] of every threshold into `out`, shape (m, n), and carry `memory` on."""
     for i in range(r.size):
         f = memory[i]
@@ -69,13 +64,7 @@ def plays(
 
 @kernel
 def hysteresis(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
-    p1: float,
-    p2: float,
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
+    v: Array, r: Array, q: Array, p1: float, p2: float, memory: Array, out: Array
 ) -> None:
     """Write w of eqs. (3) and (6) into `out`, shape (n,), and carry `memory` on."""
     for k in range(v.size):
@@ -88,7 +77,7 @@ def hysteresis(
 
 
 @ordered_kernel
-def curve(c: NDArray[np.float64], i: int, t: float) -> float:
+def curve(c: Array, i: int, t: float) -> float:
     """Return c_1 t^2 + c_2 t^3 + c_3 t^4 of a play, flat beyond its width (row 4) and below 0."""
     t = held(t, 0.0, c[4, i])
     bent: float = t * t * (c[0, i] + t * (c[1, i] + t * c[2, i]))
@@ -96,7 +85,7 @@ def curve(c: NDArray[np.float64], i: int, t: float) -> float:
 
 
 @ordered_kernel
-def curve_slope(c: NDArray[np.float64], i: int, t: float) -> float:
+def curve_slope(c: Array, i: int, t: float) -> float:
     """Return the slope of `curve`."""
     slope: float = t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
     return slope if 0.0 < t < c[4, i] else 0.0
@@ -104,16 +93,16 @@ def curve_slope(c: NDArray[np.float64], i: int, t: float) -> float:
 
 @kernel
 def wide_hysteresis(
-    v: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
+    v: Array,
+    r: Array,
+    q: Array,
     p1: float,
     p2: float,
     p0: float,
     low: float,
-    c: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    out: NDArray[np.float64],
+    c: Array,
+    memory: Array,
+    out: Array,
 ) -> None:
     """
     Do as `hysteresis`, with what stands in brackets above.
@@ -130,7 +119,7 @@ def wide_hysteresis(
 
 
 @ordered_kernel
-def path_lines(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def path_lines(x: Array) -> Array:
     """
     Return what each lag of `relaxing` tends to along a falling and a rising voltage u.
 
@@ -151,12 +140,7 @@ def path_lines(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @kernel
-def relaxing(
-    v: NDArray[np.float64],
-    x: NDArray[np.float64],
-    state: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
+def relaxing(v: Array, x: Array, state: Array, out: Array) -> None:
     """
     Add the lags along the path of v to `out`, and carry `state` on.
 
@@ -189,12 +173,7 @@ def relaxing(
 
 
 @ordered_kernel
-def dynamics(
-    w: NDArray[np.float64],
-    b: NDArray[np.float64],
-    a: NDArray[np.float64],
-    y: NDArray[np.float64],
-) -> None:
+def dynamics(w: Array, b: Array, a: Array, y: Array) -> None:
     """
     Continue y by eqs. (4) and (5), without the delay.
 
@@ -214,7 +193,7 @@ def dynamics(
 
 
 @ordered_kernel
-def _forward(w: NDArray[np.float64], b: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+def _forward(w: Array, b: Array, y: Array) -> None:
     y[:] = 0.0
     n, nb = y.size, b.size
     fours = nb - nb % 4
@@ -232,7 +211,7 @@ def _forward(w: NDArray[np.float64], b: NDArray[np.float64], y: NDArray[np.float
 
 
 @ordered_kernel
-def _backward(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+def _backward(a: Array, y: Array) -> None:
     na, n = a.size, y.size - a.size
     if na == 0:
         return
@@ -261,7 +240,7 @@ def _backward(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
 
 
 @ordered_kernel
-def _dies_away(y: NDArray[np.float64]) -> bool:
+def _dies_away(y: Array) -> bool:
     # counted by index, not looked for: that runs in vector lanes
     count = 0
     for k in range(y.size):
@@ -270,7 +249,7 @@ def _dies_away(y: NDArray[np.float64]) -> bool:
 
 
 @ordered_kernel
-def _backward_to_rest(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+def _backward_to_rest(a: Array, y: Array) -> None:
     for k in range(a.size, y.size):
         x = y[k]
         for i in range(a.size):
@@ -280,24 +259,24 @@ def _backward_to_rest(a: NDArray[np.float64], y: NDArray[np.float64]) -> None:
 
 @ordered_kernel
 def cascade(
-    v: NDArray[np.float64],
-    scale: NDArray[np.float64],
-    r: NDArray[np.float64],
-    q: NDArray[np.float64],
+    v: Array,
+    scale: Array,
+    r: Array,
+    q: Array,
     p1: float,
     p2: float,
     p0: float,
     low: float,
-    c: NDArray[np.float64],
-    lags: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    b: NDArray[np.float64],
-    a: NDArray[np.float64],
-    w: NDArray[np.float64],
-    y: NDArray[np.float64],
+    c: Array,
+    lags: Array,
+    memory: Array,
+    b: Array,
+    a: Array,
+    w: Array,
+    y: Array,
     d: int,
     fraction: float,
-    out: NDArray[np.float64],
+    out: Array,
 ) -> None:
     """
     Pass a voltage through H, G and the delay, and carry their states on.

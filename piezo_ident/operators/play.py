@@ -13,13 +13,14 @@ stays within [v - r, v], and F_0[v] = v.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.operators.kernels import plays
 
 __all__ = ['initial_memory', 'play_columns']
 
 
-def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
+def initial_memory(v0: float, thresholds: ArrayLike) -> Array:
     """
     Return the play outputs of a stage that last came down to zero and then went to `v0`.
 
@@ -30,9 +31,7 @@ def initial_memory(v0: float, thresholds: ArrayLike) -> NDArray[np.float64]:
     return np.maximum(v0 - r, np.minimum(v0, np.zeros_like(r)))
 
 
-def play_columns(
-    v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None = None
-) -> NDArray[np.float64]:
+def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None = None) -> Array:
     """
     Return the output of every play operator.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, ordered_kernel
 
 __all__ = ['rounding_of', 'run_sections', 'sections_at_rest', 'sections_of']
@@ -30,7 +30,7 @@ NOTHING = 1e-300
 STRETCH = 1024
 
 
-def rounding_of(a: NDArray[np.float64]) -> float:
+def rounding_of(a: Array) -> float:
     """
     Return the rounding error of eq. (5) as a share of its output, rms, about.
 
@@ -48,9 +48,7 @@ def rounding_of(a: NDArray[np.float64]) -> float:
     return float(np.finfo(np.float64).eps) * math.sqrt(size * power)
 
 
-def sections_of(
-    a: NDArray[np.float64], b: NDArray[np.float64], gain: float
-) -> NDArray[np.float64] | None:
+def sections_of(a: Array, b: Array, gain: float) -> Array | None:
     """
     Return G as sections, or nothing where eq. (5) serves.
 
@@ -76,7 +74,7 @@ def sections_of(
     return np.ascontiguousarray(made[:, [0, 1, 2, 4, 5]])
 
 
-def _is_product(parts: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
+def _is_product(parts: Array, whole: Array) -> bool:
     product = np.ones(1)
     for part in parts:
         product = np.convolve(product, part)
@@ -84,7 +82,7 @@ def _is_product(parts: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
     return bool(np.abs(product).max() <= SAME * np.abs(whole).max())
 
 
-def sections_at_rest(c: NDArray[np.float64], x: float) -> tuple[NDArray[np.float64], float]:
+def sections_at_rest(c: Array, x: float) -> tuple[Array, float]:
     """Return the state of sections at rest under x, shape (n, 2), and what goes out."""
     z = np.empty((c.shape[0], 2))
     for i, (b0, b1, b2, a1, a2) in enumerate(c):
@@ -95,12 +93,7 @@ def sections_at_rest(c: NDArray[np.float64], x: float) -> tuple[NDArray[np.float
 
 
 @ordered_kernel
-def run_sections(
-    x: NDArray[np.float64],
-    c: NDArray[np.float64],
-    z: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
+def run_sections(x: Array, c: Array, z: Array, out: Array) -> None:
     """Write what sections make of x to `out`, shape (n,), and carry z on, shape (n, 2)."""
     for start in range(0, x.size, STRETCH):
         for k in range(start, min(start + STRETCH, x.size)):

@@ -16,7 +16,8 @@ from dataclasses import replace
 import itertools
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
@@ -275,7 +276,7 @@ def _pieces(
     return tuple(_piece(table, p, c) for p, c in zip(parts, clocks, strict=True))
 
 
-def _not_uniform(t: NDArray[np.float64], parts: list[tuple[int, int]], name: str) -> DataError:
+def _not_uniform(t: Array, parts: list[tuple[int, int]], name: str) -> DataError:
     return DataError(
         f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); if '
         'the samples came at one rate and none is missing, name it, as in --rate 20e3, and t is '
@@ -284,7 +285,7 @@ def _not_uniform(t: NDArray[np.float64], parts: list[tuple[int, int]], name: str
 
 
 def _clocks(
-    t: NDArray[np.float64],
+    t: Array,
     parts: list[tuple[int, int]],
     resolution: Resolution,
     name: str,

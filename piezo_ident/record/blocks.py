@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Segment
 
@@ -55,13 +56,13 @@ class Samples:
     The label of the segment is empty for none.
     """
 
-    t: NDArray[np.float64]
-    values: NDArray[np.float64]
+    t: Array
+    values: Array
     segment: str = ''
     quantity: str = 'voltage'
 
 
-def encode(samples: Samples) -> tuple[NDArray[np.float64], tuple[Dimension, Dimension]]:
+def encode(samples: Samples) -> tuple[Array, tuple[Dimension, Dimension]]:
     """
     Return the data vector and the layout of a block.
 

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import re
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.arrays import Array, frozen_array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.options import plain_unit, UNITS
 from piezo_ident.record.record import Piece, Record
@@ -143,8 +142,8 @@ class Axes:
     (('v', 'v_b'), ('y', 'y_b'), (100, 2))
     """
 
-    inputs: NDArray[np.float64]
-    outputs: NDArray[np.float64]
+    inputs: Array
+    outputs: Array
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     sample_rate: float

@@ -19,6 +19,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.scatter import residual_of, scatters, without_scatter
 
 __all__ = [
@@ -32,8 +33,6 @@ __all__ = [
     'split_uniform',
     'time_stamps',
 ]
-
-Vector = NDArray[np.float64]
 
 #: rows looked at together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
@@ -74,7 +73,7 @@ class Resolution:
     single: bool = False
 
     @classmethod
-    def of(cls, t: Vector) -> Resolution:
+    def of(cls, t: Array) -> Resolution:
         """Return the coarsest rounding that all stamps obey."""
         # whole stretches, because every fifth stamp of 5 kHz has a decimal fewer than the rest
         blocks = np.linspace(0, max(t.size - 500, 0), 8).astype(int)
@@ -91,7 +90,7 @@ class Resolution:
             single = bool(np.all(x.astype(np.float32).astype(np.float64) == x))
         return cls(next(decimals, None), next(digits, None), single)
 
-    def half(self, t: Vector) -> Vector:
+    def half(self, t: Array) -> Array:
         """Return how far each stamp can lie from the true time by rounding alone [s]."""
         half = np.zeros(t.shape)
         if self.decimals is not None:
@@ -104,13 +103,13 @@ class Resolution:
         return half
 
 
-def _rounded_to(x: Vector, decimals: NDArray[np.int_]) -> bool:
+def _rounded_to(x: Array, decimals: NDArray[np.int_]) -> bool:
     scale = 10.0 ** np.abs(decimals)
     rounded = np.where(decimals >= 0, np.rint(x * scale) / scale, np.rint(x / scale) * scale)
     return bool(np.all(np.abs(rounded - x) <= 2 * np.spacing(x)))
 
 
-def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) -> Vector:
+def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) -> Array:
     """
     Return the times of samples `start` to ``stop - 1`` [s].
 
@@ -129,7 +128,7 @@ def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) ->
     return t
 
 
-def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
+def split_uniform(t: Array, resolution: Resolution) -> list[tuple[int, int]]:
     """
     Split strictly increasing stamps [s] where sampling is interrupted or changes its rate.
 
@@ -152,7 +151,7 @@ def split_uniform(t: Vector, resolution: Resolution) -> list[tuple[int, int]]:
     return done
 
 
-def _breaks(t: Vector) -> NDArray[np.bool_]:
+def _breaks(t: Array) -> Mask:
     """
     Tell for each step between neighbours whether it lies outside every uniform stretch.
 
@@ -176,7 +175,7 @@ def _breaks(t: Vector) -> NDArray[np.bool_]:
     return breaks
 
 
-def _changes(t: Vector) -> Iterator[list[int]]:
+def _changes(t: Array) -> Iterator[list[int]]:
     """Yield, chunk by chunk, the steps that differ from the one before them."""
     for i in range(0, t.size - 2, _CHUNK):
         step = np.diff(t[i : i + _CHUNK + 2])
@@ -184,7 +183,7 @@ def _changes(t: Vector) -> Iterator[list[int]]:
         yield (np.flatnonzero(change) + (i + 1)).tolist()
 
 
-def _wide(t: Vector, least: float) -> list[int]:
+def _wide(t: Array, least: float) -> list[int]:
     """Return the samples behind steps of more than a size."""
     wide: list[int] = []
     for i in range(0, t.size - 1, _CHUNK):
@@ -192,7 +191,7 @@ def _wide(t: Vector, least: float) -> list[int]:
     return wide
 
 
-def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
+def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
     """Return where a stretch without coarse breaks must still be cut; empty when uniform."""
     n = t.size
     if n < 3:
@@ -221,7 +220,7 @@ def _inner_cuts(t: Vector, resolution: Resolution) -> list[int]:
     return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
 
 
-def fit_clock(t: Vector, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
+def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
     """
     Fit a uniform clock to increasing stamps.
 
@@ -280,17 +279,17 @@ def _settled(clock: Clock, n: int) -> Clock:
     return clock
 
 
-def _last_bit(t: Vector) -> Vector:
+def _last_bit(t: Array) -> Array:
     # half a bit for the stamp, a quarter for its difference from the first one
     return 0.75 * np.spacing(np.abs(t))
 
 
-def _rounding(resolution: Resolution, dt: float) -> Callable[[Vector], Vector]:
+def _rounding(resolution: Resolution, dt: float) -> Callable[[Array], Array]:
     # steps of one or two units of the last decimal are exact more often than rounded
     return lambda t: np.minimum(resolution.half(t), 0.2 * dt) + 8 * np.spacing(np.abs(t))
 
 
-def rate_bounds(t: Vector, half: Callable[[Vector], Vector]) -> tuple[float, float]:
+def rate_bounds(t: Array, half: Callable[[Array], Array]) -> tuple[float, float]:
     """Return the smallest and largest rate through all stamps +- `half`, crossed when none is."""
     low, high = 0.0, np.inf
     first = float(half(t[:1])[0])
@@ -323,8 +322,8 @@ def _start(t0: float, rate: float, resolution: Resolution) -> float:
     return tick if abs(tick - t0) <= slack else t0
 
 
-def _reproduces(clock: Clock, t: Vector) -> bool:
-    def part(i: int) -> Vector:
+def _reproduces(clock: Clock, t: Array) -> bool:
+    def part(i: int) -> Array:
         return time_stamps(clock.sample_rate, clock.start_time, i, min(i + _CHUNK, t.size))
 
     return all(np.array_equal(part(i), t[i : i + _CHUNK]) for i in range(0, t.size, _CHUNK))

@@ -19,15 +19,14 @@ import re
 import shlex
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import channel_of_column, role_of
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
 __all__ = ['ChosenColumns', 'RecordTable', 'choose', 'listed']
-
-Vector = NDArray[np.float64]
 
 _QUANTITIES = {'t': 'time', 'v': 'voltage', 'y': 'displacement'}
 _WORDS = {
@@ -69,7 +68,7 @@ class RecordTable:
         What was guessed.
     """
 
-    columns: dict[str, Vector]
+    columns: dict[str, Array]
     names: list[str] = field(default_factory=list)
     starts: ArrayLike = ()
     ignored: tuple[str, ...] = ()
@@ -89,7 +88,7 @@ class ChosenColumns:
     faults: tuple[Fault, ...]
 
     def table(
-        self, columns: dict[str, Vector], names: Sequence[str] = (), starts: ArrayLike = ()
+        self, columns: dict[str, Array], names: Sequence[str] = (), starts: ArrayLike = ()
     ) -> RecordTable:
         """Return the columns that were chosen as a table."""
         return RecordTable(

@@ -11,13 +11,12 @@ from dataclasses import replace
 import difflib
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
 __all__ = ['line_error', 'misspelt', 'quantum_of', 'suspicions', 'without_faults']
 
-Vector = NDArray[np.float64]
 Runs = list[tuple[int, int]]
 
 #: samples in a row with one and the same displacement that are no chance
@@ -103,7 +102,7 @@ def _wild(piece: Piece, stroke: float, span: float) -> Runs:
     return found
 
 
-def _alone(y: Vector, floor: float) -> Runs:
+def _alone(y: Array, floor: float) -> Runs:
     """Return runs of up to three numbers that are far from their neighbours on both sides."""
     found: Runs = []
     taken = np.zeros(y.size, dtype=bool)
@@ -245,7 +244,7 @@ def suspicions(record: Record) -> list[str]:
     ]
 
 
-def _constant(x: Vector, least: int = STUCK) -> Runs:
+def _constant(x: Array, least: int = STUCK) -> Runs:
     """Return the stretches of at least so many equal samples."""
     same = np.concatenate([[False], x[1:] == x[:-1], [False]])
     edges = np.flatnonzero(same[1:] != same[:-1]).reshape(-1, 2)
@@ -253,7 +252,7 @@ def _constant(x: Vector, least: int = STUCK) -> Runs:
     return [(int(a), int(b) + 1) for a, b in edges]
 
 
-def quantum_of(y: Vector) -> float:
+def quantum_of(y: Array) -> float:
     """Return the step of which all readings y, shape (n,), are multiples; 0 for none."""
     span = float(np.ptp(y))
     if span == 0.0:
@@ -296,7 +295,7 @@ def quantum_of(y: Vector) -> float:
     return 0.0
 
 
-def _pieces(y: Vector) -> Vector:
+def _pieces(y: Array) -> Array:
     """Return some whole stretches of a long signal, which tell the step as well."""
     if y.size <= MOST:
         return y

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.record import Piece, Record, Segment
 
 __all__ = ['LONGEST', 'Bridged', 'bridged', 'connected_pieces', 'follows']
@@ -37,7 +37,7 @@ class Bridged:
     """
 
     piece: Piece
-    sound: NDArray[np.bool_]
+    sound: Mask
     gaps: int = 0
     filled: int = 0
 
@@ -85,7 +85,7 @@ def _joined(pieces: list[Piece]) -> Bridged:
 
     k, known = np.arange(n), np.flatnonzero(measured)
 
-    def fill(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def fill(parts: list[Array]) -> Array:
         return np.interp(k, known, np.concatenate(parts))
 
     sound = measured.copy()

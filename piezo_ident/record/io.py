@@ -12,7 +12,7 @@ import re
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
 from piezo_ident.record.arrays import read_hdf5, read_mat, read_npz, read_parquet, read_tdms
@@ -269,7 +269,7 @@ def _check_labels(record: Record, path: Path) -> None:
 def _losses(record: Record) -> tuple[str, ...]:
     """Read the columns as a reader would, and say what differs."""
 
-    def whole(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def whole(parts: list[Array]) -> Array:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     t, v, y = (

@@ -18,6 +18,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
@@ -29,7 +30,6 @@ from piezo_ident.record.stream import BlockStream
 
 __all__ = ['APPLIED', 'MAX_MISSING', 'Joined', 'join', 'record_of_streams']
 
-Vector = NDArray[np.float64]
 #: equal times of two streams: first row of the one, first row of the other, how many rows
 Matches = list[tuple[int, int, int]]
 
@@ -107,8 +107,8 @@ def record_of_streams(
 class Joined:
     """Columns of equal length, the segments' names and starts, and what was met on the way."""
 
-    t: Vector
-    columns: dict[str, Vector]
+    t: Array
+    columns: dict[str, Array]
     segments: tuple[list[str], list[int]]
     faults: tuple[Fault, ...]
 
@@ -205,7 +205,7 @@ def join(
     return Joined(_cut(t, matches[first], keep), columns, _labels(lead, keep), tuple(faults))
 
 
-def _cut(x: Vector, matches: Matches, keep: NDArray[np.bool_], *, alone: bool = False) -> Vector:
+def _cut(x: Array, matches: Matches, keep: Mask, *, alone: bool = False) -> Array:
     """Return the values of the rows that are kept; `alone`, NaN where the stream has none."""
     if alone:
         column = np.full(keep.size, np.nan)
@@ -225,7 +225,7 @@ def _cut(x: Vector, matches: Matches, keep: NDArray[np.bool_], *, alone: bool = 
     return column
 
 
-def _labels(stream: BlockStream, keep: NDArray[np.bool_]) -> tuple[list[str], list[int]]:
+def _labels(stream: BlockStream, keep: Mask) -> tuple[list[str], list[int]]:
     """Return the label of each stretch, and how many rows before it are kept."""
     names, starts = stream.labels()
     sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else starts
@@ -233,7 +233,7 @@ def _labels(stream: BlockStream, keep: NDArray[np.bool_]) -> tuple[list[str], li
 
 
 def _in_step(
-    streams: Mapping[str, BlockStream], times: Mapping[str, Vector]
+    streams: Mapping[str, BlockStream], times: Mapping[str, Array]
 ) -> dict[str, Matches] | None:
     """
     Return what the streams share, run by run, where all went through the same runs of the clock.
@@ -273,7 +273,7 @@ def _in_step(
     return matches
 
 
-def _shared(one: Vector, other: Vector) -> Iterator[tuple[int, int, int]]:
+def _shared(one: Array, other: Array) -> Iterator[tuple[int, int, int]]:
     """Yield where two rising columns of times go on alike."""
     i = j = 0
     while i < one.size and j < other.size:
@@ -309,9 +309,7 @@ def _merged(matches: Iterable[tuple[int, int, int]]) -> Matches:
     return merged
 
 
-def _matches(
-    ta: Vector, arrived_a: NDArray[np.int64], tb: Vector, arrived_b: NDArray[np.int64]
-) -> Matches:
+def _matches(ta: Array, arrived_a: Integers, tb: Array, arrived_b: Integers) -> Matches:
     """Return what two streams share, rows of the same time paired by when they came."""
     t, arrived = np.concatenate([ta, tb]), np.concatenate([arrived_a, arrived_b])
     by = np.lexsort((arrived, t))
@@ -323,7 +321,7 @@ def _matches(
     return _stretches(by[mutual][order], by[nearest[mutual]][order] - ta.size)
 
 
-def _nearest(t: Vector, arrived: NDArray[np.int64], in_b: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _nearest(t: Array, arrived: Integers, in_b: Mask) -> Integers:
     """Return for sorted rows of two streams the row of the other with equal time, -1 for none."""
     here = np.arange(t.size)
     best = np.full(t.size, -1)
@@ -342,12 +340,7 @@ def _nearest(t: Vector, arrived: NDArray[np.int64], in_b: NDArray[np.bool_]) -> 
     return best
 
 
-def _left_over(
-    name: str,
-    t: Vector,
-    x: Vector,
-    left: NDArray[np.bool_],
-) -> list[Fault]:
+def _left_over(name: str, t: Array, x: Array, left: Mask) -> list[Fault]:
     """Say what became of the samples of a stream that found no partner."""
     by = np.argsort(t, kind='stable')
     same_time = t[by][1:] == t[by][:-1]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
@@ -33,13 +33,13 @@ MAX_REPEAT = 200
 class OrderedRows:
     """Columns, the row where each label begins, and the rows that lost their predecessor."""
 
-    t: NDArray[np.float64]
-    columns: dict[str, NDArray[np.float64]]
+    t: Array
+    columns: dict[str, Array]
     names: tuple[str, ...]
-    starts: NDArray[np.int64]
-    torn: NDArray[np.int64]
+    starts: Integers
+    torn: Integers
 
-    def take(self, rows: NDArray[np.int64]) -> OrderedRows:
+    def take(self, rows: Integers) -> OrderedRows:
         """Return only these rows, which must be in order."""
         return OrderedRows(
             self.t[rows],
@@ -84,8 +84,8 @@ def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRo
 
 
 def _stretches(
-    table: OrderedRows, jumps: NDArray[np.int64], name: str
-) -> tuple[NDArray[np.int64] | None, list[int], NDArray[np.float64]]:
+    table: OrderedRows, jumps: Integers, name: str
+) -> tuple[Integers | None, list[int], Array]:
     """
     Sort stretches of rising time into repeats and restarts; refuse what is neither.
 
@@ -93,7 +93,7 @@ def _stretches(
     """
     t = table.t
     # as long as nothing is dropped, rows are their own numbers and need no table
-    rows: NDArray[np.int64] | None = None
+    rows: Integers | None = None
     known = t  # t[rows], so that a look-up copies nothing
     size, begin = 0, 0
     epochs, repeated = [0], []
@@ -143,7 +143,7 @@ def _stretches(
     )
 
 
-def at_times(times: NDArray[np.float64]) -> str:
+def at_times(times: Array) -> str:
     """Return where something happened, for people: at most three times."""
     if not times.size:
         return 'at unknown times'

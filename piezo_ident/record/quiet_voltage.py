@@ -15,14 +15,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Fault, Piece, Record
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 __all__ = ['with_quiet_voltage']
-
-Vector = NDArray[np.float64]
 
 #: samples of a window, and the share of the windows that may be quieter than the noise
 WINDOW, QUIET = 100, 10.0
@@ -69,7 +67,7 @@ def with_quiet_voltage(record: Record) -> Record:
     return replace(record, pieces=pieces, faults=(*record.faults, fault))
 
 
-def _deviation(v: Vector) -> float:
+def _deviation(v: Array) -> float:
     """Return the standard deviation of white noise [V] in the quietest parts of a voltage."""
     # of a smooth motion little is left
     one, two = (
@@ -83,7 +81,7 @@ def _deviation(v: Vector) -> float:
     return float(quiet / np.sqrt(6.0)) if is_white else 0.0
 
 
-def _quiet(v: Vector, width: float) -> Vector:
+def _quiet(v: Array, width: float) -> Array:
     """Return a voltage [V] without noise of some width, or as it is where it moves by more."""
     still = _played(v, width)
     reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
@@ -92,7 +90,7 @@ def _quiet(v: Vector, width: float) -> Vector:
     return np.where(reach > MOVES * width, v, _played(near, width / np.sqrt(BACK)))
 
 
-def _played(v: Vector, width: float) -> Vector:
+def _played(v: Array, width: float) -> Array:
     """Return the middle of a play of some width [V]."""
     u = v - v.min()
     play = play_columns(u, [width], np.array([u[0] - 0.5 * width]))[0]

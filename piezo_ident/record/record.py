@@ -16,8 +16,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from piezo_ident.common.arrays import frozen_array, robust_range
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, frozen_array, robust_range
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
@@ -101,12 +101,12 @@ class Piece:
         When lengths differ, the piece is empty, or the rate is not positive.
     """
 
-    v: NDArray[np.float64]
-    y: NDArray[np.float64]
+    v: Array
+    y: Array
     sample_rate: float
     start_time: float = 0.0
     segments: tuple[Segment, ...] = ()
-    channels: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    channels: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         v, y = frozen_array(self.v), frozen_array(self.y)
@@ -146,11 +146,11 @@ class Piece:
         return self.n / self.sample_rate
 
     @property
-    def t(self) -> NDArray[np.float64]:
+    def t(self) -> Array:
         """Time of each sample [s]; see `piezo_ident.record.clock.time_stamps`."""
         return self.time(0, self.n)
 
-    def time(self, start: int, stop: int) -> NDArray[np.float64]:
+    def time(self, start: int, stop: int) -> Array:
         """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
         return time_stamps(self.sample_rate, self.start_time, start, min(stop, self.n))
 

@@ -11,7 +11,7 @@ the more closely the longer the record is; where only one rate of few digits is 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.record.clock import nice_rates, rate_bounds, Resolution, time_stamps
 from piezo_ident.record.ordering import OrderedRows
 from piezo_ident.record.record import Fault
@@ -22,7 +22,7 @@ __all__ = ['unrounded']
 CHANCE = 0.1
 
 
-def unrounded(table: OrderedRows, met: list[Fault]) -> NDArray[np.float64]:
+def unrounded(table: OrderedRows, met: list[Fault]) -> Array:
     """
     Return uniform time where that of a table is rounded too coarsely, else its own.
 

@@ -14,11 +14,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 
 __all__ = ['residual_of', 'scatters', 'without_scatter']
-
-Vector = NDArray[np.float64]
 
 #: fewer stamps tell no scatter from a change
 _LEAST = 16
@@ -28,16 +26,16 @@ _AROUND = 8
 _CHUNK = 1 << 20
 
 
-def residual_of(t: Vector) -> Vector:
+def residual_of(t: Array) -> Array:
     """Return what a least-squares line leaves of the stamps [s]."""
     k = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t[0]
     x -= x.mean()
-    residual: Vector = x - k * (np.dot(k, x) / np.dot(k, k))
+    residual: Array = x - k * (np.dot(k, x) / np.dot(k, k))
     return residual
 
 
-def scatters(t: Vector) -> bool:
+def scatters(t: Array) -> bool:
     """
     Return whether increasing stamps [s] scatter about one uniform clock.
 
@@ -59,7 +57,7 @@ def scatters(t: Vector) -> bool:
     return bool(is_white and -step.min() > 0.6 * step.max())
 
 
-def without_scatter(t: Vector, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
+def without_scatter(t: Array, cuts: Integers) -> Integers:
     """
     Return where to cut increasing stamps [s] when steps that scatter are no breaks.
 
@@ -77,7 +75,7 @@ def without_scatter(t: Vector, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
     return cuts[(cuts > 0) & (cuts < t.size)]
 
 
-def _jumps(t: Vector) -> Iterator[int]:
+def _jumps(t: Array) -> Iterator[int]:
     """Yield the samples before which time jumps by more than half a step, and stays there."""
     dt = float(np.median(np.diff(t[:_CHUNK])))
     # mean time behind a sample less that before it, in terms of the steps between

@@ -15,7 +15,7 @@ import tempfile
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
 
@@ -53,8 +53,8 @@ class BlockStream:
         self._spooled = spooled
         self._files: list[BinaryIO] = []
         # rows of (t, value): of many blocks each, and the newest blocks one by one
-        self._chunks: list[NDArray[np.float64]] = []
-        self._newest: list[NDArray[np.float64]] = []
+        self._chunks: list[Array] = []
+        self._newest: list[Array] = []
         self._rows = 0  # in the newest blocks
         self._sizes, self._arrivals = array('q'), array('q')
         self._segments: list[str] = []
@@ -108,12 +108,12 @@ class BlockStream:
         return len(self._sizes)
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> Array:
         """Time of each sample [s], shape (n,): a copy, or a read-only memory map."""
         return self._column(0)
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Array:
         """Value of each sample, shape (n,): a copy, or a read-only memory map."""
         return self._column(1)
 
@@ -132,7 +132,7 @@ class BlockStream:
             ) from None
         self._chunks, self._newest, self._rows = [], [], 0
 
-    def _column(self, k: int) -> NDArray[np.float64]:
+    def _column(self, k: int) -> Array:
         if self._files:
             self._spool()
             # the map keeps the file, which has no name, until nobody holds the column
@@ -141,17 +141,17 @@ class BlockStream:
         return np.concatenate(parts) if parts else np.empty(0)
 
     @property
-    def arrivals(self) -> NDArray[np.int64]:
+    def arrivals(self) -> Integers:
         """When each sample arrived [ns]."""
         return np.repeat(np.array(self._arrivals, dtype=np.int64), self._sizes)
 
-    def arrived(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def arrived(self, rows: Integers) -> Integers:
         """Return when some samples arrived [ns]."""
         ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
         block = np.searchsorted(ends, rows, 'right')
         return np.array(self._arrivals, dtype=np.int64)[block]
 
-    def labels(self) -> tuple[list[str], NDArray[np.int64]]:
+    def labels(self) -> tuple[list[str], Integers]:
         """Return the label of each stretch, and the row where it begins."""
         names: list[str] = []
         starts: list[int] = []

@@ -15,28 +15,27 @@ from typing import Any, BinaryIO
 import zipfile
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.record.channels import column_of
 from piezo_ident.record.record import Record
 
 __all__ = ['ROWS', 'Blocks', 'blocks_of', 'labels_of', 'write_mat', 'write_npz']
 
-Vector = NDArray[np.float64]
 #: yields the columns block by block, each time it is called
-Blocks = Callable[[], Iterator[Mapping[str, Vector]]]
+Blocks = Callable[[], Iterator[Mapping[str, Array]]]
 
 #: rows that are read and written together
 ROWS = 65536
 
 
-def blocks_of(record: Record, **further: Sequence[Vector]) -> Blocks:
+def blocks_of(record: Record, **further: Sequence[Array]) -> Blocks:
     """
     Return the columns of a record, its pieces below each other, as the writers take them.
 
     Further columns, one array a piece, stand in place of the channels.
     """
 
-    def blocks() -> Iterator[Mapping[str, Vector]]:
+    def blocks() -> Iterator[Mapping[str, Array]]:
         for i, piece in enumerate(record):
             columns = {'v': piece.v, 'y': piece.y}
             if further:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.dependence import Curve, curves_of
@@ -58,7 +58,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     )
 
 
-def _repaired(part: ResidualPart, bad: NDArray[np.bool_], out: NDArray[np.bool_]) -> ResidualPart:
+def _repaired(part: ResidualPart, bad: Mask, out: Mask) -> ResidualPart:
     """Return a part with bad samples bridged, and without those that are to be left out."""
     good = ~bad & part.mask
     if not bad.any() or not good.any():

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.operators.play import play_columns
 from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
 __all__ = ['ChannelTest', 'channel_tests', 'drive_functions', 'without_channels', 'without_drive']
-
-Array = NDArray[np.float64]
 
 #: rate of the means that are looked at [Hz]
 RATE = 2500.0
@@ -74,7 +72,7 @@ def drive_functions(v: Array, rate: float) -> Array:
     return np.stack(columns, axis=1)
 
 
-def without_drive(e: Array, v: Array, rate: float, use: NDArray[np.bool_]) -> Array:
+def without_drive(e: Array, v: Array, rate: float, use: Mask) -> Array:
     """Return a residual without the best sum of functions of the drive, shape (n,)."""
     A = np.hstack([drive_functions(v, rate), _slow(e.size)])
     return np.asarray(e - A @ _solve(A[use], e[use]))
@@ -113,7 +111,7 @@ class _Part:
     drive: Array
     channel: Array
     own: Array
-    use: NDArray[np.bool_]
+    use: Mask
     rate: float
 
     def beyond(self, x: Array, channel: Array | None = None) -> Array:

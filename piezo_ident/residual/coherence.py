@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.stretches import ResidualPart
 from scipy import fft, signal
 
 __all__ = ['Coherence', 'coherence', 'cross_spectra']
-
-Array = NDArray[np.float64]
 
 #: samples whose segments are transformed at once
 TOGETHER = 1 << 18
@@ -49,7 +48,7 @@ class Coherence:
 
     frequency: Array
     coherence: Array
-    tested: NDArray[np.bool_]
+    tested: Mask
     bound: float
     share: float
 

@@ -9,13 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 
 __all__ = ['Curve', 'curves_of']
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 #: samples after averaging, bins of a curve, bins a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
@@ -139,13 +136,7 @@ def _decades(t: Array) -> Integers:
 
 
 def _curve(
-    against: str,
-    branch: str,
-    x: Array,
-    e: Array,
-    bins: Integers,
-    chunk: Integers,
-    own: NDArray[np.bool_],
+    against: str, branch: str, x: Array, e: Array, bins: Integers, chunk: Integers, own: Mask
 ) -> Curve:
     bins, x, e, chunk = bins[own], x[own], e[own], chunk[own]
     size = int(bins.max(initial=0)) + 1

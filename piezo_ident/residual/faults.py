@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.faults import quantum_of
 from piezo_ident.record.record import Fault
@@ -18,9 +18,6 @@ from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
 __all__ = ['FaultSearch', 'find_faults']
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
 CHANCE, MOVED = 0.01, 3e-5

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.residual.beyond_drive import without_drive
 from piezo_ident.residual.reversals import TURN, turns_of
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, true_runs
@@ -18,8 +19,6 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
 
 __all__ = ['FAINT', 'FEWEST', 'Series', 'Spectrum', 'series_of']
-
-Array = NDArray[np.float64]
 
 #: the search goes to this share of half the rate after averaging, which is about this rate [Hz]
 TOP, RATE = 0.8, 2500.0
@@ -54,7 +53,7 @@ class Series:
     block: int
     rate: float
     driven: Array | None = None
-    locked: NDArray[np.bool_] | None = None
+    locked: Mask | None = None
 
     def gain(self, f: Array) -> NDArray[np.complex128]:
         """Return what the block means, and the differences, make of a wave at f."""
@@ -148,7 +147,7 @@ def _motions(
         return []
     tick = -round(piece.start_time * piece.sample_rate) % m
     e, v = (block_means(x[tick:], m) for x in (part.e, piece.v))
-    use: NDArray[np.bool_] = np.all(part.mask[tick : tick + e.size * m].reshape(-1, m), axis=1)
+    use: Mask = np.all(part.mask[tick : tick + e.size * m].reshape(-1, m), axis=1)
     e = without_drive(e, v, piece.sample_rate / m, use)
     found = []
     for start, stop in runs:
@@ -159,7 +158,7 @@ def _motions(
     return found
 
 
-def _locked(v: Array) -> NDArray[np.bool_]:
+def _locked(v: Array) -> Mask:
     """
     Return the bins at which a drive that goes on in periods may leave a line, shape (n // 2 + 1,).
 
@@ -222,9 +221,7 @@ class Spectrum:
         placed[: x.size - head] = x[head:]
         return cls(s, np.asarray(fft.rfft(placed))[: f.size], *_noise_around(s, f))
 
-    def between(
-        self, f: Array, near: NDArray[np.int64]
-    ) -> Callable[[Array], NDArray[np.complex128]]:
+    def between(self, f: Array, near: Integers) -> Callable[[Array], NDArray[np.complex128]]:
         """
         Return the transform as a function of any frequency [Hz] among some of the grid f.
 

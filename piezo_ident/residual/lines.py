@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
 from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
 from scipy import fft
@@ -23,8 +24,6 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
 
 __all__ = ['Line', 'LineSearch', 'find_lines', 'without_lines']
-
-Array = NDArray[np.float64]
 
 #: most lines that are looked for
 LINES = 6
@@ -197,7 +196,7 @@ class _Search:
             centres = centres + np.clip(move, -width, width)
         return float(centres[np.argmax(gain(centres))])
 
-    def _near(self, best: int) -> NDArray[np.int64]:
+    def _near(self, best: int) -> Integers:
         """Return the indices of the frequencies among which a line seen at one may be."""
         power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
         series = self._spectra[int(np.argmax(power))].series

@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
 __all__ = ['NoiseFloor', 'residual_noise_floor']
-
-Array = NDArray[np.float64]
 
 #: a frame of differences is freed of a slow change of this order
 ORDER = 3
@@ -48,7 +46,7 @@ class NoiseFloor:
 
     rms: float | None
     source: str
-    blocks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    blocks: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
     block_rms: Array = field(default_factory=lambda: np.zeros(0))
     frequency: Array = field(default_factory=lambda: np.zeros(0))
     density: Array = field(default_factory=lambda: np.zeros(0))

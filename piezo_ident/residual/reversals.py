@@ -10,12 +10,10 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.residual.stretches import block_means
 
 __all__ = ['EDGES', 'Way', 'turns_of', 'ways']
-
-Array = NDArray[np.float64]
 
 #: edges of the stretches behind a turn, shares of the voltage range
 EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.01)
@@ -41,7 +39,7 @@ class Way:
     n: int
 
 
-def turns_of(v: Array, least: float) -> NDArray[np.int64]:
+def turns_of(v: Array, least: float) -> Integers:
     """
     Return the indices at which a voltage turns and then moves by `least` [V] the other way.
 
@@ -78,8 +76,7 @@ def _way_since_turn(v: Array, span: float) -> Array:
 
 
 def ways(
-    pieces: Sequence[tuple[Array, NDArray[np.bool_], float]],
-    residuals: Sequence[Sequence[Array]],
+    pieces: Sequence[tuple[Array, Mask, float]], residuals: Sequence[Sequence[Array]]
 ) -> tuple[Way, ...]:
     """
     Return the rms of residuals by the way since the last turn; nothing where none is found.

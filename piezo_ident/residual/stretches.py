@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
 from piezo_ident.record.record import Piece, Segment
@@ -76,8 +76,8 @@ class ResidualPart:
 
     record: str
     piece: Piece
-    e: NDArray[np.float64]
-    sound: NDArray[np.bool_] | None = None
+    e: Array
+    sound: Mask | None = None
 
     def __post_init__(self) -> None:
         e = np.asarray(self.e, dtype=np.float64)
@@ -95,16 +95,16 @@ class ResidualPart:
         object.__setattr__(self, 'sound', sound)
 
     @property
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> Mask:
         """The samples that count, shape (n,)."""
         return np.ones(self.piece.n, bool) if self.sound is None else self.sound
 
     @property
-    def y_hat(self) -> NDArray[np.float64]:
+    def y_hat(self) -> Array:
         """Simulated displacement [m], shape (n,)."""
         return np.asarray(self.piece.y - self.e)
 
-    def with_residual(self, e: NDArray[np.float64]) -> ResidualPart:
+    def with_residual(self, e: Array) -> ResidualPart:
         """Return the same part with another residual."""
         return ResidualPart(self.record, self.piece, e, self.sound)
 
@@ -135,13 +135,13 @@ class Stretch:
         return self.stop - self.start
 
 
-def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def true_runs(mask: Mask) -> list[tuple[int, int]]:
     """Return the runs of true values, as first and behind the last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def without_spikes(e: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+def without_spikes(e: Array, bad: Mask) -> Array:
     """Return a signal with a straight line over up to `SPIKE` bad samples in a row."""
     at = [k for a, b in true_runs(bad) if b - a <= SPIKE for k in range(a, b)]
     if not at or len(at) == e.size:
@@ -157,7 +157,7 @@ def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
     return strokes((part.record, part.piece.y) for part in parts)
 
 
-def block_means(x: NDArray[np.float64], m: int) -> NDArray[np.float64]:
+def block_means(x: Array, m: int) -> Array:
     """Return the means of whole blocks of m samples, shape (n // m,)."""
     n = x.size // m
     # a product with a vector is several times faster than a mean along a short axis
@@ -202,7 +202,7 @@ def _shortest(rate: float) -> int:
     return max(REST_SAMPLES, round(REST_TIME * rate))
 
 
-def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
+def rests(v: Array, rate: float) -> list[tuple[int, int]]:
     """
     Return where a voltage rests, as the first sample that repeats the one before, and the end.
 
@@ -225,9 +225,7 @@ def rests(v: NDArray[np.float64], rate: float) -> list[tuple[int, int]]:
     return true_runs(still)
 
 
-def _motion(
-    v: NDArray[np.float64], number: int, start: int, stop: int, shortest: int
-) -> list[Stretch]:
+def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list[Stretch]:
     """Return the repeating stretches of a motion, and what lies between them."""
     if stop - start < shortest:
         return []
@@ -242,7 +240,7 @@ def _motion(
     return found
 
 
-def find_repeats(v: NDArray[np.float64], halvings: int = 3) -> list[tuple[int, int, int]]:
+def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
     """
     Return where a signal repeats itself: (first sample, behind the last, period), in order.
 
@@ -292,7 +290,7 @@ def find_repeats(v: NDArray[np.float64], halvings: int = 3) -> list[tuple[int, i
     return sorted(found)
 
 
-def _candidates(v: NDArray[np.float64]) -> list[int]:
+def _candidates(v: Array) -> list[int]:
     n, x = v.size, v - v.mean()
     # two more, so that a period which just fits is a minimum inside
     longest = n // (PERIODS + 1) + 2

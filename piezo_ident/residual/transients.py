@@ -8,15 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.reversals import TURN, turns_of
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, stretches_of
 from scipy import stats
 from scipy.ndimage import median_filter, uniform_filter1d
 
 __all__ = ['Transients', 'transients_in']
-
-Array = NDArray[np.float64]
 
 #: time over which power is averaged, and over which what is slow is taken away [s]
 SHORT, SLOW = 0.004, 0.04
@@ -43,7 +41,7 @@ class Transients:
     length: float = 0.0
 
 
-def transients_in(part: ResidualPart, known: NDArray[np.bool_], least: float) -> Transients:
+def transients_in(part: ResidualPart, known: Mask, least: float) -> Transients:
     """
     Return the knocks in rests and in motion that repeats.
 

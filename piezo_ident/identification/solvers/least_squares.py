@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear
 
@@ -31,7 +31,7 @@ def singular_is_ours() -> Iterator[None]:
         ) from error
 
 
-def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDArray[np.float64]:
+def triangular_factor(blocks: Iterable[Array], width: int) -> Array:
     """
     Return R of the QR factorisation of all rows, in constant memory; shape (width, width).
 
@@ -45,9 +45,7 @@ def triangular_factor(blocks: Iterable[NDArray[np.float64]], width: int) -> NDAr
     return R
 
 
-def bounded_least_squares(
-    R: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def bounded_least_squares(R: Array, lower: Array, upper: Array) -> tuple[Array, float]:
     """
     Minimise ``|A x - y|^2`` inside bounds, where R is the factor of ``[A y]``.
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
@@ -38,10 +38,10 @@ class OutputErrorFit:
     """Result of the refinement; the covariance is that of (a, b), for white output noise."""
 
     dynamics: Dynamics
-    covariance: NDArray[np.float64]
+    covariance: Array
 
     @property
-    def normalised_covariance(self) -> NDArray[np.float64]:
+    def normalised_covariance(self) -> Array:
         """Covariance of (a, b) of ``dynamics.normalised()``, whose b depend on the gain."""
         G, na = self.dynamics, self.dynamics.a.size
         J = np.eye(na + G.b.size)
@@ -54,9 +54,7 @@ class OutputErrorFit:
 
 
 @kernel
-def _first_row(
-    x: NDArray[np.float64], z: NDArray[np.float64], x_at: int, z_at: int, n: int, lags: int
-) -> NDArray[np.float64]:
+def _first_row(x: Array, z: Array, x_at: int, z_at: int, n: int, lags: int) -> Array:
     row = np.zeros(lags)
     # all lags of a stretch while it is in the cache
     for start in range(0, n, STRETCH):
@@ -72,15 +70,7 @@ def _first_row(
     return row
 
 
-def lag_products(
-    x: NDArray[np.float64],
-    z: NDArray[np.float64],
-    x_at: int,
-    z_at: int,
-    n: int,
-    n_x: int,
-    n_z: int,
-) -> NDArray[np.float64]:
+def lag_products(x: Array, z: Array, x_at: int, z_at: int, n: int, n_x: int, n_z: int) -> Array:
     """
     Return the sums of products of lagged signals, without the matrix of their lags.
 
@@ -121,14 +111,7 @@ def lag_products(
 
 
 @kernel
-def _fill_rows(
-    S: NDArray[np.float64],
-    x: NDArray[np.float64],
-    z: NDArray[np.float64],
-    x_at: int,
-    z_at: int,
-    n: int,
-) -> None:
+def _fill_rows(S: Array, x: Array, z: Array, x_at: int, z_at: int, n: int) -> None:
     for i in range(1, S.shape[0]):
         for j in range(1, S.shape[1]):
             first = x[x_at - i] * z[z_at - j]
@@ -139,14 +122,12 @@ def _fill_rows(
 Stretches = list[tuple[int, int]]
 
 
-def _mean(x: NDArray[np.float64], stretches: Stretches) -> float:
+def _mean(x: Array, stretches: Stretches) -> float:
     total = sum(float(np.sum(x[start:stop])) for start, stop in stretches)
     return total / sum(stop - start for start, stop in stretches)
 
 
-def _past(
-    x: NDArray[np.float64], stretches: Stretches, count: int, negative: bool = False
-) -> NDArray[np.float64]:
+def _past(x: Array, stretches: Stretches, count: int, negative: bool = False) -> Array:
     # before the record the stage was at rest; a constant has no part in what is eliminated with
     # the offsets, and without it the sums lose no digits
     level = _mean(x, stretches)
@@ -167,7 +148,7 @@ class _Problem:
         self.n = int(sum(s.use.sum() for s in stretches))
         self.used = [s.stretches for s in stretches]
 
-    def errors(self, model: Dynamics) -> list[NDArray[np.float64]]:
+    def errors(self, model: Dynamics) -> list[Array]:
         """Return what the free run leaves of each stretch, without its mean."""
         found = []
         for s, used in zip(self.stretches, self.used, strict=True):
@@ -177,15 +158,13 @@ class _Problem:
             found.append(e)
         return found
 
-    def loss(self, errors: Sequence[NDArray[np.float64]]) -> float:
+    def loss(self, errors: Sequence[Array]) -> float:
         total = 0.0
         for e, used in zip(errors, self.used, strict=True):
             total += sum(float(np.sum(np.square(e[start:stop]))) for start, stop in used)
         return total / self.n
 
-    def normal(
-        self, model: Dynamics, errors: Sequence[NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def normal(self, model: Dynamics, errors: Sequence[Array]) -> tuple[Array, Array]:
         na, p = self.na, self.na + self.nb
         H, g = np.zeros((p, p)), np.zeros(p)
         one = np.ones(1)

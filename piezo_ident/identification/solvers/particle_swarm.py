@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import frozen_array
+from piezo_ident.common.arrays import Array, frozen_array
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.kernel import kernel
 from scipy.optimize import OptimizeResult
@@ -49,15 +48,15 @@ class Quadratic:
     With P = A'A, g = A'y and c = y'y it is ``|A x - y|^2`` without the samples.
     """
 
-    P: NDArray[np.float64]
-    g: NDArray[np.float64]
+    P: Array
+    g: Array
     c: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'P', frozen_array(self.P))
         object.__setattr__(self, 'g', frozen_array(self.g))
 
-    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, x: Array) -> Array:
         """Return the objective at points x, shape (..., n)."""
         quadratic = np.einsum('...i,ij,...j->...', x, self.P, x)
         return np.asarray(quadratic - 2.0 * x @ self.g + self.c)
@@ -65,16 +64,16 @@ class Quadratic:
 
 @kernel
 def _fly(
-    P: NDArray[np.float64],
-    g: NDArray[np.float64],
+    P: Array,
+    g: Array,
     c: float,
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
-    X: NDArray[np.float64],
-    V: NDArray[np.float64],
-    own: NDArray[np.float64],
-    own_f: NDArray[np.float64],
-    random: NDArray[np.float64],
+    lower: Array,
+    upper: Array,
+    X: Array,
+    V: Array,
+    own: Array,
+    own_f: Array,
+    random: Array,
 ) -> None:
     n_particles, n = X.shape
     for k in range(random.shape[0]):
@@ -108,8 +107,8 @@ def _fly(
 
 def particle_swarm(
     fun: Quadratic,
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    lower: Array,
+    upper: Array,
     *,
     rng: np.random.Generator,
     swarm_size: int = 40,

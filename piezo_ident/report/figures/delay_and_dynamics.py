@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.identification.results import Identification
 from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import delay_from_steps, StepDelay
@@ -56,7 +57,7 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Fi
     return fig
 
 
-def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> NDArray[np.float64] | None:
+def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> Array | None:
     """Return the model's averaged response to the same steps, if they are all there."""
     before, after = -int(step.lag[0]), int(step.lag[-1]) + 1
     for labelled in (True, False):
@@ -75,10 +76,7 @@ def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> NDArray[np.float64
 
 
 def _draw_step(
-    axes: Axes,
-    identification: Identification,
-    step: StepDelay,
-    modelled: NDArray[np.float64] | None,
+    axes: Axes, identification: Identification, step: StepDelay, modelled: Array | None
 ) -> None:
     """Draw the size of the response where it leaves the noise."""
     rate, d = identification.model.sample_rate, identification.delay.samples
@@ -115,7 +113,7 @@ def _draw_step(
     style.legend(axes, loc='lower right', handlelength=1.2)
 
 
-def _draw_scan(axes: Axes, loss: NDArray[np.float64], scan: int | None, chosen: int) -> None:
+def _draw_scan(axes: Axes, loss: Array, scan: int | None, chosen: int) -> None:
     d = np.arange(loss.size)
     axes.semilogy(d, loss / loss.min(), 'o-', color=COLOURS['measured'], markersize=3, linewidth=1)
     axes.axvline(chosen, color=COLOURS['mark'], linewidth=1.4, label=f'used: {chosen}')
@@ -156,7 +154,7 @@ def response_figure(identification: Identification) -> Figure:
     else:
         slope = 1.0
 
-    def modelled(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def modelled(frequency: Array) -> NDArray[np.complex128]:
         lag = np.exp(-2j * np.pi * frequency * model.delay.total / rate)
         return np.asarray(scale * slope * model.dynamics.response(frequency, rate) * lag)
 
@@ -214,10 +212,7 @@ def _name_modes(
 
 
 def _draw_measured(
-    axes: Sequence[Axes],
-    measured: FrequencyResponse,
-    R: NDArray[np.complex128],
-    turns: NDArray[np.float64],
+    axes: Sequence[Axes], measured: FrequencyResponse, R: NDArray[np.complex128], turns: Array
 ) -> None:
     x, size, std = measured.frequency, np.abs(R), np.minimum(measured.std, 0.99)
     spread = np.degrees(std)

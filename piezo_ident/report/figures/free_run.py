@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sine_frequency, SineError
 from piezo_ident.record.record import Record, Segment
@@ -71,12 +71,7 @@ def _widest_loop(runs: Sequence[PieceRun]) -> tuple[PieceRun, Segment]:
 
 
 def _loop(
-    axes: Axes,
-    v: NDArray[np.float64],
-    y: NDArray[np.float64],
-    colour: str,
-    label: str = '',
-    width: float = 1.0,
+    axes: Axes, v: Array, y: Array, colour: str, label: str = '', width: float = 1.0
 ) -> None:
     k = style.envelope(y, LOOP_POINTS)
     v, y = v[k], y[k]
@@ -87,11 +82,7 @@ def _loop(
 
 
 def _draw_error(
-    axes: Axes,
-    x: NDArray[np.float64],
-    e: NDArray[np.float64],
-    e_static: NDArray[np.float64],
-    width: float,
+    axes: Axes, x: Array, e: Array, e_static: Array, width: float
 ) -> tuple[str, float]:
     """Draw errors [m], that of the hysteresis alone where both are readable; return the unit."""
     limit, largest = style.axis_limit(e)

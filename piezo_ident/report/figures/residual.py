@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.results import Residual
 from piezo_ident.record.record import Piece
 from piezo_ident.report.figures import style
@@ -138,7 +138,7 @@ def _both(
     return [(before, style.VERMILION, 'before'), (after, style.BLUE, 'after')]
 
 
-def _density(part: ResidualPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _density(part: ResidualPart) -> tuple[Array, Array]:
     """Return frequency [Hz] and amplitude density [m/sqrt(Hz)] of the longest sound stretch."""
     start, stop = max(part.runs(), key=lambda r: r[1] - r[0])
     n = min(stop - start, LONGEST)

@@ -20,7 +20,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 
 __all__ = [
     'COLOURS',
@@ -164,7 +164,7 @@ def length_unit(largest: float) -> tuple[str, float]:
     return ('nm', 1e9) if largest >= 1e-9 else ('pm', 1e12)
 
 
-def axis_limit(errors: NDArray[np.float64]) -> tuple[float, float]:
+def axis_limit(errors: Array) -> tuple[float, float]:
     """Return where to end an axis for some errors, and the largest; rare spikes are cut."""
     sizes = np.abs(errors)
     largest = float(sizes.max(initial=0.0))
@@ -179,7 +179,7 @@ def symmetric(axes: Axes, limit: float) -> None:
     axes.axhline(0.0, color=ZERO, linewidth=0.6, zorder=1)
 
 
-def envelope(y: NDArray[np.float64], points: int = POINTS) -> NDArray[np.int64]:
+def envelope(y: Array, points: int = POINTS) -> Integers:
     """
     Return the samples that show every extreme of a trace: about `points`, or all of a short one.
 
@@ -199,12 +199,7 @@ def envelope(y: NDArray[np.float64], points: int = POINTS) -> NDArray[np.int64]:
 
 
 def line(
-    axes: Axes,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    colour: str,
-    label: str | None = None,
-    **options: Any,
+    axes: Axes, x: Array, y: Array, colour: str, label: str | None = None, **options: Any
 ) -> None:
     """Draw a trace by its envelope, shapes (n,)."""
     k = envelope(y)
