@@ -176,8 +176,8 @@ def _table(
     scalars = {
         k: float(x.ravel()[0]) for k, x in numbers.items() if x.size == 1 and x.dtype.kind in 'iuf'
     }
-    choice = choose(candidates, options, path, scalars=scalars)
-    places = {role: candidates[place] for role, place in choice.places.items()}
+    found, table = choose(candidates, options, path, scalars=scalars)
+    places = {role: candidates[place] for role, place in found.items()}
     columns = {}
     for role, name in places.items():
         if role != 'segment':
@@ -194,7 +194,7 @@ def _table(
         names, starts = _segments(arrays, path)
     used = {*places.values(), *_LABELS, *scalars}
     ignored = tuple(k for k in everything if k not in used)
-    return replace(choice.table(columns, names, starts), ignored=ignored)
+    return replace(table, columns=columns, names=names, starts=starts, ignored=ignored)
 
 
 def _may_be_column(name: str, x: Any) -> bool:

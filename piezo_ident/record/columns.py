@@ -26,7 +26,7 @@ from piezo_ident.record.channels import channel_of_column, role_of
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
-__all__ = ['ChosenColumns', 'RecordTable', 'choose', 'listed']
+__all__ = ['RecordTable', 'choose', 'listed']
 
 _QUANTITIES = {'t': 'time', 'v': 'voltage', 'y': 'displacement'}
 _WORDS = {
@@ -77,25 +77,6 @@ class RecordTable:
     faults: tuple[Fault, ...] = ()
 
 
-@dataclass(frozen=True)
-class ChosenColumns:
-    """The place of each quantity among the columns, and what else `RecordTable` wants to know."""
-
-    places: dict[str, int]
-    ignored: tuple[str, ...]
-    units: Mapping[str, str]
-    rate: float | None
-    faults: tuple[Fault, ...]
-
-    def table(
-        self, columns: dict[str, Array], names: Sequence[str] = (), starts: ArrayLike = ()
-    ) -> RecordTable:
-        """Return the columns that were chosen as a table."""
-        return RecordTable(
-            columns, [*names], starts, self.ignored, self.units, self.rate, self.faults
-        )
-
-
 def listed(names: Iterable[str]) -> str:
     """Return names for a message, in one short line."""
     shown = ', '.join(n if n.isprintable() else ascii(n) for n in names if n)
@@ -109,9 +90,9 @@ def choose(
     *,
     scalars: Mapping[str, float] | None = None,
     empty: Iterable[int] = (),
-) -> ChosenColumns:
+) -> tuple[dict[str, int], RecordTable]:
     """
-    Decide which column is which.
+    Return the place of each quantity among the columns, and a table that lacks the columns.
 
     Parameters
     ----------
@@ -191,13 +172,14 @@ def choose(
             parts.insert(0, f't is k / {rate:.9g} Hz by {origin}')
         action = 'guessed; --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
-    return ChosenColumns(
-        places,
-        tuple(n for i, n in enumerate(names) if n and i not in used),
-        {role: unit for role, unit in units.items() if unit},
-        rate,
-        tuple(faults),
+    table = RecordTable(
+        {},
+        ignored=tuple(n for i, n in enumerate(names) if n and i not in used),
+        units={role: unit for role, unit in units.items() if unit},
+        rate=rate,
+        faults=tuple(faults),
     )
+    return places, table
 
 
 def _add_channels(

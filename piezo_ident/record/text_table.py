@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 import csv
+from dataclasses import replace
 import io
 import itertools
 from pathlib import Path
@@ -73,13 +74,13 @@ def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTabl
             f'{layout.width}): {way}',
             options=way,
         )
-    choice = choose(
+    places, table = choose(
         names or [''] * layout.width, options, path, scalars=layout.numbers, empty=layout.empty
     )
     columns, labels, starts = _rows(
-        itertools.chain(head[layout.above :], lines), layout, choice.places, path
+        itertools.chain(head[layout.above :], lines), layout, places, path
     )
-    return choice.table(columns, labels, starts)
+    return replace(table, columns=columns, names=labels, starts=starts)
 
 
 def _rows(
