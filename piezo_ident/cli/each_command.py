@@ -13,10 +13,11 @@ from types import SimpleNamespace
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.records import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.results import Settings
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
-from piezo_ident.many.table import columns_of, Row, unit_of, write_table
+from piezo_ident.many.table import columns_of, csv_text, Row, unit_of
 from piezo_ident.model.files import load
 
 __all__ = ['check_each', 'diagnose_each', 'identify_each']
@@ -80,7 +81,7 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             progress=lambda done, of: progress('records', done / of),
         )
     table = folder / 'records.csv'
-    write_table(rows, table)
+    write_text(table, csv_text(rows))
     bad = [row for row in rows if not row.is_good]
     if len(bad) == len(rows):
         raise DataError(

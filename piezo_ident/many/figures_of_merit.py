@@ -10,12 +10,10 @@ different orders.  These numbers are read from the response of H and of G.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['FiguresOfMerit', 'figures_of_merit']
+__all__ = ['figures_of_merit']
 
 #: samples of one branch of the loop, and frequencies at which G is evaluated
 BRANCH, FREQUENCIES = 400, 4000
@@ -25,39 +23,13 @@ LOWEST = 1e-4
 PEAK = 1.05
 
 
-@dataclass(frozen=True)
-class FiguresOfMerit:
+def figures_of_merit(model: StageModel) -> dict[str, float | None]:
     """
-    Figures of merit of a stage.
+    Return the figures of merit of a stage by the columns of `piezo_ident.many.table`.
 
-    Attributes
-    ----------
-    gain : float
-        Displacement over voltage between the ends of the identified range [m/V]; negative for a
-        stage that retracts.
-    loop_width : float
-        Largest distance between the branches of the settled loop over that range, in % of its
-        stroke.
-    bandwidth : float or None
-        Lowest frequency at which |G| has fallen to 1/sqrt(2) [Hz]; None when it never does.
-    resonance, peak : float or None
-        Frequency of the largest |G| [Hz], and its value there; None without a resonance.
-    """
-
-    gain: float
-    loop_width: float
-    bandwidth: float | None
-    resonance: float | None
-    peak: float | None
-
-
-def figures_of_merit(model: StageModel) -> FiguresOfMerit:
-    """
-    Return the figures of merit of a stage from H and G of its model.
-
-    Parameters
-    ----------
-    model : StageModel
+    The gain [m/V] is negative for a stage that retracts; the loop width is in % of the stroke over
+    the identified range.  The bandwidth, down to 1/sqrt(2), is None when |G| never falls so far;
+    the resonance, the frequency of the largest |G|, and its peak are None without one.
 
     Examples
     --------
@@ -67,11 +39,11 @@ def figures_of_merit(model: StageModel) -> FiguresOfMerit:
     >>> scaling = Scaling(0.0, 10.0, 0.0, 70e-6, (0.0, 10.0))
     >>> line = Hysteresis([], [], 0.0, 1.0)
     >>> stage = figures_of_merit(StageModel(1e4, scaling, line, Dynamics.unit(), Delay(3)))
-    >>> print(f'{stage.gain:.1e} {stage.loop_width:g} {stage.resonance}')
+    >>> print(f'{stage["gain"]:.1e} {stage["loop_width"]:g} {stage["resonance"]}')
     7.0e-06 0 None
     """
-    gain, width = _loop(model)
-    return FiguresOfMerit(gain, width, *_frequency_response(model))
+    names = ('gain', 'loop_width', 'bandwidth', 'resonance', 'resonance_peak')
+    return dict(zip(names, (*_loop(model), *_frequency_response(model)), strict=True))
 
 
 def _loop(model: StageModel) -> tuple[float, float]:

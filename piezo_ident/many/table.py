@@ -10,11 +10,9 @@ import csv
 from dataclasses import dataclass, field
 import io
 import math
-from pathlib import Path
 import re
 from typing import Any
 
-from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.many.figures_of_merit import figures_of_merit
@@ -30,7 +28,6 @@ __all__ = [
     'identified',
     'natural',
     'unit_of',
-    'write_table',
 ]
 
 #: content of a cell
@@ -167,12 +164,6 @@ def _text(value: Value) -> str:
     return '' if value is None else repr(value)
 
 
-def write_table(rows: Sequence[Row], path: Path) -> None:
-    """Write the table as a CSV file."""
-    # file names need not be Unicode
-    write_text(path, csv_text(rows).encode('utf-8', 'replace').decode('utf-8'))
-
-
 def _head(record: Record) -> dict[str, Value]:
     low, high = record.voltage_range
     return {
@@ -192,7 +183,7 @@ def _number(value: float | None) -> float | None:
 def identified(result: Identification, record: Record) -> dict[str, Value]:
     """Return the cells of an identification by their columns."""
     model = result.model
-    h, stage = model.hysteresis, figures_of_merit(model)
+    h = model.hysteresis
     values: dict[str, Value] = {
         **_head(record),
         'method': str(model.identification['method']),
@@ -200,14 +191,10 @@ def identified(result: Identification, record: Record) -> dict[str, Value]:
         'error_selection': _number(result.error('selection')),
         'error_fitted': _number(result.error('fitted')),
         'noise_floor': _number(result.noise_floor),
-        'gain': stage.gain,
-        'loop_width': stage.loop_width,
+        **figures_of_merit(model),
         'delay': model.delay.total / model.sample_rate,
         'delay_samples': model.delay.total,
         'delay_std': _number(result.delay.std),
-        'bandwidth': stage.bandwidth,
-        'resonance': stage.resonance,
-        'resonance_peak': stage.peak,
         'order_a': model.dynamics.a.size,
         'order_b': model.dynamics.b.size,
         'p1': h.p1,
