@@ -40,20 +40,10 @@ def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
 
     What three samples in a row reach belongs to the range; one or two alone may leave it by a
     quarter of its width and four times the usual step from sample to sample, and are left out
-    beyond.  So the range of sound data, noise included, is that from minimum to maximum.
+    beyond.  So the range of sound data, noise included, is that from minimum to maximum.  The
+    parts are samples in the order in which they were taken; without any samples both ends are
+    zero.
 
-    Parameters
-    ----------
-    parts : iterable of ndarray, shape (n,)
-        Samples in the order in which they were taken; empty parts do not count.
-
-    Returns
-    -------
-    tuple of float
-        Both zero when there are no samples.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> robust_range([np.array([0.0, 0.0, 1.0, 3.0, 3.0, 3.0, 90.0, 2.0, 1.0, 0.0])])
     (0.0, 3.0)

@@ -43,20 +43,11 @@ def shipped_names(prefix: str = '') -> list[str]:
 
 def find_config(name: str | os.PathLike[str], kind: str) -> Path:
     """
-    Return the file that a name or a path stands for.
+    Return the file that a name or a path of a program or a stage, the `kind`, stands for.
 
-    Parameters
-    ----------
-    name : path
-        ``identification`` is the shipped ``program_identification.yaml``.  A path is taken as it
-        is; where nothing stands there, the shipped file of the same name is.
-    kind : {'program', 'stage'}
-        What is looked for.
-
-    Raises
-    ------
-    ConfigError
-        When there is no such file; the message names those that there are.
+    ``identification`` is the shipped ``program_identification.yaml``.  A path is taken as it is;
+    where nothing stands there, the shipped file of the same name is.  Where there is no such file,
+    ConfigError names those that there are.
     """
     path = Path(name)
     plain = path.suffix == '' and path.name == str(name)

@@ -93,22 +93,10 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
     """
-    Parse a YAML mapping with the safe loader.
+    Parse a YAML mapping of at most `YAML_SIZE` characters with the safe loader.
 
-    Parameters
-    ----------
-    text : str
-        At most `YAML_SIZE` characters.
-    name : str
-        What error messages call it.
+    ConfigError, which calls the text by `name`, when it is not YAML, not a mapping, or too large.
 
-    Raises
-    ------
-    ConfigError
-        When the text is not YAML, not a mapping, or too large.
-
-    Examples
-    --------
     >>> parse_yaml('limits: [0, 10]', 'program')
     {'limits': [0, 10]}
     """
@@ -158,24 +146,9 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     Yield a path of the same file name in a new folder beside `path`; rename it on success.
 
     A new output gets the rights that the umask gives it, a replaced one keeps its own.  Where
-    `path` is a symbolic link, the file that it leads to is written.
-
-    Parameters
-    ----------
-    path : path
-        Where the finished file or folder will be.
-    overwrite : bool
-        Replace what is there.  A folder is only replaced when it is a bag and nothing else.
-
-    Raises
-    ------
-    DataError
-        When the place is taken or cannot be written to; then nothing is left there.
-
-    Examples
-    --------
-    >>> with temporary_output('model.yaml', overwrite=True) as file:  # doctest: +SKIP
-    ...     file.write_text(text)
+    `path` is a symbolic link, the file that it leads to is written.  Only with `overwrite` what is
+    there is replaced, a folder only when it is a bag and nothing else.  DataError when the place
+    is taken or cannot be written to; then nothing is left there.
     """
     path = Path(path)
     if path.name in ('', '..'):

@@ -115,25 +115,12 @@ class WorkerProcess:
 
     def run(self, job: Job, tick: Tick = lambda step, share: None) -> Any:
         """
-        Do a job in the process and return its result.
+        Do a job in the process and return its result, or raise what the job raises.
 
-        Parameters
-        ----------
-        job : callable
-            Picklable, as its result must be: a function of a module, or a partial of one.
-        tick : callable, optional
-            Called here with the latest step and share, many times a second; when it raises, the
-            job is cancelled.
+        The job, a function of a module or a partial of one, and its result are picklable.  `tick`
+        is called here with the latest step and share, many times a second; when it raises, the job
+        is cancelled.  PiezoIdentError when the process dies.
 
-        Raises
-        ------
-        PiezoIdentError
-            When the process dies.
-        Exception
-            Whatever the job, or `tick`, raises.
-
-        Examples
-        --------
         >>> import functools, operator
         >>> worker = WorkerProcess()
         >>> worker.run(functools.partial(operator.is_not, None))

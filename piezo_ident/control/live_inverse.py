@@ -256,17 +256,7 @@ class _Pass:
     """
     One pass of the iteration: its filter, its H^-1 and its model, a little behind the one before.
 
-    Parameters
-    ----------
-    model : StageModel
-    H : HysteresisInverse
-    Q : LinearInverse
-    wait : int
-        Samples that it holds back for nothing.
-    left : int
-        Passes that come after it.
-    is_first : bool
-        Whether none comes before it.
+    It holds back `wait` samples for nothing; `left` passes come after it.
     """
 
     def __init__(
@@ -322,19 +312,9 @@ class _Pass:
         """
         Return what the next pass works on, of as many samples as are known far enough ahead.
 
-        Parameters
-        ----------
-        x, d, w : ndarray, shape (n,)
-            Wanted motion, what of it is missing, and H so far, normalised.
-
-        Returns
-        -------
-        x, d, w : ndarray, shape (m,)
-            The same after this pass.
-        u : ndarray, shape (m,)
-            Voltage, normalised.
-        short : ndarray of bool, shape (m,)
-            Where H could not become what it should.
+        x, d and w, shape (n,), are the wanted motion, what of it is missing, and H so far,
+        normalised.  The result are the same after this pass, the voltage u, normalised, and where
+        H could not become what it should; all of shape (m,).
         """
         x, d, w = (np.append(*z) for z in ((self._x, x), (self._d, d), (self._w, w)))
         n = max(x.size - self._ahead, 0)

@@ -69,18 +69,9 @@ def next_experiment(
     Return the experiment that would decide what is open, None when nothing is or none would.
 
     First comes what was found or could not be separated, then what could not be tested at all.
+    Without a diagnosis there were no data to judge.  What was asked for already is not asked for
+    again.
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis or None
-        None when there were no data to judge.
-    records : sequence of Record
-        Those that were judged.
-    asked : sequence of {'sweeps', 'holds'}
-        What was asked for already; it is not asked for again.
-
-    Examples
-    --------
     >>> next_experiment(None).kind
     'sweeps'
     """

@@ -26,23 +26,9 @@ def build_axes(
     Return one sequence for each of several axes, with the same segments at the same samples.
 
     Noise and multisines of each axis are drawn for it alone, so they tell which voltage moved
-    what.  Of one axis the sequence is that of `Program.build`.
+    what.  Of one axis the sequence is that of `Program.build`, whose limits and errors hold here
+    too.
 
-    Parameters
-    ----------
-    program : Program
-    count : int
-        Number of axes.
-    sample_rate, limits
-        As for `Program.build`.
-
-    Raises
-    ------
-    ConfigError
-        As for `Program.build`.
-
-    Examples
-    --------
     >>> import piezo_ident as pi
     >>> first, second = build_axes(pi.Program.load('two_axes'), 2)
     >>> first.segments == second.segments, bool((first.v == second.v).all())

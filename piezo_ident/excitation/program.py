@@ -267,22 +267,10 @@ def _where(name: str, number: int, signal: object) -> str:
 
 def parse_program(text: str, name: str = 'program') -> Program:
     """
-    Read a program from text.
+    Read a program from YAML; `name` is what messages call it.
 
-    Parameters
-    ----------
-    text : str
-        YAML.
-    name : str, optional
-        What to call it in messages.
+    ConfigError when a key is unknown, missing, of the wrong type or out of range.
 
-    Raises
-    ------
-    ConfigError
-        When a key is unknown, missing, of the wrong type or out of range.
-
-    Examples
-    --------
     >>> program = parse_program('''
     ... limits: [0, 10]
     ... segments:

@@ -21,23 +21,11 @@ HIGHEST = 0.4
 
 def scaled(program: Program, limits: tuple[float, float], sample_rate: float) -> Program:
     """
-    Return a program between other limits, as long as before.
+    Return a program between other limits [V], for another sampling rate [Hz], as long as before.
 
-    Parameters
-    ----------
-    program : Program
-    limits : tuple of float
-        Lowest and highest voltage [V]; levels are shifted and scaled, sizes and speeds scaled.
-    sample_rate : float
-        [Hz]; frequencies above 0.4 times it are lowered to that.
+    Levels are shifted and scaled, sizes and speeds scaled; frequencies above 0.4 times the
+    sampling rate are lowered to that.  A signal with voltages of its own raises ConfigError.
 
-    Raises
-    ------
-    ConfigError
-        When a signal has voltages of its own.
-
-    Examples
-    --------
     >>> import piezo_ident as pi
     >>> v = scaled(pi.Program.load('validation'), (-20, 120), 2000).build().v
     >>> float(v.min()), float(v.max())

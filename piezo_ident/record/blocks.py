@@ -89,21 +89,10 @@ def quantity_of(dims: Sequence[Any]) -> str | None:
 
 def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Samples:
     """
-    Return the samples of a block.
+    Return the samples of a block, from the numbers of its message, shape (2 n,), and their layout.
 
-    Parameters
-    ----------
-    data : array_like, shape (2 n,)
-        The message's numbers; not copied.
-    dims : sequence of Dimension, or of std_msgs/MultiArrayDimension
-        The message's layout.
-    data_offset : int
-        Numbers in front of the matrix.
-
-    Raises
-    ------
-    DataError
-        When the layout is not that of a block, or does not fit the data.
+    The numbers are not copied; `data_offset` is how many stand in front of the matrix.  DataError
+    when the layout is not that of a block, or does not fit the data.
     """
     flat = np.asarray(data, dtype=np.float64)
     quantity = quantity_of(dims)

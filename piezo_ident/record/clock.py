@@ -222,22 +222,11 @@ def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
 
 def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
     """
-    Fit a uniform clock to increasing stamps.
+    Fit a uniform clock to increasing stamps [s], two at least, of one uniform stretch.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,), n >= 2
-        Stamps of one uniform stretch [s].
-    resolution : Resolution
-        Of the whole file.
-    known : iterable of float
-        Rates [Hz] to prefer, in this order, where the stamps allow them: a short stretch cannot
-        tell its rate as well as a longer one of the same file.
-
-    Returns
-    -------
-    Clock
-        With the rate of fewest digits that the stamps allow.
+    Its rate is the one of fewest digits that the stamps allow, at the resolution of the whole
+    file.  Rates [Hz] that are `known` are preferred, in their order, where the stamps allow them:
+    a short stretch cannot tell its rate as well as a longer one of the same file.
     """
     dt = float(t[-1] - t[0]) / (t.size - 1)
     low, high = rate_bounds(t, _rounding(resolution, dt))
@@ -334,16 +323,10 @@ def has_restarted(first: float, last: float, begin: float, period: float) -> boo
     Return whether time that jumps back is a restart of the sample clock.
 
     It is when the new stretch starts at or before the start of the old one, or more than
-    `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.
+    `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.  The
+    times [s] are those of the first sample of the new stretch, of the newest sample so far, and of
+    the first one since the last restart; `period` is the sampling period [s].
 
-    Parameters
-    ----------
-    first, last, begin, period : float
-        Time of the first sample of the new stretch, of the newest sample so far, and of the first
-        one since the last restart, and the sampling period [s].
-
-    Examples
-    --------
     >>> has_restarted(0.0, last=0.02, begin=0.0, period=5e-5)
     True
     >>> has_restarted(0.01, last=0.02, begin=0.0, period=5e-5)

@@ -150,24 +150,11 @@ def join(
     streams: Mapping[str, BlockStream], beside: Mapping[str, BlockStream] | None = None
 ) -> Joined:
     """
-    Join streams on their time stamps.
+    Join streams, by quantity, on their time stamps: one column a stream.
 
-    Parameters
-    ----------
-    streams : mapping of str to BlockStream
-        By quantity; the first gives the order and the segments.
-    beside : mapping of str to BlockStream, optional
-        Streams that are looked up where they have a value, and leave NaN where they have none.
-
-    Returns
-    -------
-    Joined
-        One column a stream.
-
-    Raises
-    ------
-    DataError
-        When a stream has two values for one time, or no stamp is in all streams.
+    The first one gives the order and the segments.  Streams `beside` are looked up where they have
+    a value, and leave NaN where they have none.  DataError when a stream has two values for one
+    time, or no stamp is in all streams.
     """
     beside = beside or {}
     first, lead = next(iter(streams.items()))

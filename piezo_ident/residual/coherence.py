@@ -59,18 +59,9 @@ def cross_spectra(
     """
     Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
 
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-    size : int
-        Length of the Hann segments, at most n; they overlap by half.
-    linear : bool, optional
-        Take a line out of each segment (default), or else its mean.
-
-    Returns
-    -------
-    tuple of ndarray, shape (size // 2 + 1,)
-        In no unit: only ratios of them tell anything.
+    The Hann segments of some size, at most n, overlap by half; a line is taken out of each, or
+    without `linear` its mean.  The sums, shape (size // 2 + 1,), have no unit: only ratios of them
+    tell anything.
     """
     window, step = signal.get_window('hann', size), size - size // 2
     segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]

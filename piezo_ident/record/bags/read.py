@@ -107,24 +107,12 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
 
 def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
     """
-    Read a rosbag2 folder, or a single .mcap or .db3 file.
+    Read a rosbag2 folder, or a single .mcap or .db3 file; `choices` replace fields of the options.
 
     Where the bag holds ``applied_voltage`` beside the voltage, samples that the amplifier's guard
-    altered are cut out, as in a live capture.
-
-    Parameters
-    ----------
-    path : path
-        The folder or file.
-    options : ReadOptions, optional
-    **choices
-        Fields of `ReadOptions`, in place of those of `options`.
-
-    Raises
-    ------
-    DataError
-        For a damaged bag, for blocks whose layout does not fit, when no topic or more than one
-        carries the voltage or the displacement, and for all that `assemble` refuses.
+    altered are cut out, as in a live capture.  DataError for a damaged bag, for blocks whose
+    layout does not fit, when no topic or more than one carries the voltage or the displacement,
+    and for all that `assemble` refuses.
     """
     path = Path(path)
     options = replace(options or ReadOptions(), **choices)

@@ -279,31 +279,13 @@ def write_bag(
     block_size: int = BLOCK_SIZE,
 ) -> None:
     """
-    Write a record as a rosbag2 folder, or as a single file when `path` ends so.
+    Write a record as a rosbag2 folder, or as a single file when `path` ends in .mcap or .db3.
 
     A block's log time is the time of its first sample.  Where the record starts before zero, or
-    its clock restarts, log times are moved later by whole seconds, so that they stay positive
-    and in the order of the messages; the samples keep their own times.
-
-    Parameters
-    ----------
-    record : Record
-        What to write.
-    path : path
-        The folder, or a file name that ends in .mcap or .db3.
-    storage : {'mcap', 'sqlite3'}, optional
-        Storage of a folder; mcap unless told.
-    overwrite : bool
-        Replace an existing bag.
-    custom_data : mapping of str to str, optional
-        For the bag's metadata beside ``sample_rate``: seed, program.
-    block_size : int
-        Samples a block.
-
-    Raises
-    ------
-    DataError
-        When the place is taken or cannot be written to.
+    its clock restarts, log times are moved later by whole seconds, so that they stay positive and
+    in the order of the messages; the samples keep their own times.  The storage of a folder is
+    mcap or sqlite3, mcap by default; the custom data, such as seed and program, join the
+    ``sample_rate`` in the metadata.  DataError when the place is taken or cannot be written to.
     """
     path = Path(path)
     suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
