@@ -36,8 +36,8 @@ __all__ = [
     'read_all',
 ]
 
-#: faults that are told when a record has been read
-TOLD = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'high_voltage')
+#: faults that are shown when a record has been read
+SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
 #: what may be a record, but is often something else
@@ -181,12 +181,12 @@ def read_all(
             ) from None
         records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
     # before the work: a wrong unit may be what it fails of
-    said: dict[str, list[str]] = {}
+    shown: dict[str, list[str]] = {}
     for record in records:
         for fault in record.faults:
-            if fault.name in TOLD:
-                said.setdefault(f'{fault.where} ({fault.action})', []).append(record.name)
-    for text, of in said.items():
+            if fault.name in SHOWN:
+                shown.setdefault(f'{fault.where} ({fault.action})', []).append(record.name)
+    for text, of in shown.items():
         console.note(f'{of[0]}{f" and {len(of) - 1} more" if of[1:] else ""}: {text}')
     return records
 
@@ -194,7 +194,7 @@ def read_all(
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
     """Print the faults of a record, and what the file it was written to cannot keep."""
     for fault in record.faults:
-        if fault.name not in TOLD:
+        if fault.name not in SHOWN:
             console.say(f'met: {fault}')
     for loss in losses:
         console.say(f'not kept: {loss}')

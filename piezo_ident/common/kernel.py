@@ -7,7 +7,7 @@ How a numerical loop becomes a compiled kernel: cached on disk, without the inte
 Compiled kernels are kept in the folder ``NUMBA_CACHE_DIR`` where that is set, else in
 ``__pycache__`` beside their files, else, where the installation cannot be written, in the cache of
 the user (``~/.cache/numba``).  Where none of them can be written, each process compiles its
-kernels anew.  A process that compiles says so on the log ``piezo_ident``, once.
+kernels again.  A process that compiles says so on the log ``piezo_ident``, once.
 """
 
 from __future__ import annotations
@@ -95,6 +95,6 @@ def alive(x: float) -> float:
     out, and from there on each operation takes a processor a hundred times as long.
 
     It is compiled into each loop that calls it, and loops are kept on disk until their own file
-    changes: whoever changes it has to empty their caches.
+    changes: after a change of it their caches have to be emptied.
     """
     return 0.0 if abs(x) < STILL else x

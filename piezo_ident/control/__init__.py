@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The inverse of a model: the voltage under which a stage goes where it is told."""
+"""The inverse of a model: the voltage under which a stage moves as wanted."""

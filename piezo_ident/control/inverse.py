@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The voltage under which a model goes where it is told.
+The voltage under which a model moves as wanted.
 
 The inverse of G and of H come one after the other; what effects and the edges of a filter leave is
 then made up for by a fixed-point iteration,
@@ -11,7 +11,7 @@ then made up for by a fixed-point iteration,
 
 with y(u) the whole model in free run, and shorter steps where one leads away.  It converges as
 long as what is left out is small beside the stage, which creep, rate dependence and a bent sensor
-are; how far it came is told.  The lag of an amplifier has an inverse of its own.
+are; the result says how far it came.  The lag of an amplifier has an inverse of its own.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def invert(
     warnings += (
         _creeping(model, float(v[0]))
         if like is None
-        else [told for told in like.warnings if told.startswith(CREEPS)]
+        else [text for text in like.warnings if text.startswith(CREEPS)]
     )
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     lead -= used.start
@@ -325,14 +325,14 @@ def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) 
 def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
     """Return a warning where the model is asked for what it was not identified for."""
     s = model.scaling
-    (low, high), told = s.range, []
+    (low, high), warnings = s.range, []
     outside = np.mean((v < low - SHORT * s.V) | (v > high + SHORT * s.V))
     if outside:
-        told.append(
+        warnings.append(
             f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '
             f'identified range {low:g} .. {high:g} V, where the model is an extrapolation'
         )
-    return [*told, *_faint(model, y)]
+    return [*warnings, *_faint(model, y)]
 
 
 def _faint(model: StageModel, y: Array) -> list[str]:
@@ -376,8 +376,8 @@ def _creeping(model: StageModel, v0: float) -> list[str]:
     left = only.stream().reset(v0) - risen
     if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
         return []
-    told = f'{CREEPS}: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
-    return [f'{told} left to where the motion begins; wait longer, or begin it under {low:g} V']
+    text = f'{CREEPS}: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
+    return [f'{text} left to where the motion begins; wait longer, or begin it under {low:g} V']
 
 
 def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The voltage under which a model goes where it is told, while it is told: block by block.
+The voltage under which a model moves as wanted, block by block while the motion comes in.
 
 The offline inverse repeats one pass over the whole motion,
 
@@ -11,7 +11,7 @@ The offline inverse repeats one pass over the whole motion,
 and Q looks ahead by a few samples alone.  So pass after pass may run behind the one before it by
 as many samples: each has its own H^-1 and its own model, which run once over every sample, and
 nothing is done twice.  That is the offline iteration, sample by sample, but for the ends of Q that
-do not fit into the preview; what they cost is tried out beforehand and told.
+do not fit into the preview; what they cost is tried out beforehand and reported.
 """
 
 from __future__ import annotations
@@ -355,8 +355,8 @@ def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
     ]
     if not left:
         return model, ()
-    told = ', '.join(setting.name for setting in left)
+    names = ', '.join(setting.name for setting in left)
     kept = tuple(setting for setting in model.effects if setting not in left)
     return replace(model, effects=kept), (
-        f'{told} is not made up for: a further channel is not known ahead',
+        f'{names} is not made up for: a further channel is not known ahead',
     )

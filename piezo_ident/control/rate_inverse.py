@@ -31,7 +31,7 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 
 __all__ = ['RateInverse']
 
-#: times that the speed is taken anew, and the corner of its smoothing in cutoffs of the effect
+#: times that the speed is taken again, and the corner of its smoothing in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
 #: share of the square of what a pass misses that it must leave at most for another one
 WORTH = 0.7

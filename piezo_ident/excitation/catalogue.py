@@ -132,7 +132,7 @@ _COUNT = Option('1', whole=True)
 
 
 def _signal(name: str, kind: str = '', **options: Option) -> Callable[[Maker], Maker]:
-    """Enter a maker into the catalogue; `kind` is the name unless told."""
+    """Enter a maker into the catalogue; `kind` is the name by default."""
 
     def enter(make: Maker) -> Maker:
         SIGNALS[name] = Signal(kind or name, options, make)

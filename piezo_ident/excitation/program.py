@@ -254,7 +254,7 @@ class Program:
             append(label, part.v)
             level = min(max(part.end, low), high)
         go_to(self.rest)
-        # a last sample at rest, so that whoever holds the last value holds the rest voltage
+        # a last sample at rest, so that the rest voltage is what is held
         if segments[-1].kind == 'ramp':
             pieces.append(np.array([self.rest]))
             segments[-1] = replace(segments[-1], stop=n + 1)

@@ -232,7 +232,7 @@ def prepare(records: Sequence[Record]) -> Prepared:
                 'judged'
             )
     # of columns that are swapped, v has the noise of a sensor
-    faults += [said for record in measured for said in suspicions(record)]
+    faults += [text for record in measured for text in suspicions(record)]
     return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
 
 

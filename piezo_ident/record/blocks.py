@@ -36,7 +36,7 @@ __all__ = [
     'quantity_of',
 ]
 
-#: samples in a block unless told otherwise
+#: samples in a block by default
 BLOCK_SIZE = 100
 
 

@@ -40,7 +40,7 @@ _CHUNK = 1 << 20
 JUMP_BACK = 1000
 #: fewer steps than this between two finer runs are gaps, not a slower sampling rate
 _SHORT = 8
-#: deviation from the uniform grid, in samples, that nobody needs to hear of
+#: deviation from the uniform grid, in samples, that is not worth a notice
 _NEGLIGIBLE = 0.01
 
 

@@ -262,11 +262,11 @@ def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
         # LabVIEW's name for time
         base = 'time' if base.casefold() == 'x_value' else base
         words = set(re.findall(r'[^\W\d_]+', re.sub(r'([a-z])([A-Z])', r'\1 \2', base).casefold()))
-        said = {r for r, known in _WORDS.items() if words & set(known.split())}
+        named = {r for r, known in _WORDS.items() if words & set(known.split())}
         # the voltage of a sensor is neither a command nor a displacement
-        if said == {role}:
+        if named == {role}:
             by_word.append(i)
-        elif measured and not said:
+        elif measured and not named:
             by_unit.append(i)
     return by_word or by_unit
 

@@ -143,7 +143,7 @@ def _factor(table: RecordTable, role: str) -> float:
 
 
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
-    """Say where another unit is likelier than the one that nobody named, or a header names."""
+    """Yield where another unit is likelier than the default, or than that of a header."""
     if table.rate is None and options.time_unit is None:
         unit = table.units.get('t', 's')
         rates = [piece.sample_rate for piece in record]

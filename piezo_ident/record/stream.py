@@ -135,7 +135,7 @@ class BlockStream:
     def _column(self, k: int) -> Array:
         if self._files:
             self._spool()
-            # the map keeps the file, which has no name, until nobody holds the column
+            # the map keeps the file, which has no name, until the column is gone
             return np.asarray(np.memmap(self._files[k], np.float64, 'r', shape=(self.n,)))
         parts = [rows[:, k] for rows in (*self._chunks, *self._newest)]
         return np.concatenate(parts) if parts else np.empty(0)
@@ -166,7 +166,7 @@ class BlockStream:
 
 class LossCount:
     """
-    Counts what is missing in the numbers of a topic's messages, whoever of several sent them.
+    Counts what is missing in the numbers of a topic's messages, of one publisher or several.
 
     >>> losses = LossCount()
     >>> for number in (7, 8, 1, 9, 2, 5):

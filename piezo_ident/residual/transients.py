@@ -99,7 +99,7 @@ def _follows_turns(v: Array, events: list[tuple[int, float, float]], m: int) -> 
         return False
     last = np.searchsorted(turns, inside, side='right') - 1
     way = turns[last + 1] - turns[last]
-    # where it turns all the time nobody can tell
+    # where it turns all the time no place can be told
     share = ((inside - turns[last]) / way)[way > WAY * m]
     if share.size < 2:
         return False

@@ -181,7 +181,7 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
 
 
 def is_computed(topic: str) -> bool:
-    """Return whether a topic is one of a model's, which nobody has measured."""
+    """Return whether a topic is computed by a model, and not measured."""
     return topic.rpartition('/')[2] in ('prediction', 'residual')
 
 

@@ -129,7 +129,7 @@ def _storage_files(path: Path) -> list[Path]:
         try:
             listed = [path / Path(name).name for name in metadata(path)['relative_file_paths']]
         except (ConfigError, TypeError, KeyError):
-            return []  # whoever opens it meets the same
+            return []  # opening it meets the same
         return [file for file in listed if file.exists()]
     files = [f for f in sorted(path.iterdir()) if f.suffix in ('.mcap', '.db3')]
     if not files:

@@ -40,9 +40,9 @@ def drive_figure(drive: Inverse) -> Figure:
     edges = np.flatnonzero(np.diff(drive.clipped, prepend=False, append=False))
     for k, (first, stop) in enumerate(edges.reshape(-1, 2).tolist()):
         for axes in volts, motion:
-            told = 'out of reach' if axes is motion and not k else None
+            text = 'out of reach' if axes is motion and not k else None
             last = t[min(stop, t.size - 1)]
-            axes.axvspan(t[first], last, color=COLOURS['held out'], zorder=0, label=told)
+            axes.axvspan(t[first], last, color=COLOURS['held out'], zorder=0, label=text)
     tidy(volts, '', 'voltage / V')
     tidy(motion, '', 'displacement / µm')
     tidy(error, 'time / s', f'error / {unit}')
