@@ -15,7 +15,7 @@ from piezo_ident.residual.coherence import cross_spectra
 from piezo_ident.residual.stretches import block_means, true_runs
 from scipy import signal
 
-__all__ = ['drive_creep', 'refuse_closed_loop', 'refuse_undriven']
+__all__ = ['refuse_closed_loop', 'refuse_undriven']
 
 #: chance below which the displacement answers the voltage, and samples that it takes to tell
 CHANCE, MIN_COHERENCE = 1e-7, 256
@@ -109,20 +109,13 @@ def _refuse_hold(name: str, piece: Piece, span: float, stroke: float) -> None:
         if stop - start < 4 or moved <= 0.005 or followed >= 0.05 * moved:
             continue
         t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
-        creep = drive_creep(piece, start * window, stop * window)
-        text = ''
-        if creep is not None:
-            text = (
-                f'; there the drive makes up for creep of {creep:.2g} V a decade of time, '
-                f'{100.0 * creep / span:.2g} % of its range'
-            )
         cause = 'a position controller was on'
         if np.ptp(piece.y[(start + 1) * window : stop * window]) == 0.0:
             cause += ', or the sensor is at its stop, as it reads one value there'
         raise IdentificationError(
             f'{name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by {moved:.1%} of '
             f'its range while the position moves by {followed:.2%} of its stroke: {cause}, so the '
-            f'position is no response to the voltage{text}; record in open loop'
+            'position is no response to the voltage; record in open loop'
         )
 
 
@@ -151,20 +144,3 @@ def _bend(x: Array) -> float:
     k = np.linspace(-0.5, 0.5, x.size)
     travel = float(k @ x / (k @ k))
     return float(np.std(x - travel * k)) / max(abs(travel), np.finfo(float).tiny)
-
-
-def drive_creep(piece: Piece, start: int, stop: int) -> float | None:
-    """
-    Return by how much the drive moves a decade of time in a hold of the position [V].
-
-    None where a straight line in time describes the drive as well: that is drift.
-    """
-    t, v = piece.t[start:stop] - piece.t[start] + 1.0 / piece.sample_rate, piece.v[start:stop]
-    left, slope = {}, {}
-    # a second, and a tenth of the whole, for what the controller does at first
-    late = t > min(1.0, 0.1 * t[-1])
-    for name, x in (('log', np.log10(t)), ('line', t)):
-        fit = np.polynomial.Polynomial.fit(x[late], v[late], 1)
-        left[name] = float(np.sum((v[late] - fit(x[late])) ** 2))
-        slope[name] = float(fit.convert().coef[-1])
-    return abs(slope['log']) if left['log'] < 0.5 * left['line'] else None

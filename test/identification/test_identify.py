@@ -317,10 +317,8 @@ def test_in_the_end_an_unlabelled_record_is_fitted_whole():
 
 
 def test_measured_closed_loop_is_refused():
-    with pytest.raises(IdentificationError, match='position controller') as caught:
+    with pytest.raises(IdentificationError, match='position controller'):
         identify(measured('afm_hold.csv'))
-    # what the drive makes up for in the hold, a straight line over four decades of time
-    assert 'creep of 0.31 V a decade' in str(caught.value)
 
 
 def test_measured_closed_loop_is_refused_by_its_ramps_alone():
