@@ -35,6 +35,7 @@ __all__ = [
     'Sensor',
     'SimulatedStage',
     'StageRun',
+    'seed_of',
     'stage_from_dict',
 ]
 
@@ -274,9 +275,7 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
     if not isinstance(sensor, Mapping):
         raise ConfigError(f'{name}: sensor must be a mapping, see config/stage_paper.yaml')
     check_keys(sensor, _SENSOR, ' in sensor', name)
-    seed = data.get('seed', 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigError(f'{name}: seed must be a whole number >= 0, got {reprlib.repr(seed)}')
+    seed = seed_of(data, name)
     model = model_from_dict({k: v for k, v in data.items() if k not in ('sensor', 'seed')}, name)
     where = f'{name}: sensor'
     noise_rms = number(sensor, 'noise_rms', where, 0.0)
@@ -285,6 +284,14 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
         return SimulatedStage(model, Sensor(noise_rms, dac, adc), seed)
     except ConfigError as error:
         raise ConfigError(f'{where}: {error}') from None
+
+
+def seed_of(data: Mapping[str, Any], name: str) -> int:
+    """Return the seed of the configuration of a stage, 0 without one."""
+    seed = data.get('seed', 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ConfigError(f'{name}: seed must be a whole number >= 0, got {reprlib.repr(seed)}')
+    return seed
 
 
 def _converter(sensor: Mapping[str, Any], which: str, where: str) -> Converter | None:

@@ -39,7 +39,7 @@ from piezo_ident.common.kernel import ordered_kernel
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program, Sequence
 from piezo_ident.model.files import check_keys, number, numbers
-from piezo_ident.model.simulated_stage import SimulatedStage, stage_from_dict
+from piezo_ident.model.simulated_stage import seed_of, SimulatedStage, stage_from_dict
 from piezo_ident.record.record import Piece, Record
 from scipy.linalg import expm
 
@@ -287,7 +287,7 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
         raise ConfigError(f"{name}: axes must be two names, the first of them '', as in ['', b]")
     if creep.get('axis') not in axes:
         raise ConfigError(f'{name}: axis of creep must be one of {axes}')
-    where, seed = f'{name}: hysteresis', number(data, 'seed', name, 0)
+    where = f'{name}: hysteresis'
     stage = TwoAxisStage(
         ('', str(axes[1])),
         number(data, 'sample_rate', name),
@@ -304,7 +304,7 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
         numbers(creep, 'gain', name),
         numbers(creep, 'time_constant', name),
         number(data, 'noise_rms', name, 0.0),
-        int(seed),
+        seed_of(data, name),
     )
     _check(stage, name)
     return stage
@@ -312,6 +312,9 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
 
 def _check(stage: TwoAxisStage, name: str) -> None:
     """Refuse numbers that no stage has."""
+    h, c, z0 = stage.hysteresis
+    if not np.isfinite([stage.sample_rate, stage.gain, h, c, z0, stage.noise_rms]).all():
+        raise ConfigError(f'{name}: sample_rate, gain, hysteresis and noise_rms must be finite')
     sizes: Many[tuple[str, Array, tuple[int, ...]]] = (
         ('frequency', stage.frequency, (2,)),
         ('damping', stage.damping, (2,)),
@@ -327,8 +330,7 @@ def _check(stage: TwoAxisStage, name: str) -> None:
         )
     if abs(np.linalg.det(stage.shape)) < 1e-6:
         raise ConfigError(f'{name}: the rows of shape are the same mode; make them differ')
-    h, _, z0 = stage.hysteresis
     if not (0 <= h < 1 and z0 > 0):
         raise ConfigError(f'{name}: hysteresis needs 0 <= share < 1 and scale > 0')
-    if stage.noise_rms < 0 or stage.seed < 0:
-        raise ConfigError(f'{name}: noise_rms and seed must not be negative')
+    if stage.noise_rms < 0:
+        raise ConfigError(f'{name}: noise_rms must not be negative')

@@ -95,6 +95,10 @@ def test_a_record_holds_both_axes_with_signals_of_their_own():
         ('sample_rate', 400, 'twice the highest mode'),
         ('creep', {'axis': 'c', 'gain': [], 'time_constant': []}, 'axis of creep'),
         ('colour', 1, 'unknown keys colour'),
+        ('gain', float('nan'), 'must be finite'),
+        ('noise_rms', float('nan'), 'must be finite'),
+        ('seed', float('nan'), 'seed must be a whole number'),
+        ('seed', 1.5, 'seed must be a whole number'),
     ],
 )
 def test_numbers_that_no_stage_has_are_refused(key, value, said):
