@@ -220,13 +220,7 @@ def write(
     if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
     if is_bag:
-        write_bag(
-            record,
-            path,
-            storage=storage,
-            overwrite=overwrite,
-            custom_data=custom_data,
-        )
+        write_bag(record, path, storage=storage, overwrite=overwrite, custom_data=custom_data)
     else:
         write_columns(path, blocks_of(record), *labels_of(record), overwrite=overwrite)
     notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
@@ -253,8 +247,7 @@ def _check_labels(record: Record, path: Path) -> None:
                 f'{path}: segment label {label!r} cannot be written; use printable text without '
                 'blanks around it'
             )
-    channels = {tuple(p.channels) for p in record}
-    if len({frozenset(c) for c in channels}) > 1:
+    if len({frozenset(p.channels) for p in record}) > 1:
         raise DataError(f'{path}: pieces carry different channels; write them one by one')
     for name in record.pieces[0].channels:
         # the names that ROS topics and MATLAB variables can have
@@ -272,11 +265,7 @@ def _losses(record: Record) -> tuple[str, ...]:
     def whole(parts: list[Array]) -> Array:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    t, v, y = (
-        whole([p.t for p in record]),
-        whole([p.v for p in record]),
-        whole([p.y for p in record]),
-    )
+    t, v, y = (whole([getattr(p, name) for p in record]) for name in 'tvy')
     channels = {k: whole([p.channels[k] for p in record]) for k in record.pieces[0].channels}
     try:
         back = assemble(t, v, y, labels_of(record), channels, name='the file')
