@@ -74,10 +74,12 @@ class Matcher:
     ----------
     unmatched : int
         Measured samples without a prediction in time.
+    unmeasured : int
+        Predicted samples without a measured one in time.
     """
 
     def __init__(self) -> None:
-        self.unmatched = 0
+        self.unmatched = self.unmeasured = 0
         self._predicted, self._measured = _Side(), _Side()
 
     def predicted(self, samples: Samples) -> list[Matched]:
@@ -117,7 +119,7 @@ class Matcher:
                 other.waiting.append(left)
         if rest.t.size:
             own.waiting.append(rest)
-        self._predicted.forget()
+        self.unmeasured += self._predicted.forget()
         self.unmatched += self._measured.forget()
         return sorted(pairs, key=lambda pair: float(pair[0].t[0]))
 

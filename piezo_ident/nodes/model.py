@@ -28,6 +28,9 @@ __all__ = ['ModelNode']
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4
+#: share of the predictions of a second that must meet a displacement, and for how many seconds
+#: they may miss it: the first one began somewhere inside
+MET, PATIENCE = 0.5, 1
 
 
 class ModelNode(LabNode):
@@ -45,6 +48,8 @@ class ModelNode(LabNode):
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
+        # samples of the last second that were measured and compared, and seconds without enough
+        self._measured, self._compared, self._unmet = 0, 0, 0
         self._models = 0
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
@@ -106,6 +111,9 @@ class ModelNode(LabNode):
         predictor = self._predictor
         predictor.problem = ''
         prediction = predictor.process(samples)
+        if predictor.memory_lost:
+            # what was found before says nothing of now
+            self._error.clear()
         if prediction is not None:
             self._prediction.publish(to_message(prediction))
         self._count += samples.t.size
@@ -135,6 +143,7 @@ class ModelNode(LabNode):
             )
             if not samples.t.size:
                 return
+        self._measured += samples.t.size
         self._publish_preview(self._preview.add('displacement', samples.t, samples.values))
         if self._predictor.model is not None:
             self._compare(self._matcher.measured(samples))
@@ -142,6 +151,7 @@ class ModelNode(LabNode):
     def _compare(self, pairs: list[Matched]) -> None:
         for pair in pairs:
             residual = pair.residual
+            self._compared += residual.t.size
             self._residual.publish(to_message(residual))
             self._publish_preview(self._preview.add('residual', residual.t, residual.values))
             if self._predictor.memory_known:
@@ -176,8 +186,22 @@ class ModelNode(LabNode):
         if before is None or now <= ratio * before:
             return ''
         return (
-            f'identify again: the live error is {now:.3g} % of stroke, {now / before:.1f} times '
-            f'that at identification'
+            f'identify again, or diagnose on this motion: the live error is {now:.3g} % of '
+            f'stroke, {now / before:.1f} times that at identification'
+        )
+
+    def _mismatch(self) -> str:
+        """Return why predictions cannot be judged, empty when they can; once a second."""
+        sent, measured, compared = self._count, self._measured, self._compared
+        self._measured = self._compared = 0
+        self._unmet = self._unmet + 1 if compared < MET * sent else 0
+        if self._unmet <= PATIENCE:
+            return ''
+        self._error.clear()
+        if not measured:
+            return 'no displacement comes'
+        return (
+            f'{100.0 * compared / sent:.0f} % of the voltage is met by displacement of the same t'
         )
 
     def _live_error(self, model: StageModel) -> float:
@@ -204,7 +228,7 @@ class ModelNode(LabNode):
         """Return how the prediction goes."""
         self._report_state()
         now, p = time.monotonic(), self._predictor
-        elapsed = max(now - self._count_at, 1e-3)
+        elapsed, mismatch = max(now - self._count_at, 1e-3), self._mismatch()
         values: dict[str, object] = {
             'rate': f'{self._count / elapsed:.0f}',
             'load': f'{100.0 * self._work / elapsed:.1f}',
@@ -213,6 +237,7 @@ class ModelNode(LabNode):
             'restarts': p.restarts,
             'unreadable': self._unreadable,
             'unmatched': self._matcher.unmatched,
+            'unmeasured': self._matcher.unmeasured,
         }
         (low, high), self._range = self._range, (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, now, 0.0
@@ -222,7 +247,9 @@ class ModelNode(LabNode):
         values['memory_known'] = p.memory_known
         values['residual_rms'] = f'{self._error.rms:.6g}'
         values['residual_percent'] = f'{self._live_error(model):.4g}'
-        problems = [self._verdict()]
+        problems = [mismatch or self._verdict()]
+        if p.memory_lost:
+            problems.append('the memory is unknown until the voltage has been at its lowest')
         if low <= high:
             room = min(low - model.scaling.range[0], model.scaling.range[1] - high)
             values['head_room'] = f'{room:.6g}'

@@ -274,6 +274,10 @@ def test_what_finds_no_partner_is_forgotten_and_counted():
     assert matcher.measured(block(30_000, 100)) == []
     assert matcher.unmatched == 100
     assert matcher.predicted(block(0, 100)) == []
+    assert matcher.unmeasured == 0
+    assert matcher.predicted(block(30_100, 100)) == []
+    assert matcher.predicted(block(80_000, 100)) == []
+    assert matcher.unmeasured == 200
 
 
 def test_runs_of_the_clock_are_not_mixed_up():

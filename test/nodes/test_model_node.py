@@ -278,10 +278,53 @@ def test_it_says_when_to_identify_again(fast):
         )
     d = fast.diagnostics('model')
     assert d['level'] == '1' and '0.5 % of stroke, 5.0 times' in d['message']
+    assert 'or diagnose on this motion' in d['message']
     assert {'rate', 'load', 'lost', 'memory_known'} <= set(d)
     assert fast.set('model', 'warn_ratio', 10.0) == (True, '')
     fast.wait(lambda: fast.diagnostics('model')['message'] == 'predicting', 'taken back')
     assert fast.set('model', 'warn_ratio', 3.0) == (True, '')
+
+
+def judged(g, several, y):
+    """Send blocks of voltage and displacement, and wait until they are in the live error."""
+    for block, part in zip(several, np.split(y, len(several)), strict=True):
+        g.publish('voltage', block)
+        g.publish('displacement', Samples(block.t, part, block.segment, 'displacement'))
+    g.wait(lambda: g.diagnostics('model').get('residual_rms', 'nan') != 'nan', 'an error')
+
+
+def test_an_error_of_the_past_is_not_shown_when_nothing_can_be_judged(fast):
+    reset(fast)
+    judged(fast, blocks(4000), np.zeros(4000))
+    # behind a gap, and not at the lowest voltage, the error is not known
+    for block in blocks(1000, 5000):
+        fast.publish('voltage', block)
+        fast.publish('displacement', Samples(block.t, block.t, block.segment, 'displacement'))
+    fast.wait(lambda: fast.diagnostics('model').get('residual_rms') == 'nan', 'no error')
+    d = fast.diagnostics('model')
+    assert d['memory_known'] == 'False' and d['level'] == '1'
+    assert d['message'] == 'the memory is unknown until the voltage has been at its lowest'
+
+
+def test_it_says_that_no_displacement_comes_or_none_of_the_same_time(fast):
+    reset(fast)
+    judged(fast, blocks(4000), np.zeros(4000))
+    first = 4000
+    for shift, said in ((None, 'no displacement comes'), (1e-5, '0 % of the voltage is met by')):
+
+        def sent(shift=shift, said=said):
+            nonlocal first
+            (block,) = blocks(100, first)
+            first += 100
+            fast.publish('voltage', block)
+            if shift is not None:
+                moved = Samples(block.t + shift, block.values, block.segment, 'displacement')
+                fast.publish('displacement', moved)
+            return fast.diagnostics('model')['message'].startswith(said)
+
+        fast.wait(sent, said)
+        d = fast.diagnostics('model')
+        assert d['level'] == '1' and d['residual_rms'] == 'nan'
 
 
 def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
