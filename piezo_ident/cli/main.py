@@ -136,12 +136,14 @@ cli = Verbs(
     commands=[
         Verb(
             'simulate',
-            f'Make a record with the simulated stage.\n\n{OUT_HELP}',
+            f'Make a record with the simulated stage.\n\n{OUT_HELP} As a .yaml file the program '
+            'itself is written, scaled to the limits, for the excitation node.',
             [options.OUT],
             {'Stage and program': options.SIMULATE, 'Output': options.OUTPUT},
             'simulate record.npz',
             'simulate --config paper --program validation --seed 2 validation.csv',
             'simulate --sample-rate 2000 --limits 0 100 --voltage-only excitation.csv',
+            'simulate --program holds --sample-rate 2000 --limits 0 100 my_holds.yaml',
         ),
         Verb(
             'identify',

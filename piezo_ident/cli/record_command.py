@@ -14,9 +14,10 @@ from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_s
 from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.files import write_text
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program
-from piezo_ident.excitation.scaled import scaled
+from piezo_ident.excitation.scaled import program_to_yaml, scaled
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
@@ -24,11 +25,17 @@ from piezo_ident.record.record import Piece, Record
 
 __all__ = ['convert_command', 'simulate_command']
 
+PROGRAM_FILES = ('.yaml', '.yml')
+
 
 def simulate_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident simulate``."""
     out: Path = args.out
-    _check_record_output(args, voltage_only=args.voltage_only)
+    is_program = out.suffix.lower() in PROGRAM_FILES
+    if is_program:
+        check_file(out, overwrite=args.overwrite)
+    else:
+        _check_record_output(args, voltage_only=args.voltage_only)
     files = {}
     for kind, name in (('stage', args.config), ('program', args.program)):
         check_link(Path(name))
@@ -38,14 +45,17 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     stage, program = load_stage(files['stage']), Program.load(files['program'])
     rate = stage.sample_rate if args.sample_rate is None else args.sample_rate
     is_static = isinstance(stage, SimulatedStage) and stage.model.is_static
-    if not (is_static or args.voltage_only) and rate != stage.sample_rate:
+    if not (is_static or args.voltage_only or is_program) and rate != stage.sample_rate:
         raise ConfigError(
             f'{files["stage"]}: the stage holds for {stage.sample_rate:g} Hz, not for '
             f'{rate:g} Hz; leave out --sample-rate'
         )
     seed = stage.seed if args.seed is None else args.seed
-    if args.limits is not None:
-        program = scaled(program, args.limits, rate)
+    if args.limits is not None or is_program:
+        program = scaled(program, args.limits or program.limits, rate)
+    if is_program:
+        _write_program(out, program, console)
+        return
     sequence, *others = build_axes(program, len(stage.axes), rate)
     rng = np.random.default_rng(seed)
     if args.voltage_only:
@@ -85,6 +95,17 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     console.result(
         {**data, 'seed': seed, 'out': str(out), **data_of(record, losses), 'warnings': warnings}
     )
+
+
+def _write_program(out: Path, program: Program, console: Console) -> None:
+    text = program_to_yaml(program)
+    sequence = program.build()  # what the graph would refuse is refused here
+    write_text(out, text)
+    console.say(f'{out}: a program of {sequence.duration:.4g} s at {sequence.sample_rate:g} Hz')
+    steepest = float(np.abs(np.diff(sequence.v)).max()) * sequence.sample_rate
+    console.say(f'steepest: {steepest:.6g} V/s; the slew of the stage must be as large')
+    console.say(sequence.describe())
+    console.result({'out': str(out), 'samples': sequence.n, 'steepest': steepest})
 
 
 def convert_command(args: SimpleNamespace, console: Console) -> None:

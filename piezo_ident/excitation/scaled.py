@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A program for a stage of another voltage range and another sampling rate."""
+"""A program for a stage of another voltage range and another sampling rate, also as text."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.catalogue import Option, SIGNALS
 from piezo_ident.excitation.program import Program
+import yaml
 
-__all__ = ['scaled']
+__all__ = ['program_to_yaml', 'scaled']
 
 #: highest frequency over the sampling rate; noise ends at 1.2 times its cutoff
 HIGHEST = 0.4
@@ -62,3 +63,37 @@ def scaled(program: Program, limits: tuple[float, float], sample_rate: float) ->
         rest=min(max(low + factor * (program.rest - lowest), low), high),
         slew=factor * program.slew,
     )
+
+
+def program_to_yaml(program: Program) -> str:
+    """
+    Return the text of a program, which `pi.Program.load` reads from a file.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> from piezo_ident.excitation.program import parse_program
+    >>> program = scaled(pi.Program.load('holds'), (0, 120), 10_000)
+    >>> again = parse_program(program_to_yaml(program))
+    >>> bool((again.build().v == program.build().v).all())
+    True
+    """
+    head = {
+        'limits': [float(x) for x in program.limits],
+        'sample_rate': program.sample_rate,
+        'seed': program.seed,
+        'rest': program.rest,
+        'slew': program.slew,
+    }
+    lines = [f'{key}: {_flow(value)}' for key, value in head.items() if value is not None]
+    lines.append('segments:')
+    for entry in program.entries:
+        named = {} if entry.name is None else {'name': entry.name}
+        given = {key: x for key, x in entry.options.items() if x is not None}
+        lines.append(f'  - {_flow({"signal": entry.signal, **named, **given})}')
+    return '\n'.join([*lines, ''])
+
+
+def _flow(value: Any) -> str:
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**9)
+    return text.removesuffix('...\n').strip()

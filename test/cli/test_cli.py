@@ -16,7 +16,7 @@ import signal
 import subprocess
 import sys
 
-from command_line import csv_text, run, succeed, table, with_values
+from command_line import csv_text, refuse, run, succeed, table, with_values
 import numpy as np
 import piezo_ident as pi
 from piezo_ident import __version__
@@ -24,6 +24,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.cli.records import expand
 from piezo_ident.common.config import find_config, shipped_names
 from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.excitation.program import Program
 from piezo_ident.many.run import MARK
 from piezo_ident.model.files import load
 from piezo_ident.record.record import Piece, Record
@@ -120,6 +121,19 @@ def test_the_voltage_that_is_asked_for_next_fits_the_model(capsys, tmp_path, mad
     assert (table['v'].min(), table['v'].max()) == pytest.approx((-10.0, 90.0), abs=0.1)
     # neither another rate nor a voltage outside the range
     assert 'warning' not in succeed(capsys, 'predict', 'model.yaml', 'excitation.csv')
+
+
+@pytest.mark.parametrize('program', ['identification', 'diagnosis', 'holds'])
+def test_a_scaled_program_is_written_for_the_graph(capsys, tmp_path, program):
+    argv = ['simulate', '--program', program, '--sample-rate', 10e3, '--limits', -20, 130]
+    said = succeed(capsys, *argv, tmp_path / 'mine.yaml')
+    command = succeed(capsys, *argv, '--voltage-only', tmp_path / 'command.npz')
+    assert said.splitlines()[2:] == command.splitlines()[1:]
+    mine = Program.load(tmp_path / 'mine.yaml').build(limits=(-20.0, 130.0))
+    v = np.load(tmp_path / 'command.npz')['v']
+    np.testing.assert_array_equal(mine.v, v)
+    assert f'steepest: {1e4 * np.abs(np.diff(v)).max():.6g} V/s' in said
+    refuse(capsys, tmp_path, [*argv, tmp_path / 'mine.yaml'], 'exists already')
 
 
 def test_voltages_of_several_axes_go_into_one_file(capsys, tmp_path):
