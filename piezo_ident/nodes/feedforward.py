@@ -24,6 +24,8 @@ from the stage, as in micrometres | the block is refused | WARN |
 | a gap up to `silence` | a straight line | WARN |
 | another stream | is joined from where the first one ended | |
 | out of reach | the voltage stays at its limit | WARN |
+
+Where no displacement comes while it drives, it drives on, warns, and has no tracking error.
 """
 
 from __future__ import annotations
@@ -56,6 +58,8 @@ __all__ = ['FeedforwardNode']
 
 #: parameters that are taken over between two references
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
+#: how long a stage that is driven may answer nothing before it is told [s]
+SILENT = 1.0
 
 
 class FeedforwardNode(DrivingNode):
@@ -76,7 +80,7 @@ class FeedforwardNode(DrivingNode):
         self._length, self._last_value = 0, 0.0
         self._learner: Learner | None = None
         self._learned: LiveLearning | None = None
-        self._last = time.monotonic()
+        self._last = self._answered = time.monotonic()
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._clear()
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
@@ -239,6 +243,7 @@ class FeedforwardNode(DrivingNode):
         self._heard += x.size
         if verdict.kind is Kind.START:
             self._kept, self._length = [], 0
+            self._answered = self._last
         self._last_value, self._length = float(x[-1]), self._length + x.size
         if self._length <= self.values['longest'] * self._rate_of_clock:
             self._kept.append(np.array(x))
@@ -279,6 +284,7 @@ class FeedforwardNode(DrivingNode):
             self._faults.note('refused', f'a block of displacement is refused: {error}')
             return
         if samples.t.size and np.isfinite(samples.t).all():
+            self._answered = time.monotonic()
             self._tell(self._error.measured(samples))
             if self._learner is not None:
                 self._learner.measured(samples)
@@ -338,6 +344,10 @@ class FeedforwardNode(DrivingNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost and refused, head-room, and the tracking error."""
+        if self._state == 'tracking' and time.monotonic() - self._answered > SILENT:
+            # what was found before says nothing of now
+            self._error.live.clear()
+            self._faults.note('silent', 'no displacement comes from the stage', 0)
         # a figure that changed with each block would flood the status
         self._told = self._error.percent
         self.report_state()
