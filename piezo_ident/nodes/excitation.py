@@ -211,8 +211,9 @@ class ExcitationNode(LabNode):
         except PiezoIdentError as error:
             self._ramp(playing, 'failed', str(error))
         else:
-            late = playing.clock.late if playing.clock else 0
-            behind = f', {late} blocks late' if late else ''
+            clock, behind = playing.clock, ''
+            if clock is not None and clock.late:
+                behind = f', {clock.late} blocks late, by up to {1e3 * clock.worst:.0f} ms'
             self._end(playing, 'done', 100.0, f'{_name(playing.sequence)} played{behind}')
 
     def _end(

@@ -3,6 +3,10 @@
 
 """The excitation node as a process, with a stage beside it where it needs one."""
 
+import re
+import signal
+import time
+
 from course import column, FS, HIGH, SHORT
 from graph import best_of_three, Graph, Late
 import numpy as np
@@ -12,6 +16,7 @@ from piezo_ident.record.blocks import cut_blocks
 import pytest
 from std_msgs.msg import Float64MultiArray
 
+QUIET = 'limits: [0, 10]\nsegments:\n  - {signal: idle, duration: 1}\n'
 SLOW = 'limits: [0, 10]\nsegments:\n  - {signal: idle, duration: 60}\n'
 
 
@@ -273,3 +278,17 @@ def test_bad_parameters_at_the_start_end_it_with_the_reason():
         for node, reason in nodes:
             assert node.process.wait(60) == 2
             assert reason in node.log
+
+
+def test_it_says_by_how_much_blocks_were_late(lab):
+    assert lab.set('excitation', 'program', QUIET) == (True, '')
+    since = len(lab.collect('voltage'))
+    assert lab.call('excitation/start')[0]
+    lab.wait(lambda: len(lab.collect('voltage')) > since, 'the first block')
+    node = lab.handle('excitation')
+    node.send(signal.SIGSTOP)
+    time.sleep(0.1)
+    node.send(signal.SIGCONT)
+    lab.wait(lambda: state(lab) == 'done', 'the end')
+    late = re.search(r'(\d+) blocks late, by up to (\d+) ms', lab.status('excitation')['text'])
+    assert late and int(late[1]) > 5 and int(late[2]) >= 80
