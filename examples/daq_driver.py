@@ -26,6 +26,11 @@ def convert(v: np.ndarray) -> np.ndarray:
     return 7.5e-6 * v  # your card's call; it may wait until the samples are out
 
 
+def held(rest: float) -> float:
+    """Return what the card puts out now [V]: a driver that was killed left its last voltage."""
+    return rest  # your card's call, where it can read its output back
+
+
 class Driver(LabNode):
     """Publishes what the amplifier got and what the stage did, block by block."""
 
@@ -34,7 +39,7 @@ class Driver(LabNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.guard = Guard(self._settings(self.values))
+        self.guard = Guard(self._settings(self.values), held(self.values['rest']))
         Guard(self.guard.settings).process([np.nan])  # compiles what blocks would wait for
         self.sample_clock = SampleClock(RATE, self.values['silence'])
         self.tick, self.heard = 0, time.monotonic()

@@ -80,6 +80,23 @@ def at_rest(g: Graph) -> bool:
     return bool(applied) and applied[-1].values[-1] == 0.0
 
 
+def test_what_a_killed_driver_left_on_the_card_is_ramped_to_rest(tmp_path):
+    text = EXAMPLE.read_text(encoding='utf-8')
+    driver = tmp_path / 'driver.py'
+    driver.write_text(text.replace('return rest  #', 'return 1.5  #'), encoding='utf-8')
+    with Graph() as g:
+        applied = g.collect('applied_voltage')
+        command = [sys.executable, str(driver), '--ros-args', '-p', 'silence:=2.0']
+        g.follow('stage', 'stage')
+        g.handles.append(Handle(g, 'stage', command, g.folder / 'driver.log'))
+        g.matched('applied_voltage')
+        g.wait(lambda: at_rest(g), 'rest')
+        v = column(applied)
+        assert v.max() <= 1.5
+        assert np.abs(np.diff(v)).max() <= 1.001 * RAMP / FS
+        assert applied[0].segment == 'ramp:silence'
+
+
 def test_a_program_is_followed_bit_by_bit(lab):
     voltage = lab.collect('voltage')
     n = parse_program(PROGRAM).build(FS).n
