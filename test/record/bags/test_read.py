@@ -86,6 +86,17 @@ def test_other_readers_see_the_same(tmp_path, start):
     assert SAMPLE_QOS.depth == 100
 
 
+def test_a_displacement_of_another_clock_is_told_from_gaps(tmp_path):
+    moved = [
+        Samples(s.t * 1.01, s.values, s.segment, s.quantity) if s.quantity != 'voltage' else s
+        for pair in blocks()
+        for s in pair
+    ]
+    messages = [(f'/{s.quantity}', s) for s in moved]
+    with pytest.raises(DataError, match=r'share only \d+ of \d+ time stamps; a displacement row'):
+        read_bag(write(tmp_path / 'bag', messages))
+
+
 def test_late_and_early_streams_meet(tmp_path):
     pairs = blocks()
     messages = [('/voltage', v) for v, _ in pairs[:3]] + interleave(pairs[3:])[:-1]
