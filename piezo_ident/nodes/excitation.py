@@ -50,6 +50,8 @@ __all__ = ['ExcitationNode']
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
 #: most blocks that are sent at once after a delay
 CATCH_UP = 50
+#: share of the voltage limits below which it is said what a program drives
+NARROW = 0.5
 
 
 def read_program(text: str) -> Program:
@@ -190,8 +192,16 @@ class ExcitationNode(LabNode):
         self._thread.start()
         return (
             f'{_name(sequence)}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
-            f'{sequence.n} samples'
+            f'{sequence.n} samples{self._unused(sequence)}'
         )
+
+    def _unused(self, sequence: Sequence) -> str:
+        """Say where a program leaves most of the range alone, as one of 0 .. 10 V does."""
+        low, high = float(sequence.v.min()), float(sequence.v.max())
+        limits = self.values['voltage_low'], self.values['voltage_high']
+        if self._quantity != 'voltage' or high - low >= NARROW * (limits[1] - limits[0]):
+            return ''
+        return f'; it drives {low:g} .. {high:g} V of {limits[0]:g} .. {limits[1]:g} V'
 
     def _stop(self) -> str:
         playing = self._playing

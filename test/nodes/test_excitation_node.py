@@ -280,10 +280,11 @@ def test_bad_parameters_at_the_start_end_it_with_the_reason():
             assert reason in node.log
 
 
-def test_it_says_by_how_much_blocks_were_late(lab):
+def test_it_says_what_it_drives_and_by_how_much_blocks_were_late(lab):
     assert lab.set('excitation', 'program', QUIET) == (True, '')
     since = len(lab.collect('voltage'))
-    assert lab.call('excitation/start')[0]
+    ok, said = lab.call('excitation/start')
+    assert ok and said.endswith('samples; it drives 0 .. 0 V of 0 .. 10 V'), said
     lab.wait(lambda: len(lab.collect('voltage')) > since, 'the first block')
     node = lab.handle('excitation')
     node.send(signal.SIGSTOP)
