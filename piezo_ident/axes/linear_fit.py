@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.frequency_response import frequency_response, LineResponse
-from piezo_ident.axes.modal import Modal, RADIUS
+from piezo_ident.axes.modal import Modal, narrowest, RADIUS, resolved
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import IdentificationError
@@ -39,6 +39,8 @@ def linear_fit(response: LineResponse, order: int, *, iterations: int) -> Modal:
 def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:
     """Lower the error of a stable model's response, summed over lines, inputs and outputs."""
     z, scale = response.z, float(np.sqrt(np.mean(np.abs(response.g) ** 2)))
+    limit = narrowest(response.samples)
+    model = replace(model, blocks=resolved(model.blocks, limit))
     error = (model.response(z) - response.g) / scale
     cost, damping, slow = float(np.sum(np.abs(error) ** 2)), 1e-3, 0
     for _ in range(iterations):
@@ -52,7 +54,7 @@ def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Mo
         for _ in range(8):
             damped = hessian + damping * np.eye(len(hessian))
             step = -np.linalg.solve(damped, gradient / size) / size
-            tried = _moved(model, step)
+            tried = _moved(model, step, limit)
             if tried.radius < RADIUS:
                 error_tried = (tried.response(z) - response.g) / scale
                 cost_tried = float(np.sum(np.abs(error_tried) ** 2))
@@ -148,8 +150,10 @@ def _derivatives(model: Modal, z: NDArray[np.complex128]) -> NDArray[np.complex1
     return out.reshape(total, -1)
 
 
-def moved_blocks(blocks: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return blocks with their two numbers each moved by `step`, shape (n,)."""
+def moved_blocks(
+    blocks: NDArray[np.float64], step: NDArray[np.float64], limit: float
+) -> NDArray[np.float64]:
+    """Return blocks with their two numbers each moved by `step`, shape (n,); modes stay within."""
     blocks = blocks.copy()
     first, second = step[::2], step[1::2]
     oscillates = blocks[:, 0, 1] != 0
@@ -157,12 +161,12 @@ def moved_blocks(blocks: NDArray[np.float64], step: NDArray[np.float64]) -> NDAr
     blocks[:, 1, 1] += np.where(oscillates, first, second)
     blocks[:, 0, 1] += np.where(oscillates, second, 0)
     blocks[:, 1, 0] -= np.where(oscillates, second, 0)
-    return blocks
+    return resolved(blocks, limit)
 
 
-def _moved(model: Modal, step: NDArray[np.float64]) -> Modal:
+def _moved(model: Modal, step: NDArray[np.float64], limit: float) -> Modal:
     parts, at = [], model.order
     for old in (model.b, model.c, model.d):
         parts.append(old + step[at : at + old.size].reshape(old.shape))
         at += old.size
-    return Modal(moved_blocks(model.blocks, step[: model.order]), *parts)
+    return Modal(moved_blocks(model.blocks, step[: model.order], limit), *parts)

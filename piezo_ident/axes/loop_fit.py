@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from piezo_ident.axes.linear_fit import moved_blocks
 from piezo_ident.axes.loop_kernels import CHUNK, KINDS, sensitivities
 from piezo_ident.axes.loop_model import LoopModel, Passage
-from piezo_ident.axes.modal import Modal, RADIUS
+from piezo_ident.axes.modal import Modal, narrowest, RADIUS
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
 
@@ -92,8 +92,12 @@ class Parameters:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def moved(self, model: LoopModel, step: NDArray[np.float64]) -> LoopModel:
-        """Return the model with these parameters, then C, D and H by output, moved by `step`."""
+    def moved(self, model: LoopModel, step: NDArray[np.float64], limit: float = 1.0) -> LoopModel:
+        """
+        Return the model with these parameters, then C, D and H by output, moved by `step`.
+
+        Poles of modes stay within `limit` of the origin.
+        """
         linear = model.linear
         parts = {
             'poles': np.zeros((len(linear.blocks), 2)),
@@ -109,7 +113,7 @@ class Parameters:
         order, inputs = linear.b.shape
         rest = step[len(self) :].reshape(len(linear.c), -1)
         c, d, h = np.split(rest, [order, order + inputs], axis=1)
-        blocks = moved_blocks(linear.blocks, parts['poles'].ravel())
+        blocks = moved_blocks(linear.blocks, parts['poles'].ravel(), limit)
         return replace(
             model,
             linear=Modal(blocks, parts['b'], linear.c + c, linear.d + d),
@@ -253,6 +257,7 @@ class _Problem:
         self.targets = []
         self.warm_up = min(warm_up, records[0].u.shape[1])
         self.slowest = FADED ** (1 / self.warm_up)
+        self.limit = narrowest(records[0].u.shape[1])
         for record, weight in zip(records, weights, strict=True):
             u, y = record.mean_u, record.mean_y
             weight = weight / float(np.sqrt(np.mean(y**2)))
@@ -339,7 +344,7 @@ class _Problem:
             if not beyond.any():
                 break
             free[: len(reals)][beyond] = False
-        return self.parameters.moved(model, step)
+        return self.parameters.moved(model, step, self.limit)
 
     def _real_poles(self, model: LoopModel) -> NDArray[np.float64]:
         """Return the pole of each parameter that is a real pole, 0 for the others."""

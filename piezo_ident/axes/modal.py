@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Modal', 'balanced', 'to_modal']
+__all__ = ['Modal', 'balanced', 'narrowest', 'resolved', 'to_modal']
 
 #: poles stay within
 RADIUS = 0.9999
@@ -93,6 +93,23 @@ class Modal:
     def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return C (z - A)^-1 B + D, shape (k, outputs, inputs)."""
         return np.asarray(self.c @ self.states(z) + self.d)
+
+
+def narrowest(samples: int) -> float:
+    """
+    Return how far from the origin the poles of a mode may lie that a period resolves.
+
+    A resonance that is narrower than the distance of two lines shows in one of them at most: there
+    it makes up for noise and distortion, and rings on under other motion.
+    """
+    return float(np.exp(-np.pi / samples))
+
+
+def resolved(blocks: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+    """Return blocks whose complex poles beyond a distance from the origin are drawn in to it."""
+    radius = np.hypot(blocks[:, 0, 0], blocks[:, 0, 1])
+    beyond = (blocks[:, 0, 1] != 0) & (radius > limit)
+    return blocks * np.where(beyond, limit / np.where(beyond, radius, 1), 1)[:, None, None]
 
 
 def to_modal(

@@ -7,7 +7,9 @@ import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.frequency_response import excited_lines, frequency_response
 from piezo_ident.axes.linear_fit import choose_order, linear_error, linear_fit, refined
-from piezo_ident.axes.modal import to_modal
+from piezo_ident.axes.loop_fit import loop_fit
+from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.modal import Modal, narrowest, to_modal
 from piezo_ident.axes.periodic import periodicity, PeriodicRecord
 from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import DataError, IdentificationError, ModelError
@@ -95,6 +97,24 @@ def test_order_is_chosen_by_held_out_error(noisy):
 
 def test_a_model_of_too_high_an_order_stays_stable(noisy):
     assert linear_fit(frequency_response(noisy), 12, iterations=3).radius < 1
+
+
+def test_a_mode_narrower_than_a_line_is_widened_and_holds_up_nothing(noisy):
+    truth = stage.linear_stage()
+    slow = 0.99989 * np.array([[np.cos(0.003), np.sin(0.003)], [-np.sin(0.003), np.cos(0.003)]])
+    start = Modal(
+        np.concatenate([0.995 * truth.blocks, slow[None]]),
+        np.vstack([truth.b, 0.1 * np.ones((2, 2))]),
+        np.hstack([truth.c, 0.1 * np.ones((2, 2))]),
+        truth.d,
+    )
+    limit = narrowest(stage.SAMPLES)
+    found = refined(start, frequency_response(noisy[:4]))
+    assert found.radius <= limit + 1e-12
+    model = loop_fit(LoopModel.of(start), noisy[:4], iterations=10)
+    assert model.linear.radius <= limit + 1e-12
+    for linear in (found, model.linear):
+        assert linear_error(linear, noisy[4]) == pytest.approx(1.0, rel=0.15)
 
 
 def test_poles_beyond_the_circle_are_mirrored_and_odd_orders_refused():
