@@ -143,8 +143,7 @@ def explain(
     """
     Fit every candidate, and judge all on the records held out.
 
-    Candidates grow on few records of each group; the last steps of ``hysteretic_stiffness`` are
-    fitted to all.
+    Candidates grow on few records of each group; their last steps are fitted to all.
 
     Parameters
     ----------
@@ -198,36 +197,39 @@ def explain(
     plain = LoopModel.of(linear)
     middle = middle_group(small)
 
+    def finished(name: str, model: LoopModel, since: float) -> None:
+        """Fit a model of all amplitudes to all that is taught, and judge it."""
+        steps = max(1, iterations // 3)
+        model = loop_fit(model, taught, weights=weights, iterations=steps, warm_up=warm_up)
+        judged(name, everywhere(model), since)
+
     since = time.monotonic()
-    one = loop_fit(plain, small, weights=small_weights, iterations=iterations // 2)
-    judged('linear', everywhere(one), since)
+    one = loop_fit(plain, small, weights=small_weights, iterations=iterations, warm_up=warm_up)
+    finished('linear', one, since)
 
     since = time.monotonic()
     each = {}
     for group, members in by_group.items():
         good = [r for r in members if weight[id(r)] == 1] or members
-        own = refined(linear, frequency_response(good), iterations=iterations)
-        each[group] = LoopModel.of(own)
+        response = frequency_response(good)
+        each[group] = LoopModel.of(refined(linear, response, iterations=iterations))
     judged('changed_dynamics', each, since)
 
     since = time.monotonic()
     signals = range(plain.linear.b.shape[1])
-    model = grown(with_input_plays(plain, middle), iterations // 2, still=signals)
-    judged('input_hysteresis', everywhere(model), since)
+    model = grown(with_input_plays(plain, middle), iterations, still=signals)
+    finished('input_hysteresis', model, since)
 
     since = time.monotonic()
-    judged('loop_hysteresis', everywhere(grown(with_loop_plays(plain, middle), iterations)), since)
+    finished('loop_hysteresis', grown(with_loop_plays(plain, middle), iterations), since)
 
     since = time.monotonic()
-    model = grown(with_softening(plain, small, memory=memory), iterations)
-    judged('softening', everywhere(model), since)
+    soft = grown(with_softening(plain, small, memory=memory), iterations)
+    finished('softening', soft, since)
 
-    model = grown(with_loop_plays(model, middle), iterations)
+    model = grown(with_loop_plays(soft, middle), iterations)
     model = grown(with_input_plays(model, middle), iterations)
-    model = loop_fit(
-        model, taught, weights=weights, iterations=max(1, iterations // 3), warm_up=warm_up
-    )
-    judged('hysteretic_stiffness', everywhere(model), since)
+    finished('hysteretic_stiffness', model, since)
     return Explanation(tuple(found))
 
 

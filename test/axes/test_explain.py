@@ -44,6 +44,17 @@ def test_a_linear_stage_stays_linear():
     assert found['linear'].error == pytest.approx(0.2, rel=0.2)
 
 
+def test_a_linear_stage_stays_linear_in_few_steps():
+    # as much is done for the linear model as for those that may only go on from it
+    rng = np.random.default_rng(6)
+    truth = stage.linear_stage()
+    start = replace(truth, blocks=0.997 * truth.blocks, b=1.05 * truth.b)
+    parts = [stage.records(truth, rng, count=many, noise=0.002) for many in (3, 1)]
+    found = explain(start, *parts, iterations=2, warm_up=512, memory=100.0)
+    assert found.name == 'linear'
+    assert found['linear'].error == pytest.approx(0.2, rel=0.2)
+
+
 def test_both_ways_of_counting():
     rng = np.random.default_rng(2)
     truth = LoopModel.of(stage.linear_stage())
