@@ -15,6 +15,11 @@ judged in free run on those held out:
 
 A rival that is none of them, ``changed_dynamics``, is a linear model for each amplitude: it knows
 the amplitude beforehand.
+
+What sits inside the loop moves the modes with the amplitude; what sits in front of it changes the
+gain alone.  So the candidates inside the loop are named only where models of each amplitude err
+clearly less with modes of their own than with those of all.  Without that, a model with more
+signals may come nearer to a hysteresis of the voltages than plays of them do, and is no finding.
 """
 
 from __future__ import annotations
@@ -41,6 +46,8 @@ WORTH = 0.1
 FEW = 2
 #: simplest first
 SINGLE = ('linear', 'input_hysteresis', 'loop_hysteresis', 'softening', 'hysteretic_stiffness')
+#: those that leave the modes where they are
+STILL = SINGLE[:2]
 
 
 @dataclass(frozen=True)
@@ -81,29 +88,51 @@ class Rival:
     @property
     def error(self) -> float:
         """Quadratic mean of the pooled errors of the groups in %."""
-        return float(np.sqrt(np.mean([s.pooled**2 for s in self.scores.values()])))
+        return _quadratic_mean(self.scores)
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The candidates, and which of them is named."""
+    """
+    The candidates, and which of them is named.
+
+    Attributes
+    ----------
+    candidates : tuple of Rival
+    kept_modes, own_modes : float
+        Error in % of linear models of each amplitude, with the modes of all and with their own.
+    """
 
     candidates: tuple[Rival, ...]
+    kept_modes: float
+    own_modes: float
 
     def __getitem__(self, name: str) -> Rival:
         return next(c for c in self.candidates if c.name == name)
 
     @property
+    def modes_move(self) -> bool | None:
+        """Whether the modes move with the amplitude; None where there is only one."""
+        if len(self['linear'].scores) < 2:
+            return None
+        return self.own_modes < (1 - WORTH) * self.kept_modes
+
+    @property
     def name(self) -> str:
         """Name of the simplest single model that no other beats by much."""
-        errors = {name: self[name].error for name in SINGLE}
+        names = STILL if self.modes_move is False else SINGLE
+        errors = {name: self[name].error for name in names}
         limit = min(errors.values()) / (1 - WORTH)
-        return next(name for name in SINGLE if errors[name] <= limit)
+        return next(name for name in names if errors[name] <= limit)
 
     @property
     def model(self) -> LoopModel:
         """The model of what is named."""
         return next(iter(self[self.name].models.values()))
+
+
+def _quadratic_mean(found: dict[str, Score]) -> float:
+    return float(np.sqrt(np.mean([s.pooled**2 for s in found.values()])))
 
 
 def groups(records: Sequence[PeriodicRecord]) -> dict[str, list[PeriodicRecord]]:
@@ -215,6 +244,21 @@ def explain(
         each[group] = LoopModel.of(refined(linear, response, iterations=iterations))
     judged('changed_dynamics', each, since)
 
+    def alone(start: LoopModel, group: str, *hold: str) -> LoopModel:
+        """Fit a model to one group."""
+        return loop_fit(
+            start,
+            by_group[group],
+            weights=[weight[id(r)] for r in by_group[group]],
+            hold=hold,
+            iterations=iterations,
+            warm_up=warm_up,
+        )
+
+    kept = {group: alone(one, group, 'poles') for group in by_group}
+    own = {group: alone(model, group) for group, model in kept.items()}
+    modes = [_quadratic_mean(scores(models, held_out)) for models in (kept, own)]
+
     since = time.monotonic()
     signals = range(plain.linear.b.shape[1])
     model = grown(with_input_plays(plain, middle), iterations, still=signals)
@@ -230,7 +274,7 @@ def explain(
     model = grown(with_loop_plays(soft, middle), iterations)
     model = grown(with_input_plays(model, middle), iterations)
     finished('hysteretic_stiffness', model, since)
-    return Explanation(tuple(found))
+    return Explanation(tuple(found), *modes)
 
 
 def middle_group(records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:

@@ -17,7 +17,15 @@ import re
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.explain import explain, Explanation, groups, middle_group, Score
+from piezo_ident.axes.explain import (
+    explain,
+    Explanation,
+    groups,
+    middle_group,
+    Score,
+    SINGLE,
+    WORTH,
+)
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.model_text import AxesModel
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
@@ -144,8 +152,20 @@ class AxesIdentification:
                 '',
                 '100 rms(y - yhat) / rms(y) on what was held out:',
                 *told,
+                '',
+                self._modes(),
                 *(f'warning: {warning}' for warning in self.warnings),
             ]
+        )
+
+    def _modes(self) -> str:
+        found = self.explanation
+        if found.modes_move is None:
+            return 'One amplitude does not tell whether the modes move with it.'
+        return (
+            f'The modes {"move" if found.modes_move else "stay"} as the amplitude grows: linear '
+            f'models of each err by {found.kept_modes:.3g} % with one set of modes, by '
+            f'{found.own_modes:.3g} % with their own.'
         )
 
     @property
@@ -160,8 +180,21 @@ class AxesIdentification:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Records that do not repeat."""
-        return tuple(str(p) for p in self.periodicity if p.suspicious)
+        """Records that do not repeat, and what the name leaves open."""
+        told = [str(p) for p in self.periodicity if p.suspicious]
+        found = self.explanation
+        best = min((c for c in found.candidates if c.name in SINGLE), key=lambda c: c.error)
+        if found.modes_move is None and found.name != 'linear':
+            told.append(
+                'hysteresis before the mechanics and inside them look alike at one amplitude; '
+                'play a second one'
+            )
+        elif best.error < (1 - WORTH) * found[found.name].error:
+            told.append(
+                f'{best.name} errs by {best.error:.3g} % and is not named, since the modes stay '
+                'as the amplitude grows: what is before them is no sum of plays'
+            )
+        return tuple(told)
 
 
 def identify_axes(

@@ -7,6 +7,7 @@ import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.explain import explain, scores
 from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.signals import with_loop_plays, with_softening
 from piezo_ident.common.errors import DataError, ModelError
 import pytest
@@ -22,6 +23,7 @@ def explained(truth, *, seed=1):
 def test_hysteresis_inside_the_loop_is_named():
     found = explained(stage.loop_stage())
     assert found.name == 'hysteretic_stiffness'
+    assert found.modes_move
     best, rival = found['hysteretic_stiffness'], found['changed_dynamics']
     # noise is 0.2 %
     assert best.error < 0.5 and rival.error > 2 * best.error
@@ -36,6 +38,39 @@ def test_hysteresis_of_the_inputs_is_named():
     found = explained(truth)
     assert found.name == 'input_hysteresis'
     assert found['input_hysteresis'].error < 0.5
+
+
+def yielded(u, size=2.5, part=0.5):
+    """Return voltages less what they yield, by the law of Bouc and Wen."""
+    z, last, out = np.zeros(2), u[0], np.empty_like(u)
+    for k, now in enumerate(np.vstack([u, u])):
+        side, step = np.sign(now - last), np.abs(now - last)
+        # back to zero without yielding, and what is left of the way beyond
+        back = np.minimum(step, np.maximum(0, -side * z))
+        z, step, last = z + side * back, step - back, now
+        z = side * size - (side * size - z) * np.exp(-step / size)
+        out[k % len(u)] = now - part * z
+    return out
+
+
+def test_hysteresis_before_the_mechanics_is_none_inside_whatever_fits_better():
+    # no play: what has more signals comes nearer, but the modes stay where they are
+    rng = np.random.default_rng(8)
+    truth = stage.linear_stage()
+
+    def record(amplitude):
+        u = stage.multisine(rng, amplitude)
+        y = np.array([stage.answer(truth, yielded(u))] * 2)
+        y += 0.002 * y.std() * rng.standard_normal(y.shape)
+        return PeriodicRecord('record', f'{amplitude:g}', stage.RATE, np.array([u] * 2), y)
+
+    taught, held_out = ([record(x) for x in (0.2, 0.8, 2.0) for _ in range(n)] for n in (3, 1))
+    found = explain(truth, taught, held_out, iterations=6, warm_up=512, memory=100.0)
+    assert found.name == 'input_hysteresis' and not found.modes_move
+    assert found['input_hysteresis'].error < 0.4 * found['linear'].error
+    assert found['hysteretic_stiffness'].error < 0.9 * found['input_hysteresis'].error
+    one = [[r for r in part if r.group == '2'] for part in (taught, held_out)]
+    assert explain(truth, *one, iterations=1, warm_up=512).modes_move is None
 
 
 def test_a_linear_stage_stays_linear():
