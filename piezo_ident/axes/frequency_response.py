@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 
-__all__ = ['LineResponse', 'excited_lines', 'frequency_response']
+__all__ = ['LineResponse', 'excited_lines', 'frequency_response', 'likeness']
 
 #: a line whose voltage is smaller than this part of the largest is not excited
 EXCITED = 0.02
@@ -80,8 +80,13 @@ def frequency_response(
     y = np.array([np.fft.rfft(r.mean_y, axis=0)[lines] for r in records])
     inputs, outputs = u.shape[2], y.shape[2]
     width = 2 * half_width + 1
+    if len(lines) < width:
+        raise DataError(
+            f'the inputs share {len(lines)} lines of a period, {width} are needed; drive every '
+            'axis by a multisine of its own of the same many lines (docs/two_axes.md)'
+        )
     unknown, known = inputs * (degree + 1), width * len(records)
-    if known < unknown or len(lines) < width:
+    if known < unknown:
         raise DataError(
             f'{len(records)} records of {len(lines)} lines do not determine the response from '
             f'{inputs} inputs; take more records or a wider neighbourhood'
@@ -95,3 +100,23 @@ def frequency_response(
         solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
         g[i] = solution[:inputs].T
     return LineResponse(lines, len(records[0].mean_u), g)
+
+
+def likeness(records: Sequence[PeriodicRecord], *, half_width: int = 4) -> NDArray[np.float64]:
+    """
+    Return how much the inputs are one signal, shape (inputs, inputs).
+
+    Of each pair the coherence over the neighbours of a line and all records, 0 to 1, median over
+    the lines: with 1 nothing tells what either of them moves.  0 where there are too few lines.
+    """
+    lines = excited_lines(records)
+    width = 2 * half_width + 1
+    if len(lines) < width:
+        return np.zeros((records[0].u.shape[2],) * 2)
+    u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
+    products = np.einsum('rki,rkj->kij', u.conj(), u)
+    sums = np.cumsum(np.concatenate([0 * products[:1], products]), axis=0)
+    near = sums[width:] - sums[:-width]
+    power = np.real(np.einsum('kii->ki', near))
+    coherence = np.abs(near) ** 2 / (power[:, :, None] * power[:, None, :])
+    return np.asarray(np.median(coherence, axis=0))

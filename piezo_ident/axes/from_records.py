@@ -26,6 +26,7 @@ from piezo_ident.axes.explain import (
     SINGLE,
     WORTH,
 )
+from piezo_ident.axes.frequency_response import likeness
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.model_text import AxesModel
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
@@ -39,6 +40,8 @@ __all__ = ['AxesIdentification', 'Periods', 'identify_axes', 'periods_of']
 PERIODS = 64
 #: voltages that differ by less than this part of their range are equal: measured ones do by 2e-4
 EQUAL = 1e-3
+#: inputs of such coherence are one signal: what either moves is known ten times worse than both
+ONE_SIGNAL = 0.98
 #: orders that are tried
 ORDERS = (4, 6, 8, 12, 16, 20, 28, 36)
 
@@ -74,20 +77,29 @@ def periods_of(records: Sequence[Record]) -> Periods:
     DataError
         When there is none, or they differ in length.
     """
-    found = []
+    found, resting = [], set[str]()
     every = Axes.of_records(records)
     pieces = [piece for record in records for piece in record]
     for axes, piece in zip(every, pieces, strict=True):
         for segment in piece.segments:
             cut = slice(segment.start, segment.stop)
-            count = _periods(axes.inputs[cut])
+            still = np.ptp(axes.inputs[cut], axis=0) == 0
+            count = _periods(axes.inputs[cut][:, ~still])
             if count < 2:
+                continue
+            if still.any():
+                resting |= {axes.input_names[i] for i in np.flatnonzero(still)}
                 continue
             first = 1 if count > 2 else 0
             u, y = (
                 x[cut].reshape(count, -1, x.shape[1])[first:] for x in (axes.inputs, axes.outputs)
             )
             found.append((segment.label, u, y))
+    if resting and not found:
+        raise DataError(
+            f'{", ".join(sorted(resting))} rest in segments that repeat; drive all axes at once, '
+            'each by a multisine of its own (docs/two_axes.md)'
+        )
     sizes = sorted({u.shape[1] for _, u, _ in found})
     if len(sizes) != 1:
         raise DataError(
@@ -110,9 +122,9 @@ def periods_of(records: Sequence[Record]) -> Periods:
 
 
 def _periods(u: NDArray[np.float64]) -> int:
-    """Return how many periods some voltages are; 1 where they do not repeat or an input rests."""
+    """Return how many periods some voltages are; 1 where they do not repeat, or all rest."""
     n, span = len(u), np.ptp(u, axis=0)
-    if not span.all():
+    if not span.size:
         return 1
     for count in range(min(PERIODS, n // 16), 1, -1):
         size = n // count
@@ -240,6 +252,7 @@ def identify_axes(
             f'{", ".join(alone)}: one realisation only; play two or more, one of them is held out'
         )
     taught = [r for members in parts.values() for r in members[:-1]]
+    _check_separable(taught, periods.inputs)
     held_out = [members[-1] for members in parts.values()]
     repeats = periodicity(periods.records)
     weight = {id(r): p.weight for r, p in zip(periods.records, repeats, strict=True)}
@@ -273,3 +286,15 @@ def identify_axes(
         found[found.name].error,
     )
     return AxesIdentification(model, found, found[found.name].scores, repeats, periods)
+
+
+def _check_separable(records: Sequence[PeriodicRecord], inputs: Sequence[str]) -> None:
+    """Refuse axes that were driven by one signal: each may have moved what the other did."""
+    for group, members in groups(records).items():
+        alike = np.triu(likeness(members), 1)
+        first, second = divmod(int(np.argmax(alike)), len(alike))
+        if alike[first, second] > ONE_SIGNAL:
+            raise DataError(
+                f'{group}: {inputs[first]} and {inputs[second]} play one signal, so nothing '
+                'tells which of them moved what; give each axis random phases of its own'
+            )

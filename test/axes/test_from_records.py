@@ -82,6 +82,24 @@ def test_what_cannot_be_used_says_why(record):
         periods_of([record, shorter])
 
 
+def test_axes_that_cannot_be_told_apart_are_refused(record):
+    (piece,) = record
+
+    def of(v, v_b):
+        channels = {**piece.channels, 'v_b': v_b}
+        return pi.Record((replace(piece, v=v, channels=channels),), 'record')
+
+    # another size and bias make no other signal
+    with pytest.raises(DataError, match='small: v and v_b play one signal'):
+        identify_axes(of(piece.v, 1 + 0.8 * piece.v))
+    with pytest.raises(DataError, match='v_b rest in segments that repeat; drive all axes'):
+        identify_axes(of(piece.v, np.full(piece.n, 5.0)))
+    t = np.arange(piece.n) * 50 / 2048
+    sine, triangle = np.sin(2 * np.pi * t), np.abs(t % 1 - 0.5)
+    with pytest.raises(DataError, match=r'the inputs share \d lines of a period, 9 are needed'):
+        identify_axes(of(5 + sine, 5 + triangle))
+
+
 def test_the_text_of_a_model_reads_back_bit_by_bit(record, tmp_path):
     linear = periods_of([record])
     found = identify_axes([record], iterations=1)
