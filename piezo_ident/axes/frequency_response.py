@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 
-__all__ = ['LineResponse', 'excited_lines', 'frequency_response', 'likeness']
+__all__ = ['LineResponse', 'excited_lines', 'frequency_response', 'likeness', 'neighbours']
 
 #: a line whose voltage is smaller than this part of the largest is not excited
 EXCITED = 0.02
@@ -93,13 +93,31 @@ def frequency_response(
         )
     g = np.zeros((len(lines), outputs, inputs), complex)
     for i in range(len(lines)):
-        low = max(0, min(i - half_width, len(lines) - width))
-        near = slice(low, low + width)
-        powers = np.vander((lines[near] - lines[i]) / half_width, degree + 1, increasing=True)
-        columns = (u[:, near, None, :] * powers[None, :, :, None]).reshape(-1, unknown)
+        columns, near = neighbours(u, lines, i, half_width, degree)
         solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
         g[i] = solution[:inputs].T
     return LineResponse(lines, len(records[0].mean_u), g)
+
+
+def neighbours(
+    u: NDArray[np.complex128],
+    lines: NDArray[np.intp],
+    at: int,
+    half_width: int,
+    degree: int,
+) -> tuple[NDArray[np.complex128], slice]:
+    """
+    Return the columns of a local polynomial, inputs first, and the lines that it is fitted to.
+
+    u has the shape (records, lines, inputs), the middle is ``lines[at]``; a row of the columns is
+    a line of a record.
+    """
+    width = 2 * half_width + 1
+    low = max(0, min(at - half_width, len(lines) - width))
+    near = slice(low, low + width)
+    powers = np.vander((lines[near] - lines[at]) / half_width, degree + 1, increasing=True)
+    columns = u[:, near, None, :] * powers[None, :, :, None]
+    return columns.reshape(-1, u.shape[2] * (degree + 1)), near
 
 
 def likeness(records: Sequence[PeriodicRecord], *, half_width: int = 4) -> NDArray[np.float64]:

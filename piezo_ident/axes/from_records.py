@@ -29,6 +29,7 @@ from piezo_ident.axes.explain import (
 from piezo_ident.axes.frequency_response import likeness
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.model_text import AxesModel
+from piezo_ident.axes.paths import axis_errors, AxisError, Path, paths_of
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import Axes
@@ -148,6 +149,10 @@ class AxesIdentification:
     periodicity : tuple of Periodicity
         Of all records.
     periods : Periods
+    axis_errors : tuple of AxisError
+        Of each axis alone, on the records held out.
+    paths : tuple of Path
+        What each input moves of other axes, and by how much the model errs there.
     """
 
     model: AxesModel
@@ -155,6 +160,8 @@ class AxesIdentification:
     errors: dict[str, Score]
     periodicity: tuple[Periodicity, ...]
     periods: Periods
+    axis_errors: tuple[AxisError, ...]
+    paths: tuple[Path, ...]
 
     def __repr__(self) -> str:
         told = [f'{c.name:32s}{c.error:8.3g} %' for c in self.explanation.candidates]
@@ -166,6 +173,8 @@ class AxesIdentification:
                 *told,
                 '',
                 self._modes(),
+                '',
+                *(str(x) for x in (*self.axis_errors, *self.paths)),
                 *(f'warning: {warning}' for warning in self.warnings),
             ]
         )
@@ -192,8 +201,14 @@ class AxesIdentification:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Records that do not repeat, and what the name leaves open."""
+        """Records that do not repeat, couplings missed, and what the name leaves open."""
         told = [str(p) for p in self.periodicity if p.suspicious]
+        told += [
+            f'the model does not tell what {p.input} moves of {p.output}: it errs by '
+            f'{p.error:.2g} % of the motion of {p.output} there'
+            for p in self.paths
+            if p.wrong
+        ]
         found = self.explanation
         best = min((c for c in found.candidates if c.name in SINGLE), key=lambda c: c.error)
         if found.modes_move is None and found.name != 'linear':
@@ -285,7 +300,15 @@ def identify_axes(
         found.name,
         found[found.name].error,
     )
-    return AxesIdentification(model, found, found[found.name].scores, repeats, periods)
+    return AxesIdentification(
+        model,
+        found,
+        found[found.name].scores,
+        repeats,
+        periods,
+        axis_errors(found.model, held_out, periods.outputs),
+        paths_of(found.model, held_out, periods.inputs, periods.outputs),
+    )
 
 
 def _check_separable(records: Sequence[PeriodicRecord], inputs: Sequence[str]) -> None:

@@ -56,10 +56,13 @@ def test_hysteresis_inside_the_loop_is_named_and_halves_the_error(record):
     assert found.error < 0.7 * found.explanation['changed_dynamics'].error
     assert found.model.model.radius < 1 and not found.warnings
     assert set(steps) == {'dynamics', 'candidates'}
-    first, _, _, *rows, _, modes = repr(found).splitlines()
+    first, _, _, *rows, _, modes, _, y, y_b, path, _ = repr(found).splitlines()
     assert first == f'A stage of 2 axes: {found.model.effect}.'
     assert [row.split()[0] for row in rows] == [c.name for c in found.explanation.candidates]
     assert modes.startswith('The modes move as the amplitude grows')
+    assert y.startswith('y: ') and y_b.startswith('y_b: ')
+    # the axes of this stage pull at one another
+    assert path.startswith('v moves y_b by') and not found.paths[0].wrong
 
 
 def test_a_linear_stage_is_found_to_the_noise_and_nothing_is_blamed():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 import json
 from pathlib import Path
 
@@ -66,6 +67,8 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
                 }
                 for c in found.explanation.candidates
             ],
+            'axes': [asdict(x) for x in found.axis_errors],
+            'paths': [asdict(x) for x in found.paths],
             'periodicity': [str(p) for p in found.periodicity],
             'warnings': [*warnings],
         }
