@@ -3,6 +3,8 @@
 
 """A simulated stage of two axes that pull at one another, softening and hysteretic or not."""
 
+from dataclasses import replace
+
 import numpy as np
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.modal import balanced, to_modal
@@ -23,6 +25,17 @@ def linear_stage():
         a[at, at], b[at] = part[:2, :2], np.outer(part[:2, 2], shapes[:, i])
         c[:, 2 * i] = shapes[:, i]
     return balanced(to_modal(a, b, c, np.zeros((2, 2))))
+
+
+def uncoupled_stage():
+    """Return the same modes, each of one axis alone."""
+    plain = linear_stage()
+    b, c = plain.b.copy(), plain.c.copy()
+    for mode in range(2):
+        at = slice(2 * mode, 2 * mode + 2)
+        b[at, 1 - mode] = 0
+        c[1 - mode, at] = 0
+    return replace(plain, b=b, c=c)
 
 
 def loop_stage(*, softening=0.04, plays=0.08):

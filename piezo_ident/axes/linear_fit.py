@@ -37,14 +37,20 @@ def linear_fit(response: LineResponse, order: int, *, iterations: int) -> Modal:
 
 
 def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:
-    """Lower the error of a stable model's response, summed over lines, inputs and outputs."""
-    z, scale = response.z, float(np.sqrt(np.mean(np.abs(response.g) ** 2)))
+    """
+    Lower the error of a stable model's response, summed over lines, inputs and outputs.
+
+    That of each output counts in parts of its own response, whatever its stroke.
+    """
+    z, size = response.z, np.sqrt(np.mean(np.abs(response.g) ** 2, axis=(0, 2)))[:, None]
+    scale = np.where(size > 0, size, 1)
     limit = narrowest(response.samples)
     model = replace(model, blocks=resolved(model.blocks, limit))
     error = (model.response(z) - response.g) / scale
     cost, damping, slow = float(np.sum(np.abs(error) ** 2)), 1e-3, 0
     for _ in range(iterations):
-        columns = _derivatives(model, z) / scale
+        shape = (-1, *response.g.shape)
+        columns = (_derivatives(model, z).reshape(shape) / scale).reshape(-1, response.g.size)
         hessian = columns.real @ columns.real.T + columns.imag @ columns.imag.T
         flat = error.ravel()
         gradient = columns.real @ flat.real + columns.imag @ flat.imag
@@ -72,14 +78,19 @@ def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Mo
 
 
 def linear_error(model: Modal, record: PeriodicRecord) -> float:
-    """Return 100 rms(y - yhat) / rms(y) of a linear model over the last period, settled."""
+    """
+    Return 100 rms(y - yhat) / rms(y) of a linear model over the last period, settled.
+
+    Quadratic mean over the outputs.
+    """
     samples = record.u.shape[1]
     u, y = (np.fft.rfft(x[-1], axis=0) for x in (record.u, record.y))
     response = model.response(np.exp(2j * np.pi * np.arange(len(u)) / samples))
     answer = np.einsum('kpm,km->kp', response, u)
     answer[0] = 0
     error = np.fft.irfft(y - answer, samples, axis=0)
-    return 100 * float(np.linalg.norm(error) / np.linalg.norm(record.y[-1]))
+    shares = np.mean(error**2, axis=0) / np.mean(record.y[-1] ** 2, axis=0)
+    return 100 * float(np.sqrt(np.mean(shares)))
 
 
 def choose_order(

@@ -5,8 +5,9 @@
 Everything in a loop model fitted at once by its error in free run.
 
 Levenberg-Marquardt on the steady state of periodic records of all amplitudes together, with the
-sensitivities of `piezo_ident.axes.loop_kernels`.  The error of each record is divided by the rms
-of its y, so small amplitudes count as much as large ones.
+sensitivities of `piezo_ident.axes.loop_kernels`.  The error of each output of each record is
+divided by its rms, so small amplitudes count as much as large ones, and an axis of a short stroke
+as much as one of a long one.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ SLOW = 3e-3
 SLOW_STEPS = 3
 #: threads
 WORKERS = 2
+
+#: voltages with those before, displacements, and a factor for the error of each of them
+Target = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,22 +258,22 @@ class _Problem:
         warm_up: int,
     ) -> None:
         self.parameters = Parameters.of(model, hold=hold, still=still)
-        self.targets = []
+        self.targets: list[Target] = []
         self.warm_up = min(warm_up, records[0].u.shape[1])
         self.slowest = FADED ** (1 / self.warm_up)
         self.limit = narrowest(records[0].u.shape[1])
         for record, weight in zip(records, weights, strict=True):
             u, y = record.mean_u, record.mean_y
-            weight = weight / float(np.sqrt(np.mean(y**2)))
             before = u[len(u) - self.warm_up :]
-            self.targets.append((np.concatenate([before, u]), y, weight))
+            scale = weight / np.sqrt(np.mean(y**2, axis=0))
+            self.targets.append((np.concatenate([before, u]), y, scale))
 
     def cost(self, model: LoopModel, pool: ThreadPoolExecutor) -> float:
         """Sum of the squared, weighted errors; infinite where the model is not stable."""
         if not model.radius < RADIUS:
             return float('inf')
 
-        def one(target: tuple[NDArray[np.float64], NDArray[np.float64], float]) -> float:
+        def one(target: Target) -> float:
             try:
                 error, _ = self._error(model, target)
             except ModelError:  # ran away
@@ -278,13 +282,11 @@ class _Problem:
 
         return sum(pool.map(one, self.targets))
 
-    def _error(
-        self, model: LoopModel, target: tuple[NDArray[np.float64], NDArray[np.float64], float]
-    ) -> tuple[NDArray[np.float64], Passage]:
-        u, y, weight = target
+    def _error(self, model: LoopModel, target: Target) -> tuple[NDArray[np.float64], Passage]:
+        u, y, scale = target
         run = model.run(u)
         answer = run.y[self.warm_up :]
-        return (answer - answer.mean(axis=0) - y) * weight, run
+        return (answer - answer.mean(axis=0) - y) * scale, run
 
     def normal_equations(
         self, model: LoopModel, pool: ThreadPoolExecutor
@@ -295,10 +297,8 @@ class _Problem:
         each = model.linear.order + model.linear.b.shape[1] + model.signals
         total = many + outputs * each
 
-        def one(
-            target: tuple[NDArray[np.float64], NDArray[np.float64], float],
-        ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            u, _, weight = target
+        def one(target: Target) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            u, _, scale = target
             error, run = self._error(model, target)
             skip = self.warm_up
             inner = output_sensitivities(model, self.parameters, u, run, skip)
@@ -307,7 +307,7 @@ class _Problem:
             for o in range(outputs):
                 columns = np.hstack([inner[:, o], plain])
                 columns -= columns.mean(axis=0)
-                columns *= np.float32(weight)
+                columns *= np.float32(scale[o])
                 at = np.r_[:many, many + o * each : many + (o + 1) * each]
                 hessian[np.ix_(at, at)] += columns.T @ columns
                 gradient[at] += columns.T @ error[:, o].astype(np.float32)

@@ -11,6 +11,8 @@ B, C and D then follow by least squares, in turns.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.frequency_response import LineResponse
@@ -35,6 +37,10 @@ def subspace(response: LineResponse, order: int) -> Modal:
         Where the response has too few lines for the order.
     """
     outputs, inputs = response.g.shape[1:]
+    # an output of a short stroke counts as much as one of a long one
+    size = np.sqrt(np.mean(np.abs(response.g) ** 2, axis=(0, 2)))[:, None]
+    size = np.where(size > 0, size, 1)
+    response = replace(response, g=response.g / size)
     rows = min(ROWS, len(response.lines) // (2 * max(inputs, outputs)))
     if order % 2 or not 0 < order < (rows - 1) * outputs:
         raise IdentificationError(
@@ -47,7 +53,7 @@ def subspace(response: LineResponse, order: int) -> Modal:
     model = to_modal(a, nothing[0], observability[:outputs], nothing[1])
     for _ in range(TURNS):
         model = _with_c(_with_b(model, response), response)
-    return model
+    return balanced(replace(model, c=size * model.c, d=size * model.d))
 
 
 def _observability(response: LineResponse, rows: int) -> NDArray[np.float64]:

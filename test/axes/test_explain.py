@@ -68,7 +68,7 @@ def test_hysteresis_before_the_mechanics_is_none_inside_whatever_fits_better():
     found = explain(truth, taught, held_out, iterations=6, warm_up=512, memory=100.0)
     assert found.name == 'input_hysteresis' and not found.modes_move
     assert found['input_hysteresis'].error < 0.4 * found['linear'].error
-    assert found['hysteretic_stiffness'].error < 0.9 * found['input_hysteresis'].error
+    assert found['hysteretic_stiffness'].error < 0.95 * found['input_hysteresis'].error
     one = [[r for r in part if r.group == '2'] for part in (taught, held_out)]
     assert explain(truth, *one, iterations=1, warm_up=512).modes_move is None
 

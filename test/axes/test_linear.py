@@ -89,6 +89,22 @@ def test_refinement_recovers_the_stage_to_the_noise(noisy):
     assert stage.modes(found.a)[0] == pytest.approx([190, 310], rel=1e-3)
 
 
+def test_an_axis_of_a_short_stroke_is_fitted_as_well():
+    truth = stage.uncoupled_stage()
+    small = replace(truth, c=truth.c * np.array([[1.0], [1e-3]]))
+    records = stage.records(small, np.random.default_rng(1), (1.0,), count=6)
+    noise = np.random.default_rng(2).standard_normal((6, *records[0].y.shape))
+    records = [
+        replace(r, y=r.y + 0.01 * r.y.std(axis=(0, 1)) * e)
+        for r, e in zip(records, noise, strict=True)
+    ]
+    start, errors = choose_order(records[:4], records[4:], orders=(2, 4, 8))
+    assert start.order == 4 and errors[4] == pytest.approx(1.0, rel=0.15)
+    for model in (LoopModel.of(start), loop_fit(LoopModel.of(start), records[:4], iterations=3)):
+        error = model.error(records[5]).std(axis=0) / records[5].y[-1].std(axis=0)
+        assert error == pytest.approx(0.01, rel=0.2)
+
+
 def test_order_is_chosen_by_held_out_error(noisy):
     model, errors = choose_order(noisy[:4], noisy[4:], orders=(2, 4, 8))
     assert model.order == 4
