@@ -270,7 +270,7 @@ def _diagnosed(
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
     # where no line stands out, and no channel, there is nothing to fit
     tested = {HUM} if lines.searched else set()
-    tested |= {'cross_coupling'} if channels else set()
+    tested |= {'cross_coupling'} if any(test.tells for test in channels) else set()
     tested |= {*settings.without, *(setting.name for setting in model.effects)}
     aside = set_aside(rows, selected, settings, noise, missed, tested)
     explainable = max(base.mean_square - noise, 1e-300)

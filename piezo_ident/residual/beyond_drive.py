@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.operators.play import play_columns
+from piezo_ident.record.channels import role_of
 from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
@@ -51,6 +52,11 @@ class ChannelTest:
     channel: str
     significant: bool = False
     added: tuple[Array | None, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def tells(self) -> bool:
+        """Whether the channel moves by itself, and causes: the motion of an axis does not."""
+        return bool(self.added) and role_of(self.channel) != 'y'
 
 
 def drive_functions(v: Array, rate: float) -> Array:

@@ -249,6 +249,21 @@ def test_the_rest_of_another_axis_is_where_it_stood_at_first():
     assert free_run(result.model, record).errors.percent < 0.01
 
 
+@pytest.mark.parametrize('moves', ['not', 'alike', 'by itself'])
+def test_an_axis_that_does_not_move_by_itself_tests_no_coupling(moves):
+    record = example_record()
+    (piece,) = record.pieces
+    t = np.arange(piece.n) / piece.sample_rate
+    v_b = {'not': 5 + 0 * t, 'alike': 2 + 0.5 * piece.v, 'by itself': np.sin(2 * np.pi * 7.3 * t)}
+    # the motion of the other axis is no cause, however noisy
+    y_b = 1e-6 * v_b[moves] + 1e-9 * np.random.default_rng(6).standard_normal(piece.n)
+    two = Record((replace(piece, channels={'v_b': v_b[moves], 'y_b': y_b}),), record.name)
+    result = diagnose(slow_model(), two, DiagnosisSettings(effects=('creep', 'cross_coupling')))
+    assert [e.name for e in result.effects] == ['creep']
+    untestable = [found.name for found in result.untestable]
+    assert untestable == ([] if moves == 'by itself' else ['cross_coupling'])
+
+
 @pytest.mark.parametrize(
     ('effect', 'size', 'seed', 'other'),
     [
