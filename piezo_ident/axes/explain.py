@@ -36,7 +36,7 @@ from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.signals import with_input_plays, with_loop_plays, with_softening
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, ModelError
 
 __all__ = ['Explanation', 'Rival', 'Score', 'explain', 'groups', 'middle_group', 'scores']
 
@@ -144,13 +144,16 @@ def groups(records: Sequence[PeriodicRecord]) -> dict[str, list[PeriodicRecord]]
 
 
 def scores(models: dict[str, LoopModel], records: Sequence[PeriodicRecord]) -> dict[str, Score]:
-    """Judge the model of each group on its records."""
+    """Judge the model of each group on its records; one that runs away errs without end."""
     found = {}
     for group, members in groups(records).items():
         errors, powers = [], []
         for record in members:
-            errors.append(np.mean(models[group].error(record) ** 2, axis=0))
             powers.append(np.mean(record.y[-1] ** 2, axis=0))
+            try:
+                errors.append(np.mean(models[group].error(record) ** 2, axis=0))
+            except ModelError:
+                errors.append(np.full(record.y.shape[2], np.inf))
         found[group] = Score(
             100 * float(np.sqrt(np.sum(errors) / np.sum(powers))),
             100 * float(np.mean(np.sqrt(np.array(errors) / np.array(powers)))),

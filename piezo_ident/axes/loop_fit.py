@@ -201,6 +201,7 @@ def loop_fit(
     -------
     LoopModel
         Whose modes are stable over its range of levels, which is what the records often reach.
+        One that runs away under a record is returned as it is.
     """
     weights = [1.0] * len(records) if weights is None else weights
     model = _ranged(model, records)
@@ -208,7 +209,8 @@ def loop_fit(
     damping, slow = 1e-3, 0
     with ThreadPoolExecutor(WORKERS) as pool:
         cost = problem.cost(model, pool)
-        for _ in range(iterations):
+        # from a model that runs away no step is known
+        for _ in range(iterations if np.isfinite(cost) else 0):
             hessian, gradient = problem.normal_equations(model, pool)
             before = cost
             for _ in range(8):

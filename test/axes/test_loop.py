@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import axes_stage as stage
 import numpy as np
+from piezo_ident.axes.explain import scores
 from piezo_ident.axes.loop_fit import loop_fit, output_sensitivities, Parameters
 from piezo_ident.axes.loop_kernels import KINDS
 from piezo_ident.axes.loop_model import LoopModel
@@ -107,6 +108,17 @@ def test_what_is_held_stays():
     assert (fitted.mu == start.mu).all()
     assert (fitted.f[2:] == start.f[2:]).all() and (fitted.g[2:] == start.g[2:]).all()
     assert (fitted.f[:2] != start.f[:2]).any()
+
+
+def test_a_fit_leaves_a_model_that_runs_away_as_it_is():
+    truth = stage.loop_stage()
+    rng = np.random.default_rng(5)
+    taught = [stage.record(truth, rng, 1.0)]
+    wild = replace(truth, e=-60 * truth.e)
+    found = loop_fit(wild, taught, iterations=2)
+    assert (found.e == wild.e).all()
+    (score,) = scores({'1': found}, taught).values()
+    assert score.pooled == score.mean == np.inf
 
 
 def test_a_model_that_runs_away_says_so():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 import json
+from math import isfinite
 from pathlib import Path
 
 from piezo_ident.axes.from_records import AxesIdentification, identify_axes
@@ -62,8 +63,8 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
             'candidates': [
                 {
                     'name': c.name,
-                    'error_percent': c.error,
-                    'by_group': {group: score.pooled for group, score in c.scores.items()},
+                    'error_percent': _known(c.error),
+                    'by_group': {group: _known(s.pooled) for group, s in c.scores.items()},
                 }
                 for c in found.explanation.candidates
             ],
@@ -73,6 +74,11 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
             'warnings': [*warnings],
         }
     }
+
+
+def _known(error: float) -> float | None:
+    """Return an error, or None of a model that ran away: JSON has no infinity."""
+    return error if isfinite(error) else None
 
 
 def save_axes(model: str, folder: str, tick: Tick) -> str:
