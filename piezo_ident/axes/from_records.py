@@ -169,7 +169,7 @@ class AxesIdentification:
             [
                 f'A stage of {len(self.model.outputs)} axes: {self.model.effect}.',
                 '',
-                '100 rms(y - yhat) / rms(y) on what was held out:',
+                '100 rms(y - yhat) / rms(y) on multisines held out; other motion may err more:',
                 *told,
                 '',
                 self._modes(),
