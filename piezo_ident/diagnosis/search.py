@@ -316,11 +316,11 @@ def stands_out(rows: Rows, this: Round) -> bool:
     Return whether the best contender of a round gains far more than any other candidate.
 
     A hysteresis that does not fit leaves something of which many effects explain a part, and none
-    much more than the next.  What follows the path of the command, or was tried beside a G that
-    was not retuned, stands out too easily.
+    much more than the next.  What follows the path of the command, is a law of H itself, or was
+    tried beside a G that was not retuned, stands out too easily.
     """
-    before, best = this.before, this.contenders[0]
-    if not before.state.retuning or find_effect(best.name).rate_independent:
+    before, best = this.before, find_effect(this.contenders[0].name)
+    if not before.state.retuning or best.rate_independent or best.slot == 'hysteresis':
         return False
     others = [gain for name, gain in gains_of(rows, this).items() if name != best.name]
     most = max(others, default=0.0)

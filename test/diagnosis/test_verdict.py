@@ -374,6 +374,9 @@ def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
         # beside a G as given any change of it stands out, and beside a wide H what bends it
         ('changed_dynamics', 0.7, 0.7, False, False),
         ('sensor_nonlinearity', 0.7, 0.7, True, False),
+        # a law of H makes up for an H that does not fit: 0.62 and 0.64 of a backlash, 0.91 and
+        # more of what goes with the rate
+        ('rate_dependent_hysteresis', 0.7, 0.7, True, False),
     ],
 )
 def test_an_effect_stands_out_where_no_other_gains_half_as_much(
