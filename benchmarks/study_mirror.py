@@ -151,7 +151,7 @@ not to its square; the damping of some modes rises. One linear model cannot have
 {periodicity}
 
 All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods. What fails the test
-is weighted down in the fit, and nobody has to name it.
+is weighted down in the fit, without being told.
 
 ## What is left
 
@@ -472,12 +472,14 @@ def usual(tested: Sequence[Periodicity]) -> tuple[float, float]:
 
 
 def noise_by_group(tested: Sequence[Periodicity]) -> str:
-    names = dict.fromkeys(t.group for t in tested)
-    usual = [
-        np.mean([t.noise for t in tested if t.group == name and not t.suspicious])
-        for name in names
-    ]
-    return ' / '.join(f'{v:.1f}' for v in usual)
+    """Return the noise of one period at each amplitude, mean over the records that repeat."""
+    fine: dict[str, list[float]] = {}
+    for t in tested:
+        of_group = fine.setdefault(t.name.partition(',')[0], [])
+        if not t.suspicious:
+            # a difference has the noise of two periods
+            of_group.append(t.difference / np.sqrt(2))
+    return ' / '.join(f'{np.mean(found):.1f}' for found in fine.values())
 
 
 if __name__ == '__main__':

@@ -7,7 +7,7 @@ import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.explain import Rival
 from piezo_ident.axes.loop_model import LoopModel
-from piezo_ident.axes.periodic import periodicity
+from piezo_ident.axes.periodic import Periodicity, periodicity
 import pytest
 import study_mirror as study
 
@@ -22,6 +22,15 @@ def test_the_records_that_do_not_repeat_are_found():
         '100 mV, realisation 2',
     ]
     assert max(t.difference for t in tested if not t.suspicious) < 2
+
+
+def test_noise_is_that_of_one_period_of_records_that_repeat():
+    tested = [
+        Periodicity('100 mV, realisation 0', 2.0, 1.0, None),
+        Periodicity('100 mV, realisation 1', 8.0, 0.1, (0.0, 2000.0)),
+        Periodicity('200 mV, realisation 0', 1.0, 1.0, None),
+    ]
+    assert study.noise_by_group(tested) == '1.4 / 0.7'
 
 
 def test_spectra_hold_the_whole_error():
