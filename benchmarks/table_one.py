@@ -27,7 +27,6 @@ from piezo_ident.diagnosis import diagnose
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.initial_memory import start_memory
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
@@ -88,7 +87,8 @@ def record_of(
 def by_segment(model: StageModel, record: Record) -> dict[str, float]:
     """Return the free-run error of each segment, % of the stroke of the record."""
     piece = record.pieces[0]
-    y_hat = model.predict_piece(piece, start_memory(model, piece))
+    # it begins at rest
+    y_hat = model.predict_piece(piece)
     return {
         s.label: percent_of_stroke(
             piece.y[s.start : s.stop], y_hat[s.start : s.stop], record.stroke

@@ -159,3 +159,11 @@ def test_swarm_problem_is_that_of_the_identification():
     middle = task.box.mean(axis=1)
     assert cost(middle[None])[0] == pytest.approx(task.loss(middle))
     assert task.loss(middle) > task.optimum
+
+
+@pytest.mark.parametrize('path', sorted(FOLDER.rglob('*.py')), ids=lambda p: p.stem)
+def test_what_a_benchmark_takes_from_the_package_is_there(path):
+    # most of them run for minutes, and seldom
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('piezo_ident.'):
+            exec(compile(ast.Module([node], []), path, 'exec'), {})
