@@ -48,8 +48,8 @@ class ModelNode(LabNode):
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
-        # samples of the last second that were measured and compared, and seconds without enough
-        self._measured, self._compared, self._unmet = 0, 0, 0
+        # samples of the last second, and seconds in which too few were compared
+        self._predicted, self._measured, self._compared, self._unmet = 0, 0, 0, 0
         self._models = 0
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
@@ -127,6 +127,7 @@ class ModelNode(LabNode):
         if predictor.problem:
             self._note_problem(predictor.problem)
         if prediction is not None:
+            self._predicted += prediction.t.size
             self._publish_preview(self._preview.add('prediction', prediction.t, prediction.values))
             self._compare(self._matcher.predicted(prediction))
 
@@ -192,17 +193,20 @@ class ModelNode(LabNode):
 
     def _mismatch(self) -> str:
         """Return why predictions cannot be judged, empty when they can; once a second."""
-        sent, measured, compared = self._count, self._measured, self._compared
-        self._measured = self._compared = 0
-        self._unmet = self._unmet + 1 if compared < MET * sent else 0
+        predicted, measured, compared = self._predicted, self._measured, self._compared
+        self._predicted = self._measured = self._compared = 0
+        if self._count and not predicted:
+            # displacement is not to blame
+            self._error.clear()
+            return self._predictor.problem
+        self._unmet = self._unmet + 1 if compared < MET * predicted else 0
         if self._unmet <= PATIENCE:
             return ''
         self._error.clear()
         if not measured:
             return 'no displacement comes'
-        return (
-            f'{100.0 * compared / sent:.0f} % of the voltage is met by displacement of the same t'
-        )
+        share = 100.0 * compared / predicted
+        return f'{share:.0f} % of the voltage is met by displacement of the same t'
 
     def _live_error(self, model: StageModel) -> float:
         return percent(self._error.rms, abs(model.scaling.Y))

@@ -327,6 +327,55 @@ def test_it_says_that_no_displacement_comes_or_none_of_the_same_time(fast):
         assert d['level'] == '1' and d['residual_rms'] == 'nan'
 
 
+def paired(g, several):
+    """Send blocks of voltage, each with the displacement of the same time."""
+    for block in several:
+        g.publish('voltage', block)
+        zeros = np.zeros(block.t.size)
+        g.publish('displacement', Samples(block.t, zeros, block.segment, 'displacement'))
+
+
+def test_a_model_that_comes_later_finds_no_fault_with_what_came_before(lab):
+    lab.start('model')
+    lab.wait(lambda: lab.diagnoses('model'), 'diagnostics')
+    seconds, first = lab.diagnoses('model'), 0
+
+    def more(count):
+        nonlocal first
+        paired(lab, blocks(100 * count, first))
+        first += 100 * count
+
+    # a second without a model, and most of the next one
+    seen = len(seconds)
+    lab.wait(lambda: len(seconds) > seen + 1, 'a second', meanwhile=lambda: more(1))
+    seen = len(seconds)
+    more(40)
+    lab.publish_text('model', paper())
+    lab.wait(lambda: lab.status('model').get('models') == '1', 'the model')
+    more(10)
+    lab.wait(lambda: len(seconds) > seen + 1, 'diagnostics')
+    assert {d['message'] for d in seconds[seen:]} <= {'no model yet', 'predicting'}
+
+
+def test_where_nothing_is_predicted_displacement_is_not_to_blame(lab):
+    lab.start('model')
+    lab.publish_text('model', paper())
+    lab.wait(lambda: lab.status('model').get('models') == '1', 'the model')
+    lab.wait(lambda: lab.diagnoses('model'), 'diagnostics')
+    seconds, first = lab.diagnoses('model'), 0
+
+    def more():
+        nonlocal first
+        paired(lab, [Samples(2.0 * b.t, b.values, b.segment) for b in blocks(100, first)])
+        first += 100
+
+    lab.wait(lambda: [d for d in seconds if 'sampled at' in d['message']], 'why', meanwhile=more)
+    seen = len(seconds)
+    lab.wait(lambda: len(seconds) > seen + 2, 'more', meanwhile=more)
+    for d in seconds[seen:]:
+        assert d['level'] == '1' and d['message'].startswith('the stream is sampled at 10000 Hz')
+
+
 def test_a_model_of_another_rate_is_refused_and_the_old_one_kept(fast):
     since = reset(fast)
     send(fast, blocks(1000))
