@@ -12,7 +12,7 @@ two that arrived closest to each other do.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import itertools
 
@@ -37,7 +37,7 @@ Matches = list[tuple[int, int, int]]
 TOLERANCE = 1e-3
 #: most of a segment by time, or of a further channel, that may be missing before it is not used
 MAX_MISSING = 0.05
-#: least share of the samples that streams of one clock have in common
+#: least share of the samples of one clock in common, from the latest start to the earliest end
 MET = 0.1
 #: rows of a stream no further apart than this are of the same run of the sample clock
 NEARBY = 300
@@ -173,7 +173,7 @@ def join(
         for i, _, n in (*matches[name], (lead.n, 0, 0)):
             keep[end:i] = False
             end = i + n
-    shared, fewest = int(np.count_nonzero(keep)), min(s.n for s in streams.values())
+    shared, fewest = int(np.count_nonzero(keep)), _fewest([times[name] for name in streams])
     # clocks that differ meet by chance now and then
     if shared < MET * fewest or not shared:
         much = f'only {shared} of {fewest} time stamps' if shared else 'no time stamp'
@@ -195,6 +195,13 @@ def join(
             if left.any():
                 faults += _left_over(name, times[name][rows], values[rows], left[rows])
     return Joined(_cut(t, matches[first], keep), columns, _labels(lead, keep), tuple(faults))
+
+
+def _fewest(times: Sequence[Array]) -> int:
+    """Return how many rows a stream has at least, from the latest start to the earliest end."""
+    low = max(np.nanmin(t, initial=np.inf) for t in times)
+    high = min(np.nanmax(t, initial=-np.inf) for t in times)
+    return min(int(np.count_nonzero((t >= low) & (t <= high))) for t in times)
 
 
 def _cut(x: Array, matches: Matches, keep: Mask, *, alone: bool = False) -> Array:

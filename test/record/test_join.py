@@ -8,6 +8,7 @@ import time
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from piezo_ident.common.errors import DataError
 from piezo_ident.record import join as joining
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.join import join
@@ -104,3 +105,17 @@ def test_streams_that_begin_and_end_apart_are_joined_without_a_copy():
     assert not joined.columns['v'].flags.writeable
     for column in joined.columns.values():
         assert column.size == 700 and column.base is not None
+
+
+@pytest.mark.parametrize('clock', [1.0, 1.01])
+def test_a_short_time_together_is_told_from_another_clock(clock):
+    # the voltage ends soon after the displacement begins
+    t, streams = np.arange(60_000) / 1000.0, {}
+    for name, times in (('voltage', t[:32_000]), ('displacement', clock * t[30_000:])):
+        streams[name] = BlockStream()
+        streams[name].append(Samples(times, times), 0)
+    if clock == 1.0:
+        np.testing.assert_array_equal(join(streams).t, t[30_000:32_000])
+    else:
+        with pytest.raises(DataError, match=r'share only \d+ of \d+ time stamps'):
+            join(streams)
