@@ -58,7 +58,7 @@ __all__ = ['FeedforwardNode']
 
 #: parameters that are taken over between two references
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
-#: how long a stage that is driven may answer nothing before it is told [s]
+#: how long a stage may answer nothing to a reference that goes on, before it is told [s]
 SILENT = 1.0
 
 
@@ -344,7 +344,8 @@ class FeedforwardNode(DrivingNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost and refused, head-room, and the tracking error."""
-        if self._state == 'tracking' and time.monotonic() - self._answered > SILENT:
+        # where the reference pauses there is nothing to answer
+        if self._state == 'tracking' and self._last - self._answered > SILENT:
             # what was found before says nothing of now
             self._error.live.clear()
             self._faults.note('silent', 'no displacement comes from the stage', 0)

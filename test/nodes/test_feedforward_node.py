@@ -117,6 +117,23 @@ def test_a_stage_that_answers_no_more_is_told():
         assert any(errors)
 
 
+def test_a_reference_that_pauses_needs_no_answer():
+    with Graph() as g:
+        voltage, errors = g.collect('voltage'), g.collect('tracking_error')
+        g.start('feedforward', {'silence': 60.0})
+        armed(g)
+        x = reference(0.5)
+        sent(g, x)
+        for k in range(0, x.size, SIZE):
+            g.publish('displacement', block(k, np.zeros(SIZE), 'scan', 'displacement'))
+        g.wait(lambda: errors, 'a tracking error')
+        seen = len(g.diagnoses('feedforward'))
+        g.wait(lambda: len(g.diagnoses('feedforward')) > seen + 3, 'seconds of silence')
+        assert voltage and state(g) == 'tracking'
+        assert not [d for d in g.diagnoses('feedforward') if 'no displacement' in d['message']]
+        assert 'tracking_percent' in g.status('feedforward')
+
+
 def test_another_model_takes_over_while_the_stage_moves(lab):
     armed(lab)
     voltage, x = lab.collect('voltage'), reference(1.2)
