@@ -169,6 +169,12 @@ class Rows:
         begin = float(self.begin[list(self.record).index(self.longest)])
         return self._counted[self.longest][0] - begin
 
+    @property
+    def last(self) -> float:
+        """When the last record ends, by the clock of `time` [s]."""
+        ends = [run.piece.start_time + run.piece.duration for run in self.runs]
+        return float((np.array(ends) - self.begin).max())
+
     @functools.cached_property
     def _counted(self) -> dict[int, tuple[float, float]]:
         """When the rows of each record begin and end [s]."""

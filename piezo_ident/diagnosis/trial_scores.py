@@ -191,5 +191,6 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
         thresholds=model.hysteresis.thresholds,
         judged=rows.judged,
         first=rows.first,
+        last=rows.last,
         is_fast=simulator.is_fast,
     )

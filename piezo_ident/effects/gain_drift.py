@@ -90,8 +90,9 @@ class GainDrift(Effect):
         It is where the data begin to count: before, the gain could have been any.
         """
         trials = []
+        last = view.duration if view.last is None else view.last
         for stretches in (1, 3, 6, 12):
-            knots = np.linspace(view.first, max(view.duration, view.first + 1e-6), stretches + 1)
+            knots = np.linspace(view.first, max(last, view.first + 1e-6), stretches + 1)
             full = cls.trial({'time': knots})
             trials.append(Trial(full.values, full.moves[1:], full.steps[1:]))
         return tuple(trials)

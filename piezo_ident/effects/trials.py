@@ -46,6 +46,8 @@ class View:
         From the first sample to the last of a record that counts, of the longest one [s].
     first : float
         When the first sample that counts comes, in the record that has most [s].
+    last : float or None
+        When the last record ends, by the same clock [s]; None where that is `duration`.
     is_fast : bool
         Whether dynamics matter in these data.
     """
@@ -62,6 +64,7 @@ class View:
     thresholds: Array = field(default_factory=lambda: np.empty(0))
     judged: float = np.inf
     first: float = 0.0
+    last: float | None = None
     is_fast: bool = True
 
     @property

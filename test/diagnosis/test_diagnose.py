@@ -346,6 +346,22 @@ def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
     np.testing.assert_allclose(1.0 + gain, truth / truth[0], atol=4e-3)
 
 
+def test_a_gain_drifts_by_the_clock_that_the_model_has_already():
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+    rate = {'rate': 1e-4, 'amplitude': 0.0, 'time_constant': 60.0}
+    drifting = replace(model, effects=(EffectSetting('thermal_drift', rate),))
+    # the time of the clock goes on from an earlier record
+    t = 100.0 + np.arange(piece.n) / piece.sample_rate
+    gains = 1.0 + 0.03 * np.linspace(0.0, 1.0, piece.n)
+    y = gains * piece.y + 1e-4 * abs(model.scaling.Y) * t
+    later = Record((replace(piece, y=y, start_time=100.0, segments=()),), 'later')
+    (found,) = diagnose(drifting, later, DiagnosisSettings(effects=('gain_drift',))).effects
+    time, gain = (np.asarray(found.parameters[name].value) for name in ('time', 'gain'))
+    assert time[0] == 100.0 and time[-1] == pytest.approx(100.0 + piece.duration)
+    np.testing.assert_allclose(gain, np.interp(time, t, gains - 1.0), atol=2e-3)
+
+
 def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
