@@ -54,7 +54,7 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     if args.limits is not None or is_program:
         program = scaled(program, args.limits or program.limits, rate)
     if is_program:
-        _write_program(out, program, console)
+        _write_program(out, program, len(stage.axes), console)
         return
     sequence, *others = build_axes(program, len(stage.axes), rate)
     rng = np.random.default_rng(seed)
@@ -97,12 +97,14 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     )
 
 
-def _write_program(out: Path, program: Program, console: Console) -> None:
+def _write_program(out: Path, program: Program, axes: int, console: Console) -> None:
     text = program_to_yaml(program)
-    sequence = program.build()  # what the graph would refuse is refused here
+    every = build_axes(program, axes)  # what the graph would refuse is refused here
+    sequence = every[0]
     write_text(out, text)
     console.say(f'{out}: a program of {sequence.duration:.4g} s at {sequence.sample_rate:g} Hz')
-    steepest = float(np.abs(np.diff(sequence.v)).max()) * sequence.sample_rate
+    largest = max(float(np.abs(np.diff(q.v)).max(initial=0.0)) for q in every)
+    steepest = largest * sequence.sample_rate
     console.say(f'steepest: {steepest:.6g} V/s; the slew of the stage must be as large')
     console.say(sequence.describe())
     console.result({'out': str(out), 'samples': sequence.n, 'steepest': steepest})

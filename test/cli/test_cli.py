@@ -136,6 +136,16 @@ def test_a_scaled_program_is_written_for_the_graph(capsys, tmp_path, program):
     refuse(capsys, tmp_path, [*argv, tmp_path / 'mine.yaml'], 'exists already')
 
 
+def test_the_steepest_of_all_axes_is_said(capsys, tmp_path):
+    argv = ['simulate', '--config', 'two_axes', '--program', 'two_axes', '--json']
+    said = json.loads(succeed(capsys, *argv, tmp_path / 'mine.yaml'))
+    succeed(capsys, *argv, '--voltage-only', tmp_path / 'both.npz')
+    both = np.load(tmp_path / 'both.npz')
+    steepest = [2000.0 * np.abs(np.diff(both[name])).max() for name in ('v', 'v_b')]
+    assert steepest[0] < steepest[1] == pytest.approx(said['steepest'])
+    assert said['samples'] == both['v'].size
+
+
 def test_voltages_of_several_axes_go_into_one_file(capsys, tmp_path):
     out = tmp_path / 'both.npz'
     argv = ['simulate', '--config', 'two_axes', '--program', 'two_axes', '--voltage-only', out]
