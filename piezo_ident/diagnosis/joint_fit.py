@@ -175,7 +175,9 @@ def fit_jointly(
     IdentificationError, an effect that cannot run on these data ModelError.
     """
     rows = simulator.rows
-    parameters = free_parameters(state, len(rows.names), rows.longest)
+    # an H that stays, or is drawn to the given one, leaves another gain to the effects
+    free_h = state.law is not None and pull_at is None
+    parameters = free_parameters(state, len(rows.names), rows.longest if free_h else None)
     p = base.columns.shape[1] + len(parameters)
     damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)

@@ -79,11 +79,14 @@ class FreeParameter:
         return min(self.lower - value, 0.0), max(self.upper - value, 0.0)
 
 
-def free_parameters(state: State, records: int, longest: int = 0) -> tuple[FreeParameter, ...]:
+def free_parameters(
+    state: State, records: int, longest: int | None = None
+) -> tuple[FreeParameter, ...]:
     """
     Return every number of G's retuning and of the effects that the fit may move.
 
-    `longest` is the record from whose start a change that H can make as well is counted.
+    `longest` is the record from whose start a change that H can make as well is counted, None
+    where H is not free to make it.
     """
     found = [
         FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)

@@ -341,9 +341,28 @@ def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
     wandering = Record((replace(late, y=gains * late.y, segments=()),), 'wandering')
     (found,) = diagnose(model, wandering, DiagnosisSettings(effects=('gain_drift',))).effects
     time, gain = (np.asarray(found.parameters[name].value) for name in ('time', 'gain'))
-    assert gain[0] == 0.0 < time[0]
+    assert time[0] > 0.0
     truth = np.interp(time, late.time(0, late.n) - late.start_time, gains)
-    np.testing.assert_allclose(1.0 + gain, truth / truth[0], atol=4e-3)
+    np.testing.assert_allclose(1.0 + gain, truth, atol=4e-3)
+
+
+@pytest.mark.parametrize('offset', [0.0, 0.05])
+def test_a_gain_that_has_changed_before_a_record_begins_is_given(offset):
+    # the H as given stays, so that it makes up for no other gain
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+
+    def wandering(name, *gains):
+        gain = 1.0 + np.linspace(*gains, piece.n)
+        return Record((replace(piece, y=gain * piece.y, segments=()),), name)
+
+    records = [wandering('a', offset, offset - 0.05), wandering('b', 0.05, 0.02)]
+    result = diagnose(model, records, DiagnosisSettings(effects=('gain_drift',)))
+    (found,) = result.effects
+    time, gain = (np.asarray(found.parameters[name].value) for name in ('time', 'gain'))
+    truth = offset - 0.05 * time / piece.duration
+    np.testing.assert_allclose(gain, truth, atol=4e-3)
+    assert result.after.overall < 0.03 < 0.3 < result.before.overall
 
 
 def test_a_gain_drifts_by_the_clock_that_the_model_has_already():
