@@ -105,7 +105,10 @@ def _write_program(out: Path, program: Program, axes: int, console: Console) -> 
     console.say(f'{out}: a program of {sequence.duration:.4g} s at {sequence.sample_rate:g} Hz')
     largest = max(float(np.abs(np.diff(q.v)).max(initial=0.0)) for q in every)
     steepest = largest * sequence.sample_rate
-    console.say(f'steepest: {steepest:.6g} V/s; the slew of the stage must be as large')
+    shown = f'{steepest:.6g}'
+    if float(shown) < (1.0 - 1e-9) * steepest:  # of a slew that is too slow
+        shown = f'{(1.0 + 1e-5) * steepest:.6g}'
+    console.say(f'steepest: {shown} V/s; the slew of the stage must be as large')
     console.say(sequence.describe())
     console.result({'out': str(out), 'samples': sequence.n, 'steepest': steepest})
 

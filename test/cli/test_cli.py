@@ -25,6 +25,7 @@ from piezo_ident.cli.records import expand
 from piezo_ident.common.config import find_config, shipped_names
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.excitation.program import Program
+from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.many.run import MARK
 from piezo_ident.model.files import load
 from piezo_ident.record.record import Piece, Record
@@ -132,7 +133,9 @@ def test_a_scaled_program_is_written_for_the_graph(capsys, tmp_path, program):
     mine = Program.load(tmp_path / 'mine.yaml').build(limits=(-20.0, 130.0))
     v = np.load(tmp_path / 'command.npz')['v']
     np.testing.assert_array_equal(mine.v, v)
-    assert f'steepest: {1e4 * np.abs(np.diff(v)).max():.6g} V/s' in said
+    slew = float(said.splitlines()[1].split()[1])
+    assert slew == pytest.approx(1e4 * np.abs(np.diff(v)).max(), rel=2e-5)
+    assert not Guard(GuardSettings(-20, 130, slew, 20, -20, 1e4), -20.0).process(v).altered
     refuse(capsys, tmp_path, [*argv, tmp_path / 'mine.yaml'], 'exists already')
 
 
