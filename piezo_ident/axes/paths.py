@@ -140,7 +140,7 @@ def paths_of(
     whole = np.mean([np.var(r.y[-1], axis=0) / np.mean(r.u**2) for r in records], axis=0)
     # of lines to the mean of squares over samples
     share = 2 * 1e4 / whole / records[0].u.shape[1] ** 2
-    g, variance = _response(u, answers, lines)
+    g, variance, width = _response(u, answers, lines)
     paths = []
     for i, name in enumerate(inputs):
         for o, output in enumerate(outputs):
@@ -150,7 +150,8 @@ def paths_of(
             columns = [o, o + len(outputs)]
             noise = variance[:, columns, i] * power[:, i, None]
             squares = np.sum(np.abs(g[:, columns, i]) ** 2 * power[:, i, None] - noise, axis=0)
-            doubt = SURE * np.sqrt((2 * HALF_WIDTH + 1) * np.sum(noise**2, axis=0)).max()
+            # lines that share neighbours err alike
+            doubt = SURE * np.sqrt(width * np.sum(noise**2, axis=0)).max()
             error, size = np.sqrt(np.maximum(squares, 0) * share[o]).tolist()
             paths.append(Path(name, output, size, error, float(np.sqrt(doubt * share[o]))))
     return tuple(paths)
@@ -167,8 +168,12 @@ def _answer(
 
 def _response(
     u: NDArray[np.complex128], y: NDArray[np.complex128], lines: NDArray[np.intp]
-) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return the response at each line, shape (k, outputs, inputs), and its variance."""
+) -> tuple[NDArray[np.complex128], NDArray[np.float64], int]:
+    """
+    Return the response at each line, shape (k, outputs, inputs), and its variance.
+
+    The last number is that of the lines which each is fitted to.
+    """
     count, _, inputs = u.shape
     unknown = inputs * (DEGREE + 1)
     half_width = max(HALF_WIDTH, int(np.ceil((EQUATIONS * unknown / count - 1) / 2)))
@@ -187,4 +192,4 @@ def _response(
         left /= len(columns) - unknown
         spread = np.real(np.diag(np.linalg.pinv(columns.conj().T @ columns)))[:inputs]
         g[i], variance[i] = solution[:inputs].T, left[:, None] * spread
-    return g, variance
+    return g, variance, 2 * half_width + 1

@@ -8,7 +8,9 @@ from dataclasses import replace
 import axes_stage as stage
 import numpy as np
 from piezo_ident.axes.loop_model import LoopModel
+from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.paths import axis_errors, paths_of
+from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 import pytest
 
@@ -67,3 +69,23 @@ def test_too_few_lines_are_refused():
     few = [replace(r, u=np.array([sine * [1, 2]] * 2)) for r in held_out(coupled(0.0))]
     with pytest.raises(DataError, match='1 lines do not tell'):
         paths_of(coupled(0.0), few, INPUTS, OUTPUTS)
+
+
+def test_paths_that_are_not_there_are_not_seen_by_one_record_of_many_axes():
+    # lines share the more neighbours, the more inputs a record has to tell apart
+    rng, axes, samples, last = np.random.default_rng(0), 4, 512, 60
+    plain = Modal(0.1 * np.eye(2)[None], np.zeros((2, axes)), np.zeros((axes, 2)), np.eye(axes))
+    names = ['', '_b', '_c', '_d']
+    seen = 0
+    for _ in range(60):
+        lines = np.zeros((samples // 2 + 1, axes), complex)
+        lines[1:last] = np.exp(2j * np.pi * rng.random((last - 1, axes)))
+        u = np.fft.irfft(lines, samples, axis=0)
+        y = u + 0.05 * u.std() * rng.standard_normal(u.shape)
+        record = PeriodicRecord('r', 'g', 2000.0, u[None], y[None])
+        paths = paths_of(
+            LoopModel.of(plain), [record], [f'v{n}' for n in names], [f'y{n}' for n in names]
+        )
+        seen += sum(path.seen for path in paths)
+    # of 720, one by chance
+    assert seen <= 1
