@@ -16,7 +16,7 @@ from piezo_ident.record.blocks import cut_blocks
 import pytest
 from std_msgs.msg import Float64MultiArray
 
-QUIET = 'limits: [0, 10]\nsegments:\n  - {signal: idle, duration: 1}\n'
+QUIET = 'limits: [0, 10]\nsegments:\n  - {signal: idle, duration: 3}\n'
 SLOW = 'limits: [0, 10]\nsegments:\n  - {signal: idle, duration: 60}\n'
 
 
@@ -292,4 +292,5 @@ def test_it_says_what_it_drives_and_by_how_much_blocks_were_late(lab):
     node.send(signal.SIGCONT)
     lab.wait(lambda: state(lab) == 'done', 'the end')
     late = re.search(r'(\d+) blocks late, by up to (\d+) ms', lab.status('excitation')['text'])
-    assert late and int(late[1]) > 5 and int(late[2]) >= 80
+    # a longer pause moves the schedule, and all behind it are in time
+    assert late and int(late[1]) >= 1 and int(late[2]) >= 80
