@@ -56,8 +56,8 @@ class Parameter:
     tries : tuple
         Of a parameter that is no amplitude: values worth trying on any data; for a list, lists.
     first_stays : bool
-        Of a list that follows time: whether its first number stays in one record, since H can do
-        the same.
+        Of a list that follows time: whether its first number stays in one record while H is free,
+        which can do the same.
     """
 
     name: str
