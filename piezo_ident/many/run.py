@@ -110,17 +110,24 @@ class _Job:
         task = json.loads(json.dumps(asdict(self.task), default=str))
         return {'version': __version__, 'path': str(self.path), 'report': self.report, **task}
 
+    def inputs(self) -> list[list[int | str]]:
+        """
+        Return name, size and time of the files that are read.
+
+        Not whether they are older than the results: a file that takes the place of another may be.
+        """
+        files = [self.path, *sorted(self.path.iterdir() if self.path.is_dir() else ())]
+        if isinstance(self.task, Diagnose):
+            files.append(self.task.model_of(self.name))
+        return [[f.name, (at := f.stat()).st_size, at.st_mtime_ns] for f in files]
+
     def earlier(self) -> Row | None:
         """Return the row of an earlier run, None where the record has to be done again."""
         try:
             kept = json.loads(self.row_file.read_text(encoding='utf-8'))
-            made = self.row_file.stat().st_mtime_ns
-            inputs = [self.path, *(self.path.iterdir() if self.path.is_dir() else ())]
-            if isinstance(self.task, Diagnose):
-                inputs.append(self.task.model_of(self.name))
-            fresh = all(file.stat().st_mtime_ns < made for file in inputs)
+            same = kept['inputs'] == self.inputs() and kept['settings'] == self.settings()
             whole = self.model_file.is_file() and (not self.report or self.report_folder.is_dir())
-            if fresh and whole and kept['settings'] == self.settings():
+            if same and whole:
                 return Row(self.name, kept['values'])
         except (OSError, ValueError, KeyError, TypeError):
             pass
@@ -129,13 +136,16 @@ class _Job:
     def __call__(self, tick: Tick = lambda step, share: None) -> Row:
         self.row_file.unlink(missing_ok=True)
         try:
+            # before they are read: what changes meanwhile is done again
+            inputs = self.inputs()
             result, values = self.task(record_io.read(self.path, self.task.reading), self.name)
             result.model.save(self.model_file)
             if self.report:
                 from piezo_ident.report import write_report
 
                 write_report(result, self.report_folder)
-            write_text(self.row_file, json.dumps({'settings': self.settings(), 'values': values}))
+            kept = {'settings': self.settings(), 'inputs': inputs, 'values': values}
+            write_text(self.row_file, json.dumps(kept))
         # one record must not end the run, whatever goes wrong with it
         except Exception as error:  # noqa: BLE001
             self.model_file.unlink(missing_ok=True)
@@ -167,8 +177,8 @@ def run_many(
     """
     Identify or diagnose every record on its own.
 
-    A record whose results are in `folder` already, newer than the record and made with the same
-    settings, is not done again: a run that was stopped goes on with the same call.
+    A record whose results are in `folder` already, made of the same file with the same settings,
+    is not done again: a run that was stopped goes on with the same call.
 
     Parameters
     ----------

@@ -98,6 +98,17 @@ def test_other_settings_do_all_again(rows, records, folder):
     assert (folder / 'models/stage_10.yaml').stat().st_mtime_ns > before
 
 
+def test_an_older_file_that_takes_the_place_of_another_is_done(records, tmp_path):
+    path, out = tmp_path / 'stage_7.npz', tmp_path / 'out'
+    path.write_bytes(records[0].read_bytes())
+    (wrong,) = run_many([path], out, FAST, jobs=1)
+    path.write_bytes(records[2].read_bytes())
+    # as cp -p and an unpacked archive leave it
+    os.utime(path, (0, 0))
+    (right,) = run_many([path], out, FAST, jobs=1)
+    assert right.values['stroke'] > 1.04 * wrong.values['stroke']
+
+
 @dataclass(frozen=True)
 class Deadly:
     """Ends the process that works on one record."""
