@@ -16,6 +16,7 @@ from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.results import Settings
+from piezo_ident.many.odd import stand_out
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, csv_text, Row, unit_of
 from piezo_ident.model.files import load
@@ -36,6 +37,15 @@ SPREAD = {
     'delay': ('delay', 'ms', 1e3),
     'bandwidth': ('bandwidth', 'Hz', 1.0),
     'resonance': ('resonance', 'Hz', 1.0),
+}
+#: further columns in which a record may stand out
+OTHERS = {
+    'sample_rate': ('sampling rate', 'Hz', 1.0),
+    'duration': ('duration', 's', 1.0),
+    'voltage_high': ('highest voltage', 'V', 1.0),
+    'delay_samples': ('delay', 'samples', 1.0),
+    'error_fitted': ('fitted error', '% of stroke', 1.0),
+    'noise_floor': ('noise floor', '% of stroke', 1.0),
 }
 
 
@@ -95,6 +105,7 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             'records': len(rows),
             'failed': len(bad),
             'units': {name: unit_of(name) for name in columns_of(rows) if unit_of(name)},
+            'stand_out': {name: list(columns) for name, columns in stand_out(rows).items()},
             'rows': [
                 {'record': row.record, 'reason': row.reason or None, **row.values} for row in rows
             ],
@@ -128,3 +139,19 @@ def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
             numbers = (factor * f(values) for f in (min, statistics.median, max))
             cells = ''.join(f'{x:11.4g}' for x in numbers)
             console.say(f'{f"{name} / {unit}":30s}{cells}')
+    _print_odd(rows, console)
+
+
+def _print_odd(rows: Sequence[Row], console: Console) -> None:
+    odd, of = stand_out(rows), {row.record: row for row in rows}
+    if odd:
+        console.say('\nThese stand out, with the median of all in brackets:')
+    for record in list(odd)[:PRINTED]:
+        told = []
+        for column, median in odd[record].items():
+            name, unit, factor = {**SPREAD, **OTHERS}[column]
+            here = factor * float(of[record].values[column] or 0.0)
+            told.append(f'{name} {here:.4g} {unit} ({factor * median:.4g})')
+        console.say(f'  {record}: {", ".join(told)}')
+    if len(odd) > PRINTED:
+        console.say(f'  and {len(odd) - PRINTED} more')
