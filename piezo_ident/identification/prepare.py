@@ -18,6 +18,7 @@ from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.faults import suspicions, without_faults
+from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
@@ -306,7 +307,7 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
                 continue
             u = scaling.u(piece.v)
             known = part.sound.copy()
-            if abs(u[0]) > REST:
+            if abs(u[0]) > REST or rises_first(piece):
                 known[: forgotten(u)] = False
             x = scaling.x(piece.y)
             runs.append(

@@ -252,8 +252,8 @@ def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]
     if elsewhere:
         yield (
             f'{record.name}: {elsewhere} of {len(starts)} pieces do not start at the '
-            f'lowest voltage, {model.scaling.range[0]:g} V; the memory at their start is '
-            'estimated from their early part'
+            f'lowest voltage, {model.scaling.range[0]:g} V, or had not come down to it; the '
+            'memory at their start is estimated from their early part'
         )
     most = max((crept(model, start) for start in found), key=abs, default=0.0)
     if most:

@@ -4,8 +4,9 @@
 """
 What a stage keeps of its motion before a record: the memory of the plays, and creep.
 
-The memory is known where the record starts at the lowest voltage.  Elsewhere each play keeps its
-unknown start F_r(0) as long as the voltage allows,
+The memory is known where the record starts at the lowest voltage, and comes back to its
+displacement there.  Elsewhere each play keeps its unknown start F_r(0) as long as the voltage
+allows,
 
     max(v so far) - r   <=   F_r(0)   <=   min(v so far),
 
@@ -29,6 +30,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.gaps import connected_pieces
 from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
@@ -115,8 +117,8 @@ def forgetting(model: StageModel) -> float:
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
-    """Return whether a piece starts near the lowest voltage, where the memory is known."""
-    return abs(float(model.scaling.u(piece.v[0]))) < 0.01
+    """Return whether a piece starts near the lowest voltage, having come down to it."""
+    return abs(float(model.scaling.u(piece.v[0]))) < 0.01 and not rises_first(piece)
 
 
 def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:

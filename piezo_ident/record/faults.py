@@ -12,6 +12,7 @@ import difflib
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
@@ -215,7 +216,22 @@ def misspelt(labels: Sequence[str]) -> list[str]:
 
 
 def suspicions(record: Record) -> list[str]:
-    """Return what a record makes one suspect: a sensor at its stop, columns swapped."""
+    """Return what a record makes one suspect: a first rise, a sensor at its stop, and the like."""
+    return [*_first_rise(record), *_stopped(record)]
+
+
+def _first_rise(record: Record) -> list[str]:
+    if not any(rises_first(piece) for piece in record):
+        return []
+    return [
+        f'{record.name}: the stage does not come back to where it began at '
+        f'{record.pieces[0].v[0]:g} V: it was not driven before, came from beyond that voltage, '
+        'or its zero moves. The memory at the start is fitted; a model that runs by itself '
+        'begins as a stage that came back. Drive it once over the range, and then record'
+    ]
+
+
+def _stopped(record: Record) -> list[str]:
     span = float(np.ptp(record.voltage_range))
     levels: list[float] = []
     stuck = noisy = 0
