@@ -163,6 +163,8 @@ def _drive(result: Inverse) -> tuple[str, Table]:
     if result.expected is not None and result.expected_rms is not None:
         rms = length(result.expected_rms)
         expected = f'{number(result.expected)} % of stroke, {rms} rms, as the model errs elsewhere'
+        if result.error > result.expected:
+            expected += '; what the inversion leaves comes on top'
     rows += [('expected', expected)]
     rows += [('warning', warning) for warning in result.warnings]
     rows += [('% of stroke', FORMULA)]

@@ -89,6 +89,11 @@ def test_no_motion_costs_one_line(capsys, tmp_path, made, t, y, reason):
 def test_a_drive_shows_itself(made):
     drive = pi.load(made / 'model.yaml').inverse(1e-6 * WANTED)
     assert 'left by the inversion' in repr(drive)
+    # limits that keep the stage far from the motion are no error of the model
+    assert 'on top' not in repr(drive)
+    assert 'elsewhere; what the inversion leaves' in ' '.join(
+        repr(replace(drive, error=15.0)).split()
+    )
     labels = [text for axes in drive.plot().axes for text in axes.get_legend_handles_labels()[1]]
     assert labels[:2] == ['wanted', 'model under the voltage']
     assert '<table' in drive._repr_html_()
