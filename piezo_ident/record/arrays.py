@@ -128,6 +128,16 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
             arrays[f'{name} [{unit}]' if unit else name] = channel[:]
             if 'wf_increment' in channel.properties:
                 arrays['wf_increment'] = np.array([channel.properties['wf_increment']])
+        cut = getattr(file.file_status, 'channel_statuses', None) or {}
+    # where all end at one sample, nothing but the end is missing
+    uneven = len({len(channel) for channel in channels}) > 1
+    for name, part in cut.items():
+        # a channel without samples would be taken for one that is not there
+        if uneven and part.read_length < part.expected_length:
+            raise DataError(
+                f'{path}: ends early, {name} has {part.read_length} of {part.expected_length} '
+                'samples in its last segment; copy or record it again'
+            )
     return _table(arrays, arrays, path, options)
 
 

@@ -363,6 +363,14 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
         monkeypatch.undo()
 
 
+def test_a_tdms_file_that_ends_early_says_so(tmp_path):
+    path = tmp_path / 'scan.tdms'
+    daq_tdms(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match=r'ends early, .* samples in its last segment'):
+        pi.read(path)
+
+
 @pytest.mark.parametrize('suffix', ['txt', 'lvm', 'h5', 'tdms', 'parquet'])
 def test_damaged_files(tmp_path, suffix):
     path = tmp_path / f'r.{suffix}'
