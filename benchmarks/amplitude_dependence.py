@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.axes.explain import groups
-from piezo_ident.axes.frequency_response import frequency_response
+from piezo_ident.axes.frequency_response import excited_lines, frequency_response
 from piezo_ident.axes.linear_fit import refined
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
@@ -68,7 +68,8 @@ def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> Amp
     models = tuple(
         refined(start, frequency_response(part), iterations=STEPS) for part in parts.values()
     )
-    places = _strongest(start, rate)
+    highest = float(excited_lines(records).max()) * rate / len(records[0].mean_u)
+    places = _strongest(start, rate, highest)
     frequency, damping = [], []
     for model in models:
         s = _poles(model, rate)[places]
@@ -88,8 +89,8 @@ def _poles(model: Modal, rate: float) -> NDArray[np.complex128]:
     return np.asarray(np.log(model.blocks[:, 0, 0] + 1j * model.blocks[:, 0, 1]) * rate)
 
 
-def _strongest(model: Modal, rate: float) -> NDArray[np.intp]:
-    """Return the blocks of the modes with the largest peaks, by frequency."""
+def _strongest(model: Modal, rate: float, highest: float) -> NDArray[np.intp]:
+    """Return the blocks of the modes with the largest peaks in the driven band, by frequency."""
     s = _poles(model, rate)
     size = np.linalg.norm(model.b.reshape(len(s), -1), axis=1) * np.sqrt(
         (model.c**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
@@ -98,6 +99,7 @@ def _strongest(model: Modal, rate: float) -> NDArray[np.intp]:
     near = np.abs(s.imag[:, None] - s.imag) < APART * s.imag[:, None]
     np.fill_diagonal(near, False)
     alone = ~(near & (peak > FAINT * peak[:, None])).any(axis=1)
-    peak = np.where(alone, peak, 0)
+    # beyond the lines a mode stands for all that is there
+    peak = np.where(alone & (np.abs(s.imag) < 2 * np.pi * highest), peak, 0)
     chosen = np.argsort(-peak)[: min(COUNT, int((peak > 0).sum()))]
     return np.asarray(chosen[np.argsort(s.imag[chosen])])
