@@ -184,11 +184,31 @@ def without_channels(
     parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
 ) -> list[ResidualPart]:
     """Return parts without what significant channels add, so that their lines are not hum."""
-    found = []
-    for k, part in enumerate(parts):
-        added = [t.added[k] for t in tests if t.significant]
-        found.append(part.with_residual(part.e - sum(x for x in added if x is not None)))
+    # the voltage and the displacement of one axis tell the same, and each was tested alone
+    of_axis: dict[str, list[list[ResidualPart]]] = {}
+    for t in tests:
+        if t.significant:
+            axis = t.channel[2:] if role_of(t.channel) else t.channel
+            of_axis.setdefault(axis, []).append(_without(parts, t))
+    found = list(parts)
+    for rivals in of_axis.values():
+        least = min(rivals, key=_squares)
+        found = [
+            part.with_residual(part.e + less.e - own.e)
+            for part, less, own in zip(found, least, parts, strict=True)
+        ]
     return found
+
+
+def _without(parts: Sequence[ResidualPart], test: ChannelTest) -> list[ResidualPart]:
+    return [
+        part if x is None else part.with_residual(part.e - x)
+        for part, x in zip(parts, test.added, strict=True)
+    ]
+
+
+def _squares(parts: Sequence[ResidualPart]) -> float:
+    return sum(float(np.sum(part.e[part.mask] ** 2)) for part in parts)
 
 
 def _at_all(part: ResidualPart, means: Array) -> Array:

@@ -82,6 +82,19 @@ def test_lines_of_another_axis_are_no_hum():
     assert find_lines([left], all_stretches([left])).lines == ()
 
 
+def test_what_voltage_and_displacement_of_an_axis_both_tell_is_taken_out_once():
+    n = DRIVES['sines'].size
+    other = np.sin(2 * np.pi * 61.3 * np.arange(n) / RATE)
+    added = 3e-3 * other
+    both = part_of('sines', added, {'v_b': 5.0 * other, 'y_b': 1e-6 * other})
+    tests = channel_tests([both])
+    assert [test.significant for test in tests] == [True, True]
+    (left,) = without_channels([both], tests)
+    # taken out twice, as much as there was is left
+    alone = part_of('sines', 0.0, {})
+    assert np.std(left.e - alone.e) < 0.1 * STROKE * np.std(added)
+
+
 def test_too_little_data():
     piece = Piece(np.arange(100.0), np.arange(100.0), RATE, channels={'x': np.arange(100.0)})
     (test,) = channel_tests([ResidualPart('r', piece, np.ones(100))])
