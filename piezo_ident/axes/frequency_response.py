@@ -48,6 +48,12 @@ class LineResponse:
         """The lines on the unit circle."""
         return np.asarray(np.exp(2j * np.pi * self.lines / self.samples))
 
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """The rms of the response of each output, 1 where there is none; shape (outputs, 1)."""
+        size = np.sqrt(np.mean(np.abs(self.g) ** 2, axis=(0, 2)))[:, None]
+        return np.where(size > 0, size, 1)
+
 
 def excited_lines(records: Sequence[PeriodicRecord]) -> NDArray[np.intp]:
     """Return the lines, without the mean, that every input excites on average over the records."""

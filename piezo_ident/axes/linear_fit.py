@@ -42,8 +42,7 @@ def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Mo
 
     That of each output counts in parts of its own response, whatever its stroke.
     """
-    z, size = response.z, np.sqrt(np.mean(np.abs(response.g) ** 2, axis=(0, 2)))[:, None]
-    scale = np.where(size > 0, size, 1)
+    z, scale = response.z, response.size
     limit = narrowest(response.samples)
     model = replace(model, blocks=resolved(model.blocks, limit))
     error = (model.response(z) - response.g) / scale

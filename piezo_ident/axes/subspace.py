@@ -38,8 +38,7 @@ def subspace(response: LineResponse, order: int) -> Modal:
     """
     outputs, inputs = response.g.shape[1:]
     # an output of a short stroke counts as much as one of a long one
-    size = np.sqrt(np.mean(np.abs(response.g) ** 2, axis=(0, 2)))[:, None]
-    size = np.where(size > 0, size, 1)
+    size = response.size
     response = replace(response, g=response.g / size)
     rows = min(ROWS, len(response.lines) // (2 * max(inputs, outputs)))
     if order % 2 or not 0 < order < (rows - 1) * outputs:
