@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import statistics
 from types import SimpleNamespace
@@ -98,14 +98,14 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             f'none of {len(rows)} records gave a result, see {table}; the first: '
             f'{bad[0].record}: {bad[0].reason}'
         )
-    _print(rows, bad, console)
+    odd = _print(rows, bad, console)
     console.say(f'\nmodels and table: {folder}')
     console.result(
         {
             'records': len(rows),
             'failed': len(bad),
             'units': {name: unit_of(name) for name in columns_of(rows) if unit_of(name)},
-            'stand_out': {name: list(columns) for name, columns in stand_out(rows).items()},
+            'stand_out': {name: list(columns) for name, columns in odd.items()},
             'rows': [
                 {'record': row.record, 'reason': row.reason or None, **row.values} for row in rows
             ],
@@ -119,7 +119,10 @@ def _told(row: Row) -> tuple[str, str]:
     return 'verdict', 'alike' if row.values.get('verdict') == 'refitted' else 'effects'
 
 
-def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
+def _print(
+    rows: Sequence[Row], bad: Sequence[Row], console: Console
+) -> dict[str, dict[str, float]]:
+    """Print what came out, and return what stands out."""
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
         console.say(f'  {row.record}: {row.reason}')
@@ -139,17 +142,21 @@ def _print(rows: Sequence[Row], bad: Sequence[Row], console: Console) -> None:
             numbers = (factor * f(values) for f in (min, statistics.median, max))
             cells = ''.join(f'{x:11.4g}' for x in numbers)
             console.say(f'{f"{name} / {unit}":30s}{cells}')
-    _print_odd(rows, console)
+    odd = stand_out(rows)
+    _print_odd(rows, odd, console)
+    return odd
 
 
-def _print_odd(rows: Sequence[Row], console: Console) -> None:
-    odd, of = stand_out(rows), {row.record: row for row in rows}
+def _print_odd(
+    rows: Sequence[Row], odd: Mapping[str, Mapping[str, float]], console: Console
+) -> None:
+    of, columns = {row.record: row for row in rows}, {**SPREAD, **OTHERS}
     if odd:
         console.say('\nThese stand out, with the median of all in brackets:')
     for record in list(odd)[:PRINTED]:
         told = []
         for column, median in odd[record].items():
-            name, unit, factor = {**SPREAD, **OTHERS}[column]
+            name, unit, factor = columns[column]
             here = factor * float(of[record].values[column] or 0.0)
             told.append(f'{name} {here:.4g} {unit} ({factor * median:.4g})')
         console.say(f'  {record}: {", ".join(told)}')
