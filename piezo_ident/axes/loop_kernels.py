@@ -22,11 +22,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 
 __all__ = ['CHUNK', 'KINDS', 'sensitivities', 'trajectory']
 
-Array = NDArray[np.float64]
 
 #: what a parameter is, by number: two numbers a block of A, then entries of matrices
 KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')

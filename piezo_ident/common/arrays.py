@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ['Array', 'Integers', 'Mask', 'frozen_array', 'robust_range']
+__all__ = ['Array', 'Integers', 'Mask', 'frozen_array', 'robust_range', 'true_runs']
 
 #: real numbers, which ones count, and places
 Array = NDArray[np.float64]
@@ -32,6 +32,12 @@ def frozen_array(values: ArrayLike) -> Array:
         array = array.copy()
         array.setflags(write=False)
     return array
+
+
+def true_runs(mask: Mask) -> list[tuple[int, int]]:
+    """Return the runs of true values, as first and behind the last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def robust_range(parts: Iterable[Array]) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds, takes_shape
 from piezo_ident.diagnosis.forward_selection import TESTED
@@ -24,7 +24,6 @@ from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['WANDERS', 'Refined', 'lasting', 'moved_zeros', 'refine']
 
-Array = NDArray[np.float64]
 
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9

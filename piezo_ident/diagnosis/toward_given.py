@@ -23,7 +23,7 @@ from collections.abc import Callable
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
@@ -33,7 +33,6 @@ from piezo_ident.diagnosis.state import State
 
 __all__ = ['loops', 'toward_given']
 
-Array = NDArray[np.float64]
 
 #: samples of a sweep over the range
 SWEEP = 60

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
@@ -22,7 +22,6 @@ from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.gaps import bridged
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.residual.stretches import true_runs
 
 __all__ = [
     'Excerpt',

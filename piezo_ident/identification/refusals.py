@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.residual.coherence import cross_spectra
-from piezo_ident.residual.stretches import block_means, true_runs
+from piezo_ident.residual.stretches import block_means
 from scipy import signal
 
 __all__ = ['refuse_closed_loop', 'refuse_undriven']

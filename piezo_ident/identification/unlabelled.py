@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
@@ -50,12 +51,10 @@ from piezo_ident.identification.warnings import warn_of_range, warn_of_starts, w
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.residual.stretches import true_runs
 
 __all__ = ['JointFit', 'fit_unlabelled', 'joint_fit']
 
 Vector = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: how often starts, H and G are fitted in turn
 TURNS = 3

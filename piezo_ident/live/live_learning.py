@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.control.learning import Learning
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.model.stage_model import StageModel
@@ -16,7 +16,6 @@ from piezo_ident.record.blocks import Samples
 
 __all__ = ['LiveLearning']
 
-Array = NDArray[np.float64]
 
 #: time at the first voltage of a repetition before it begins [s]
 SETTLE = 0.05

@@ -17,7 +17,8 @@ import math
 import threading
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
 from piezo_ident.live.guard import Guard, GuardSettings
@@ -25,8 +26,6 @@ from piezo_ident.live.history import History
 from piezo_ident.model.stage_model import StageModel
 
 __all__ = ['Drive', 'Successor', 'Tracker']
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ curve, and does not come back to where it was.
 from __future__ import annotations
 
 import numpy as np
+from piezo_ident.common.arrays import true_runs
 from piezo_ident.record.record import Piece
 
 __all__ = ['rises_first']
@@ -39,9 +40,7 @@ def rises_first(piece: Piece) -> bool:
     v, y = piece.v, piece.y
     span = float(np.ptp(v))
     least = max(SAMPLES, round(REST * piece.sample_rate))
-    near = np.concatenate([[False], np.abs(v - v[0]) <= NEAR * span, [False]])
-    edges = np.flatnonzero(near[1:] != near[:-1]).reshape(-1, 2)
-    rests = [(int(a), int(b)) for a, b in edges if b - a >= least]
+    rests = [(a, b) for a, b in true_runs(np.abs(v - v[0]) <= NEAR * span) if b - a >= least]
     if not rests or rests[0][0] > 0:
         return False
     first = float(np.mean(y[: rests[0][1]]))

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array, Integers, true_runs
 
 __all__ = ['residual_of', 'scatters', 'without_scatter']
 
@@ -84,8 +84,7 @@ def _jumps(t: Array) -> Iterator[int]:
         first = max(at - 2 * _AROUND, 0)
         step = np.diff(t[first : at + _CHUNK + 2 * _AROUND]) - dt
         ahead = np.convolve(step, weights)[_AROUND - 1 : 1 - _AROUND] > 0.5 * dt
-        edges = np.flatnonzero(np.diff(ahead, prepend=False, append=False)).reshape(-1, 2)
-        for start, stop in edges:
+        for start, stop in true_runs(ahead):
             k = first + int(start + np.argmax(step[start:stop])) + 1
             if at < k <= at + _CHUNK:
                 yield k

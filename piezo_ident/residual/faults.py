@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.faults import quantum_of
 from piezo_ident.record.record import Fault
-from piezo_ident.residual.stretches import ResidualPart, strokes_of, true_runs
+from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 

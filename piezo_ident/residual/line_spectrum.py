@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array, Integers, Mask
+from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.residual.beyond_drive import without_drive
 from piezo_ident.residual.reversals import TURN, turns_of
-from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, true_runs
+from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter

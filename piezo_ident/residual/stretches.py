@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
 from piezo_ident.record.record import Piece, Segment
@@ -30,7 +30,6 @@ __all__ = [
     'rests',
     'stretches_of',
     'strokes_of',
-    'true_runs',
     'without_spikes',
 ]
 
@@ -133,12 +132,6 @@ class Stretch:
     def n(self) -> int:
         """Number of samples."""
         return self.stop - self.start
-
-
-def true_runs(mask: Mask) -> list[tuple[int, int]]:
-    """Return the runs of true values, as first and behind the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def without_spikes(e: Array, bad: Mask) -> Array:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 import numpy as np
+from piezo_ident.common.arrays import true_runs
 from piezo_ident.control.inverse import Inverse
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, tidy
@@ -37,8 +38,7 @@ def drive_figure(drive: Inverse) -> Figure:
     if largest > max(limit, 1.3 * band):
         style.note(error, f'axis cut; largest {scale * largest:.3g} {unit}')
     # where a limit holds the voltage
-    edges = np.flatnonzero(np.diff(drive.clipped, prepend=False, append=False))
-    for k, (first, stop) in enumerate(edges.reshape(-1, 2).tolist()):
+    for k, (first, stop) in enumerate(true_runs(drive.clipped)):
         for axes in volts, motion:
             text = 'out of reach' if axes is motion and not k else None
             last = t[min(stop, t.size - 1)]
