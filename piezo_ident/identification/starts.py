@@ -38,11 +38,22 @@ from piezo_ident.operators.play import play_columns
 __all__ = ['fit_starts', 'lag_of', 'with_starts', 'without_harm']
 
 Rule = Callable[[Array], Array]
+#: of each run whose start is sought: the share of each play
+Shares = dict[int, Array]
 
 #: blocks into which a run is thinned; of each, the extremes and the last sample stay
 BLOCKS = 4000
 #: thresholds over the range of the voltage, fewer where there are several unknown starts
 COUNT, COUNT_OF_MANY = 40, 20
+#: shares of the swing by which the voltage may have gone one way to a start, the first guesses;
+#: from a wrong one Gauss-Newton ends at another, worse memory
+TURNED = np.linspace(0.0, 1.0, 11)
+#: shares, the same for all plays, of a stage that stands between
+BETWEEN = (0.25, 0.5, 0.75)
+#: shares of plays that were pushed to an end: from the very end none would move
+ENDS = (0.1, 0.9)
+#: best guesses from which Gauss-Newton starts
+STARTS = 5
 #: weight of the first guess of the shares, per row and threshold
 PULL = 1e-3
 #: most turns
@@ -82,17 +93,130 @@ class _Thinned:
         return plays.T, free.T.astype(np.float64)
 
 
-def _guesses(u0: float, r: Array) -> list[Array]:
-    """Return shares of a stage that came up from the lowest voltage, down, or from between."""
-    steps = np.diff(np.concatenate([[0.0], r]))
+def _guesses(r: Array, swing: float) -> list[Array]:
+    """Return shares of a stage that last went up, or down, by some voltage, or stands between."""
+    low, high = ENDS
+    up = [np.where(r < share * swing, high, low) for share in TURNED]
+    down = [low + high - shares for shares in up[1:-1]]
+    return [*up, *down, *(np.full(r.size, share) for share in BETWEEN)]
 
-    def shares(memory: Array) -> Array:
-        fall = -np.diff(np.concatenate([[u0], memory]))
-        return np.asarray(np.clip(fall / steps, 0.0, 1.0))
 
-    up = np.maximum(u0 - r, np.minimum(u0, 0.0))
-    down = np.minimum(u0, np.maximum(1.0, u0) - r)
-    return [shares(up), shares(down), shares(u0 - 0.5 * r)]
+class _Starts:
+    """
+    Runs of which some start with an unknown memory, and least squares on weights and starts.
+
+    Offsets and weights come first among the numbers that are sought, the shares of each start
+    behind them.
+    """
+
+    def __init__(
+        self, excerpts: Sequence[Excerpt], thinned: Sequence[_Thinned], sought: Sequence[int]
+    ) -> None:
+        self.excerpts, self.thinned, self.sought = excerpts, thinned, sought
+        self.swing = max(float(np.ptp(e.u)) for e in excerpts)
+        count = COUNT if len(sought) < 3 else COUNT_OF_MANY
+        self.r = self.swing * np.arange(1, count) / count
+        self.steps = np.diff(self.r, prepend=0.0)
+        n = sum(t.x.size for t in thinned)
+        self.pull = PULL * np.sqrt(n) * self.steps
+        k, m = len(excerpts), self.r.size
+        self.weights = slice(k, k + m)
+        self.known = known = k + m + 2
+        self.places = {i: slice(known + m * j, known + m * (j + 1)) for j, i in enumerate(sought)}
+        self.lower, self.upper = np.full(known, -np.inf), np.full(known, np.inf)
+        self.lower[self.weights] = 0.0
+
+    def memory(self, i: int, shares: Shares) -> Array:
+        """Return the memory at the start of a run."""
+        if i in shares:
+            return np.asarray(self.excerpts[i].u[0] - np.cumsum(shares[i] * self.steps))
+        return self.excerpts[i].start(self.r)
+
+    def rows(self, i: int, shares: Shares) -> tuple[Array, Array]:
+        """Return columns of offsets and weights with the target, and which plays still stand."""
+        part = self.thinned[i]
+        plays, still = part.columns(self.r, self.memory(i, shares))
+        u = part.u[part.rows]
+        block = np.zeros((u.size, self.known + 1))
+        block[:, i] = 1.0
+        block[:, len(self.thinned) : -1] = np.column_stack([plays, u**3, u])
+        block[:, -1] = part.x
+        return block, still
+
+    def guessed(self) -> list[tuple[Shares, Array]]:
+        """Return the best first guesses, and the weights that go with each."""
+        guesses = _guesses(self.r, self.swing)
+        factors = [
+            [
+                triangular_factor([self.rows(i, {i: guess})[0]], self.known + 1)
+                for guess in (guesses if i in self.places else guesses[:1])
+            ]
+            for i in range(len(self.thinned))
+        ]
+
+        def fit(places: Sequence[int]) -> tuple[Array, float]:
+            chosen = [R[place] for R, place in zip(factors, places, strict=True)]
+            R = triangular_factor(chosen, self.known + 1)
+            return bounded_least_squares(R, self.lower, self.upper)
+
+        def loss(places: Sequence[int]) -> float:
+            return fit(places)[1]
+
+        numbers = range(len(guesses))
+        alike = [[g if i in self.places else 0 for i in range(len(factors))] for g in numbers]
+        found = []
+        for places in sorted(alike, key=loss)[:STARTS]:
+            for i in self.sought if len(self.sought) > 1 else ():
+                others = [[*places[:i], g, *places[i + 1 :]] for g in numbers]
+                places = min(others, key=loss)
+            found.append(({i: guesses[places[i]] for i in self.sought}, fit(places)[0]))
+        return found
+
+    def step(self, shares: Shares, weights: Array, prior: Shares) -> tuple[Array, Shares, float]:
+        """Return the next weights, changes of the shares, and the loss before."""
+        known, m = self.known, self.r.size
+        width = known + m * len(self.places) + 1
+        blocks = []
+        loss = 0.0
+        for i in range(len(self.thinned)):
+            own, still = self.rows(i, shares)
+            loss += float(np.sum((own[:, :-1] @ weights - own[:, -1]) ** 2))
+            block = np.zeros((own.shape[0], width))
+            block[:, :known], block[:, -1] = own[:, :-1], own[:, -1]
+            if i in self.places:
+                moved = still * weights[self.weights]
+                block[:, self.places[i]] = -self.steps * np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
+            blocks.append(block)
+        lower, upper = (np.resize(x, width - 1) for x in (self.lower, self.upper))
+        for i, at in self.places.items():
+            ridge = np.zeros((m, width))
+            ridge[:, at] = np.diag(self.pull)
+            ridge[:, -1] = self.pull * (prior[i] - shares[i])
+            loss += float(np.sum(ridge[:, -1] ** 2))
+            blocks.append(ridge)
+            lower[at], upper[at] = -shares[i] - 1e-9, 1.0 - shares[i] + 1e-9
+        theta, _ = bounded_least_squares(triangular_factor(blocks, width), lower, upper)
+        return theta[:known], {i: theta[at] for i, at in self.places.items()}, loss
+
+    def fit(self, first: tuple[Shares, Array]) -> tuple[Shares, float]:
+        """Return the shares that Gauss-Newton finds from a guess, and their loss."""
+        prior, weights = first
+        best, best_loss, scale = prior, np.inf, 1.0
+        shares, change = prior, prior
+        for _ in range(TURNS):
+            new_weights, new_change, loss = self.step(shares, weights, prior)
+            if loss < best_loss:
+                small = loss > (1.0 - WORTH) * best_loss
+                best, best_loss, change, weights = shares, loss, new_change, new_weights
+                if small:
+                    break
+                scale = 1.0
+            else:
+                scale *= 0.4
+                if scale < 0.05:
+                    break
+            shares = {i: np.clip(best[i] + scale * change[i], 0.0, 1.0) for i in self.sought}
+        return best, best_loss
 
 
 def fit_starts(
@@ -118,83 +242,14 @@ def fit_starts(
     rules = [e.memory for e in excerpts]
     if not any(unknown):
         return rules
-    swing = max(float(np.ptp(e.u)) for e in excerpts)
-    count = COUNT if sum(unknown) < 3 else COUNT_OF_MANY
-    r = swing * np.arange(1, count) / count
-    steps = np.diff(np.concatenate([[0.0], r]))
     thinned = [_Thinned(e, lag) for e in excerpts]
     sought = [i for i, is_sought in enumerate(unknown) if is_sought and thinned[i].x.size]
     if not sought:
         return rules
-    k, m = len(excerpts), r.size
-    n = sum(t.x.size for t in thinned)
-    pull = PULL * np.sqrt(n) * steps
-    starts = {i: float(excerpts[i].u[0]) for i in sought}
-    # offsets and weights come first, the shares of each start behind them
-    known = k + m + 2
-    places = {i: slice(known + m * j, known + m * (j + 1)) for j, i in enumerate(sought)}
-
-    def memory(i: int, shares: dict[int, Array]) -> Array:
-        if i in shares:
-            return np.asarray(starts[i] - np.cumsum(shares[i] * steps))
-        return excerpts[i].start(r)
-
-    def solve(
-        shares: dict[int, Array], weights: Array | None, prior: dict[int, Array]
-    ) -> tuple[Array, dict[int, Array], float]:
-        """Return weights and changes of the shares, and the loss of the weights before."""
-        free = {} if weights is None else places
-        width = known + m * len(free) + 1
-        blocks = []
-        for i, part in enumerate(thinned):
-            plays, still = part.columns(r, memory(i, shares))
-            block = np.zeros((part.x.size, width))
-            block[:, i] = 1.0
-            u = part.u[part.rows]
-            block[:, k:known] = np.column_stack([plays, u**3, u])
-            block[:, -1] = part.x
-            if weights is not None and i in free:
-                moved = still * weights[k : k + m]
-                block[:, free[i]] = -steps * np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
-            blocks.append(block)
-        loss = 0.0
-        if weights is not None:
-            loss = sum(float(np.sum((b[:, :known] @ weights - b[:, -1]) ** 2)) for b in blocks)
-        lower, upper = np.full(width - 1, -np.inf), np.full(width - 1, np.inf)
-        lower[k : k + m] = 0.0
-        for i, at in free.items():
-            ridge = np.zeros((m, width))
-            ridge[:, at] = np.diag(pull)
-            ridge[:, -1] = pull * (prior[i] - shares[i])
-            loss += float(np.sum(ridge[:, -1] ** 2))
-            blocks.append(ridge)
-            lower[at], upper[at] = -shares[i] - 1e-9, 1.0 - shares[i] + 1e-9
-        theta, after = bounded_least_squares(triangular_factor(blocks, width), lower, upper)
-        change = {i: theta[at] for i, at in free.items()}
-        return theta[:known], change, after if weights is None else loss
-
-    guesses = [{i: _guesses(starts[i], r)[g] for i in sought} for g in range(3)]
-    tried = [solve(guess, None, guess) for guess in guesses]
-    first = int(np.argmin([loss for *_, loss in tried]))
-    prior = shares = guesses[first]
-    weights = tried[first][0]
-    best, change, best_loss = shares, {}, np.inf
-    for _ in range(TURNS):
-        new_weights, new_change, loss = solve(shares, weights, prior)
-        if loss < best_loss:
-            small = loss > (1.0 - WORTH) * best_loss
-            best, best_loss, change, weights_next = shares, loss, new_change, new_weights
-            if small:
-                break
-            scale = 1.0
-        else:
-            scale *= 0.4
-            if scale < 0.05:
-                break
-        shares = {i: np.clip(best[i] + scale * change[i], 0.0, 1.0) for i in sought}
-        weights = weights_next
+    starts = _Starts(excerpts, thinned, sought)
+    best = min(map(starts.fit, starts.guessed()), key=lambda one: one[1])[0]
     for i in sought:
-        rules[i] = _rule(starts[i], r, memory(i, best))
+        rules[i] = _rule(float(excerpts[i].u[0]), starts.r, starts.memory(i, best))
     return rules
 
 

@@ -16,6 +16,7 @@ from piezo_ident.identification.warnings import warn_of_starts
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Piece, Record
 import pytest
 
@@ -55,6 +56,19 @@ def test_start_is_found_on_a_plane_of_relays():
     later = np.concatenate([np.full(5, y[0]), y[:-5]])
     [moved] = fit_starts([Excerpt(GROWING, later, use)], [True], 5.0)
     np.testing.assert_allclose(moved(r), rule(r), atol=0.01)
+
+
+def test_start_of_a_stage_that_came_from_beyond_the_voltage_is_found():
+    u = corners([0.0, 0.5, 0.45, 0.55, 0.5, 0.0, 0.33, 0.0, 0.67, 0.0, 1.0, 0.0], 700)
+    r = np.linspace(0.025, 0.975, 39)
+    truth = -np.minimum(r, 0.1)
+    x = 0.5 * u + 0.05 * np.exp(-r / 0.3) @ play_columns(u, r, truth)
+    x += 1e-4 * np.random.default_rng(0).standard_normal(u.size)
+    # no memory describes how such a stage creeps in the beginning
+    x -= 0.01 * np.exp(-np.arange(u.size) / 700.0)
+    [rule] = fit_starts([Excerpt(u, x, np.ones(u.size, dtype=bool))], [True])
+    # from the memory of a stage that came down the fit ends 0.26 away
+    np.testing.assert_allclose(rule(r), truth, atol=0.1)
 
 
 def test_start_of_a_play_that_never_moves_stays_within_what_is_possible():
