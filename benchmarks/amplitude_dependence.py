@@ -21,8 +21,6 @@ from piezo_ident.axes.linear_fit import refined
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 
-__all__ = ['AmplitudeDependence', 'amplitude_dependence']
-
 #: modes nearer than this part of their frequency trade places from fit to fit: neither is followed
 APART = 0.02
 #: unless the peak of the other is below this part of its own

@@ -29,8 +29,6 @@ from piezo_ident.record.record import Piece, Record, Segment
 from side_by_side import take_turns
 from truths import make_stage, program
 
-__all__ = ['EFFECT', 'MEASURES', 'RATE', 'base_model', 'labelled', 'paper', 'sine', 'to_diagnose']
-
 RATE = 20_000.0
 #: the effect that the diagnosed stage has, and its size [% of stroke]
 EFFECT, SIZE = 'creep', 0.3

@@ -18,8 +18,6 @@ from piezo_ident.record.bags.read import opened_bag, typestore
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 
-__all__ = ['BLOCK', 'NODES', 'RATE', 'STREAMS', 'RunningGraph', 'recorded_samples']
-
 RATE, BLOCK = 20_000, 100
 STREAMS = ('voltage', 'displacement', 'applied_voltage', 'prediction', 'residual')
 NODES = ('stage', 'identifier', 'model', 'recorder', 'excitation')

@@ -25,21 +25,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    'Turn',
-    'last_line',
-    'machine',
-    'markdown',
-    'peak_memory',
-    'ratio',
-    'seconds',
-    'show',
-    'take_turns',
-    'version_of',
-    'versions',
-]
-
-
 #: whose versions a page names, where they are installed
 LIBRARIES = (
     *('numpy', 'scipy', 'numba', 'llvmlite', 'rosbags', 'sippy_unipi', 'sysidentpy', 'pysindy'),

@@ -15,8 +15,6 @@ from typing import Any
 from side_by_side import markdown
 from tqdm import tqdm
 
-__all__ = ['all_rows', 'read_rows', 'section']
-
 
 def section(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
     """Return a section with a table; the heads are separated by commas."""

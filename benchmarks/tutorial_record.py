@@ -22,8 +22,6 @@ from foreign.stage import Linear, make_core, Stage
 import numpy as np
 from piezo_ident.excitation.program import parse_program
 
-__all__ = ['PROGRAMS', 'main', 'stage', 'table']
-
 RATE = 2000.0
 LIMITS = (0.0, 100.0)
 STROKE = 80e-6

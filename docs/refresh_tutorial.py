@@ -29,8 +29,6 @@ from nbformat import v4
 import piezo_ident as pi
 from PIL import Image
 
-__all__ = ['DATA', 'NOTEBOOK', 'PAGE', 'code_blocks', 'main', 'notebook']
-
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs/tutorial.md'
 NOTEBOOK = ROOT / 'examples/tutorial.ipynb'

@@ -40,8 +40,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 import yaml
 
-__all__ = ['Client', 'Nodes', 'own_domain']
-
 PR_SET_PDEATHSIG = 1
 #: how long a node may take to end after each signal [s]
 PATIENCE = 3.0

@@ -15,8 +15,6 @@ from truths.table import EFFECTS
 from .families import SETS
 from .motion import POORER
 
-__all__ = ['CASES', 'FAULTS', 'Case', 'draw']
-
 #: how many cases a set has
 CASES = {'tuning': 72, 'known': 216, 'former': 216, 'past': 216, 'final': 216}
 BLOCK = 24

@@ -28,20 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 from truths.cores import extremes_left
 
-__all__ = [
-    'Core',
-    'accommodation',
-    'bouc_wen',
-    'bouc_wen_of',
-    'coleman_hodgdon',
-    'core_of',
-    'law_of',
-    'play',
-    'preisach',
-    'uneven',
-    'unlike_plays',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 Law = Callable[[Array], Array]

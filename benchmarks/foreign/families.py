@@ -34,8 +34,6 @@ from .unseen_cores import (
     tetragonal_grains,
 )
 
-__all__ = ['LAWS', 'SETS']
-
 LAWS = {
     'preisach': uneven,
     'bouc-wen': bouc_wen,

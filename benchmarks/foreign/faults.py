@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['NAMES', 'spoilt']
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

@@ -12,18 +12,6 @@ from numpy.typing import NDArray
 from truths import laws
 from truths.linear import lag
 
-__all__ = [
-    'FURTHER',
-    'bent',
-    'fed',
-    'friction',
-    'hinge',
-    'hum',
-    'lagging',
-    'limited',
-    'wander',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

@@ -24,14 +24,6 @@ from numpy.typing import NDArray
 
 from .cores import Law, law_of
 
-__all__ = [
-    'bounding_lines',
-    'energy_balance',
-    'limiting_loops',
-    'pinned_line',
-    'pinned_line_of',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

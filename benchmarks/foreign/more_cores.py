@@ -24,15 +24,6 @@ from numpy.typing import NDArray
 
 from .cores import bouc_wen_of, DEPTH, Law, law_of, preisach, STEP
 
-__all__ = [
-    'dahl',
-    'hills',
-    'jiles_atherton',
-    'krasnoselskii_pokrovskii',
-    'skewed_bouc_wen',
-    'turning_curves',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

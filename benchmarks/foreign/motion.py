@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from scipy.signal import firwin, lfilter
 from truths.programs import Label, Tape
 
-__all__ = ['POORER', 'Label', 'Motion', 'record_motion']
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

@@ -17,8 +17,6 @@ from scipy.optimize import lsq_linear
 from .cores import play
 from .stage import Stage
 
-__all__ = ['FORMS', 'Reference', 'basis', 'references', 'remainder']
-
 Array = NDArray[np.float64]
 
 #: rows that are fitted at most

@@ -24,16 +24,6 @@ from numpy.typing import NDArray
 
 from .cores import Law, law_of, STEP
 
-__all__ = [
-    'dragged_moments',
-    'dragged_moments_of',
-    'gap_shares',
-    'loaded_sliders',
-    'loaded_sliders_of',
-    'random_bonds',
-    'random_bonds_of',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

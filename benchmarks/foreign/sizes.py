@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from .stage import Stage
 
-__all__ = ['AMOUNTS', 'LARGEST', 'LEAST', 'scaled', 'size_of']
-
 Array = NDArray[np.float64]
 
 #: of each law the parameter that hardly shows, and the largest that a stage would have; see

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from truths.linear import lag
 
-__all__ = ['spent_on_speed']
-
 Array = NDArray[np.float64]
 
 #: the speed is smoothed with this corner [Hz]; well below this one [spans/s] it counts as slow

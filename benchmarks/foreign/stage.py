@@ -23,8 +23,6 @@ from .cores import Core, core_of, WIDTHS
 from .families import LAWS
 from .speed import spent_on_speed
 
-__all__ = ['VARIANTS', 'Linear', 'Stage', 'make_linear', 'make_stage']
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

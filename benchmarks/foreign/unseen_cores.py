@@ -26,19 +26,6 @@ from numpy.typing import NDArray
 
 from .cores import Law, law_of
 
-__all__ = [
-    'back_stresses',
-    'back_stresses_of',
-    'growing_domains',
-    'growing_domains_of',
-    'phase_fractions',
-    'phase_fractions_of',
-    'rotating_grains',
-    'rotating_grains_of',
-    'tetragonal_grains',
-    'tetragonal_grains_of',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

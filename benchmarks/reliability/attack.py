@@ -37,8 +37,6 @@ from piezo_ident.live.guard import GuardSettings
 from piezo_ident.record.blocks import Samples
 from safety import check
 
-__all__ = ['Attack', 'bad_parameters', 'foreign_models', 'odd_blocks', 'odd_messages']
-
 FS = 20_000.0
 NODES = ('stage', 'excitation', 'identifier', 'model', 'recorder', 'player')
 #: what four clients call, none of which starts work that is meant

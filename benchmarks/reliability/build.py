@@ -18,8 +18,6 @@ from typing import Any
 
 from rows import KEYS, ROWS
 
-__all__ = ['ORDER', 'main', 'page']
-
 PAGE = ROWS.parents[1] / 'reliability.md'
 #: studies in the order of the table; any other comes behind
 ORDER = ('safety', 'attack', 'netns', 'crash', 'soak')

@@ -41,8 +41,6 @@ SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'nice': 0}
 #: what a run may take, and what a busy machine may add to the start of a node [s]
 LIMIT = 90.0
 
-__all__ = ['Hosts', 'Outcome', 'leftover', 'run', 'seen_from', 'why_not']
-
 
 def why_not() -> str:
     """Return why there can be no two hosts here, empty when there can."""

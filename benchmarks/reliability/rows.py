@@ -9,8 +9,6 @@ import json
 import os
 from pathlib import Path
 
-__all__ = ['KEYS', 'ROWS', 'crowd', 'processors', 'shares', 'write_rows']
-
 KEYS = ('what', 'how_often', 'result', 'command')
 ROWS = Path(__file__).resolve().parents[2] / 'docs' / 'reliability' / 'rows'
 

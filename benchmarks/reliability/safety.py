@@ -36,8 +36,6 @@ from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Broken', 'Drive', 'check', 'main', 'sequence']
-
 #: what rounding may add to a step, relative to it and to the voltage
 ROUNDING, ULPS = 1e-8, 4
 #: longest ramp that is followed to its end [samples]

@@ -34,8 +34,6 @@ from rows import processors, shares, write_rows
 from running_graph import BLOCK, NODES, RATE, recorded_samples, RunningGraph, STREAMS
 import yaml
 
-__all__ = ['Soak', 'Stream', 'clock_drift', 'slope', 'soak']
-
 #: how often memory is looked at [s]
 LOOK = 2.0
 #: longest program: samples of one are bounded [s]

@@ -21,8 +21,6 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Density', 'Row', 'everett', 'extremes_left', 'plays']
-
 Array = NDArray[np.float64]
 
 #: thresholds of a dense row of plays

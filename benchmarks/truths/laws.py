@@ -14,24 +14,6 @@ from scipy.special import expit, ndtr
 
 from .linear import band, lag, RATE
 
-__all__ = [
-    'bent',
-    'bridge',
-    'charged',
-    'current_limited',
-    'drift',
-    'fed_through',
-    'friction',
-    'hinge',
-    'hum',
-    'jumps',
-    'limited',
-    'ripple',
-    'speed_of',
-    'vibration',
-    'wander',
-]
-
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from .cores import plays, Row
 from .stage import Base, Stage, VOLTS
 
-__all__ = ['base_of', 'left_over']
-
 Array = NDArray[np.float64]
 
 #: thresholds of the refitted base

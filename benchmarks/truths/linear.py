@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import firwin, freqz, lfilter
 
-__all__ = ['ARX', 'RATE', 'Cascade', 'band', 'delayed', 'lag', 'relaxation', 'ridden']
-
 Array = NDArray[np.float64]
 
 #: internal sampling rate [Hz]

@@ -12,8 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ['Label', 'Tape', 'other_axis', 'program', 'table_one_sines']
-
 Array = NDArray[np.float64]
 Label = tuple[str, int, int]
 

@@ -19,8 +19,6 @@ from .cores import Density, everett, plays
 from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
 from .table import EFFECTS, gain_of, LATER, OUTSIDE, VARIANTS
 
-__all__ = ['SPAN', 'VOLTS', 'Base', 'Stage', 'make_base', 'make_stage']
-
 Array = NDArray[np.float64]
 
 #: displacement [m] and voltage [V] of the whole range

@@ -9,8 +9,6 @@ import math
 
 import numpy as np
 
-__all__ = ['EFFECTS', 'LATER', 'LAWS', 'OUTSIDE', 'VARIANTS', 'describe', 'gain_of']
-
 #: left-over sizes [% of stroke, rms] at which the gains below were found, see `truths.leftover`
 STRENGTHS = (0.1, 0.3, 1.0)
 

@@ -20,8 +20,6 @@ from .laws import speed_of
 from .linear import ARX, delayed, RATE, relaxation
 from .stage import SPAN, VOLTS
 
-__all__ = ['PUBLISHED', 'TableOneStage', 'table_one_stage']
-
 Array = NDArray[np.float64]
 
 #: Table I of Gu, Li, Zhu, Su (2016), doi:10.1109/TMECH.2015.2465868: error of the model with

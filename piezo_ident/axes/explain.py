@@ -38,8 +38,6 @@ from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.signals import with_input_plays, with_loop_plays, with_softening
 from piezo_ident.common.errors import DataError, ModelError
 
-__all__ = ['Explanation', 'Rival', 'Score', 'explain', 'groups', 'middle_group', 'scores']
-
 #: a candidate is preferred to simpler ones where it takes at least this part of their error
 WORTH = 0.1
 #: candidates grow on so many records a group, those of the largest weight

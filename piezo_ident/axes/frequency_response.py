@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 
-__all__ = ['LineResponse', 'excited_lines', 'frequency_response', 'likeness', 'neighbours']
-
 #: a line whose voltage is smaller than this part of the largest is not excited
 EXCITED = 0.02
 

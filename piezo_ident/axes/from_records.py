@@ -35,8 +35,6 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import Axes
 from piezo_ident.record.record import Record, records_of
 
-__all__ = ['AxesIdentification', 'Periods', 'identify_axes', 'periods_of']
-
 #: most periods of one segment
 PERIODS = 64
 #: voltages that differ by less than this part of their range are equal: measured ones do by 2e-4

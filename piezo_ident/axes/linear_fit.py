@@ -21,8 +21,6 @@ from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import IdentificationError
 
-__all__ = ['choose_order', 'linear_error', 'linear_fit', 'refined']
-
 #: a higher order has to lower the held-out error by this part of it
 WORTH = 0.02
 #: every so many lines serve the choice of the order

@@ -25,8 +25,6 @@ from piezo_ident.axes.modal import Modal, narrowest, RADIUS
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Parameters', 'loop_fit', 'output_sensitivities']
-
 #: a real pole has died away to this part after the warm-up
 FADED = 0.01
 #: the softening follows the level but for this part of the time at either end

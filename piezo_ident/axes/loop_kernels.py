@@ -25,9 +25,6 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 
-__all__ = ['CHUNK', 'KINDS', 'sensitivities', 'trajectory']
-
-
 #: what a parameter is, by number: two numbers a block of A, then entries of matrices
 KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')
 #: parameters that run through the loop together

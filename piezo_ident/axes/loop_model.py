@@ -26,8 +26,6 @@ from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError, ModelError
 
-__all__ = ['LoopModel', 'LoopStream', 'Passage']
-
 
 @dataclass(frozen=True, eq=False)
 class Passage:

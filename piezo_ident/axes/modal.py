@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Modal', 'balanced', 'narrowest', 'resolved', 'to_modal']
-
 #: poles stay within
 RADIUS = 0.9999
 

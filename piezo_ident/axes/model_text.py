@@ -19,8 +19,6 @@ from piezo_ident.common.files import load_yaml, write_text
 from piezo_ident.model.files import plain
 import yaml
 
-__all__ = ['AxesModel', 'axes_model_to_text']
-
 #: the key that tells such a text from a model of one axis
 KEY = 'several_axes'
 

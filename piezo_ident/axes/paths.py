@@ -22,8 +22,6 @@ from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import DataError
 
-__all__ = ['AxisError', 'Path', 'axis_errors', 'paths_of']
-
 #: neighbours on either side of a line, at least; degree of the polynomial
 HALF_WIDTH, DEGREE = 4, 2
 #: equations for each unknown of a line, at least

@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 
-__all__ = ['PeriodicRecord', 'Periodicity', 'periodicity']
-
 #: a record that differs between periods by so many times the median of all is suspicious
 SUSPICIOUS = 3.0
 #: bands in which the difference is compared

@@ -20,8 +20,6 @@ from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['THRESHOLDS', 'with_input_plays', 'with_loop_plays', 'with_softening']
-
 #: of the plays, in units of the rms of their signals
 THRESHOLDS = (0.05, 0.15, 0.4, 1.0, 2.0)
 

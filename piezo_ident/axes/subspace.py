@@ -19,8 +19,6 @@ from piezo_ident.axes.frequency_response import LineResponse
 from piezo_ident.axes.modal import balanced, Modal, to_modal
 from piezo_ident.common.errors import IdentificationError
 
-__all__ = ['subspace']
-
 #: rows of blocks in the observability matrix, at most
 ROWS = 120
 #: turns of B and C

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from piezo_ident.identification.results import Progress
 
 
-__all__ = ['Console', 'deferred_interrupts']
-
-
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[..., None]]:
     """

@@ -35,8 +35,6 @@ from piezo_ident.report import (
     validated,
 )
 
-__all__ = ['diagnose_command']
-
 
 def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident diagnose``."""

@@ -21,8 +21,6 @@ from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, csv_text, Row, unit_of
 from piezo_ident.model.files import load
 
-__all__ = ['check_each', 'diagnose_each', 'identify_each']
-
 #: failed records that are printed
 PRINTED = 10
 #: columns whose spread is printed: name, unit for people, and factor from that of the table

@@ -17,8 +17,6 @@ from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.effects import catalogue, Effect, Parameter
 
-__all__ = ['effect_name', 'effect_names', 'effects_command']
-
 #: [characters]
 WIDTH = 99
 

@@ -18,8 +18,6 @@ from piezo_ident.export.fmu import export_fmu
 from piezo_ident.export.header import export_c
 from piezo_ident.model.files import load
 
-__all__ = ['export_command']
-
 SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
 

@@ -31,16 +31,6 @@ from piezo_ident.record.record import Record
 if TYPE_CHECKING:
     from piezo_ident.report import Prompt
 
-__all__ = [
-    'checked',
-    'identify_command',
-    'keep',
-    'print_files',
-    'print_next',
-    'prompt_of',
-    'read_both',
-]
-
 
 def identify_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident identify``."""

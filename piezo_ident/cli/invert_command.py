@@ -21,8 +21,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['invert_command']
-
 
 def invert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident invert``."""

@@ -28,8 +28,6 @@ from piezo_ident.cli import options
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import PiezoIdentError
 
-__all__ = ['cli', 'main']
-
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 SETTINGS = {'help_option_names': ['-h', '--help']}
 

@@ -13,17 +13,6 @@ import tempfile
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import broken_link, check_replaceable, unwritable
 
-__all__ = [
-    'check_apart',
-    'check_distinct',
-    'check_file',
-    'check_folder',
-    'check_link',
-    'check_output',
-    'check_suffix',
-    'check_table_and_picture',
-]
-
 TABLE_FILES = ('.csv', '.npz')
 PICTURES = ('.png', '.pdf', '.svg')
 

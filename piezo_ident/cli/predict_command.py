@@ -23,8 +23,6 @@ from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Record
 from piezo_ident.record.tables import blocks_of
 
-__all__ = ['error_data', 'predict_command', 'print_errors']
-
 
 def predict_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident predict``."""

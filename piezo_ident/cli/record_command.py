@@ -23,8 +23,6 @@ from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['convert_command', 'simulate_command']
-
 PROGRAM_FILES = ('.yaml', '.yml')
 
 

@@ -21,21 +21,6 @@ from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
-__all__ = [
-    'BAG_FILES',
-    'MODEL_FILES',
-    'check_bag_options',
-    'check_order',
-    'data_of',
-    'expand',
-    'expand_apart',
-    'fields_of',
-    'naming',
-    'options_of',
-    'print_faults',
-    'read_all',
-]
-
 #: faults that are shown when a record has been read
 SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')

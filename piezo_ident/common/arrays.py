@@ -10,8 +10,6 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ['Array', 'Integers', 'Mask', 'frozen_array', 'robust_range', 'true_runs']
-
 #: real numbers, which ones count, and places
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -15,8 +15,6 @@ import sysconfig
 
 from piezo_ident.common.errors import ConfigError
 
-__all__ = ['find_config', 'shipped_names']
-
 _SHARE = Path('share', 'piezo_ident', 'config')
 _SOURCE = Path(__file__).resolve().parents[2] / 'config'
 

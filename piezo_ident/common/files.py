@@ -24,20 +24,6 @@ from typing import Any
 from piezo_ident.common.errors import ConfigError, DataError
 import yaml
 
-__all__ = [
-    'UNPACKED_SIZE',
-    'YAML_SIZE',
-    'broken_link',
-    'check_regular',
-    'check_replaceable',
-    'load_yaml',
-    'parse_yaml',
-    'temporary_output',
-    'unwritable',
-    'write_text',
-    'write_together',
-]
-
 #: the largest YAML text [characters, 20 us each], and values in it with aliases written out
 YAML_SIZE = 500_000
 #: what the samples of one file may unpack to [bytes]: four hours of three columns at 20 kHz

@@ -19,8 +19,6 @@ from typing import Any, cast, TypeVar
 from numba import njit
 from numba.core import event
 
-__all__ = ['STILL', 'alive', 'kernel', 'ordered_kernel']
-
 F = TypeVar('F', bound=Callable[..., Any])
 
 #: what is smaller has died away

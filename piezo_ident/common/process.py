@@ -27,8 +27,6 @@ import weakref
 
 from piezo_ident.common.errors import Cancelled, PiezoIdentError
 
-__all__ = ['Job', 'Tick', 'WorkerProcess']
-
 #: called with the name of a step and its share done; raises to cancel
 Tick = Callable[[str, float], None]
 Job = Callable[[Tick], Any]

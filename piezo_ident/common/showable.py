@@ -10,8 +10,6 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ['Showable']
-
 
 class Showable:
     """Base of what is shown through the front door, which alone may look down to the reports."""

@@ -24,8 +24,6 @@ from piezo_ident.common.kernel import kernel, ordered_kernel
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, curve_slope, held
 
-__all__ = ['HysteresisInverse']
-
 #: largest difference of H from what is wanted at a root, normalised
 TOLERANCE = 1e-13
 #: evaluations of H for a sample, at most

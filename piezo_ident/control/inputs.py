@@ -14,8 +14,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['checked_limits', 'checked_motion', 'padded']
-
 
 def checked_motion(wanted: ArrayLike) -> Array:
     """Return a wanted motion as a vector, or raise DataError."""

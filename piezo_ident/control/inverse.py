@@ -37,8 +37,6 @@ from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
 from scipy.signal import butter, sosfiltfilt
 
-__all__ = ['Inverse', 'invert']
-
 #: passes of the iteration, at most
 PASSES = 30
 #: error [of the span of the wanted motion, rms] below which it ends

@@ -31,8 +31,6 @@ from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['Learning', 'Repetition']
-
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95
 #: step below which a correction that harms is not tried again

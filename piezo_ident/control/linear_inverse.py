@@ -36,17 +36,6 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import oaconvolve
 
-__all__ = [
-    'LinearInverse',
-    'check_preview',
-    'is_filter',
-    'least_gain',
-    'least_preview',
-    'linear_inverse',
-    'lowest_mode',
-    'smoothed',
-]
-
 #: gain of G, as a share of the static one, below which it is not made up for: of a model that is
 #: exact, and of one from data, which knows little of what hardly moves
 EXACT, FROM_DATA = 3e-2, 0.1

@@ -36,8 +36,6 @@ from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['PREVIEW', 'Driven', 'LiveInverse']
-
 #: samples that a wanted motion is known ahead
 PREVIEW = 400
 #: passes that are tried

@@ -29,8 +29,6 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-__all__ = ['RateInverse']
-
 #: times that the speed is taken again, and the corner of its smoothing in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
 #: share of the square of what a pass misses that it must leave at most for another one

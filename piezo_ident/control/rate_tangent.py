@@ -18,8 +18,6 @@ from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresi
 from piezo_ident.operators.kernels import curve_slope
 from scipy.sparse.linalg import LinearOperator
 
-__all__ = ['tangent']
-
 
 def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOperator:
     """

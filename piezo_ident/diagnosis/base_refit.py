@@ -30,8 +30,6 @@ from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
-__all__ = ['base_thresholds', 'effects_beside', 'refits', 'with_refit']
-
 #: laws that are tried in the place of the widest, the narrowest first
 _NARROWER: tuple[LawName, ...] = ('plays', 'preisach')
 #: times the error of the given model that an H of records without kinds of motion may be off it

@@ -23,8 +23,6 @@ from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Behind']
-
 #: samples that pass all links while they are in the cache, about
 STRETCH = 1 << 14
 #: filters that run side by side in vector lanes

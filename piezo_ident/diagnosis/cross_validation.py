@@ -21,23 +21,6 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import HARM, HARM_OF_REFIT, OF_SHAPE, STANDARD_ERRORS
 from piezo_ident.diagnosis.rows import centred, Rows
 
-__all__ = [
-    'NormalEquations',
-    'Pull',
-    'block_products',
-    'fitted_gain',
-    'held_out_errors',
-    'held_out_residual',
-    'normal_equations',
-    'refit_holds',
-    'right_sides',
-    'solve',
-    'standard_errors',
-    'summed',
-    'takes_shape',
-    'with_columns',
-]
-
 #: share of a column's own energy that is added to the diagonal: keeps collinear columns small
 RIDGE = 1e-9
 

@@ -71,8 +71,6 @@ from piezo_ident.residual import (
     without_lines,
 )
 
-__all__ = ['diagnose']
-
 #: effect that is looked for by its lines
 HUM = 'periodic_disturbance'
 

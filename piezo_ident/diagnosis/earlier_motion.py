@@ -29,8 +29,6 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
 
-__all__ = ['with_earlier_motion']
-
 
 def with_earlier_motion(
     simulator: Simulator, fitted: Fitted, tick: Callable[[], None] = lambda: None

@@ -20,8 +20,6 @@ from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import centred, Rows
 from scipy.optimize import lsq_linear
 
-__all__ = ['WORSE', 'BaseColumns', 'FitStep', 'Scale', 'next_damping']
-
 #: factor of the damping after a step that failed; its square after the next one, and so on
 WORSE = 3.0
 #: shares of what a step promised: above the first damping falls, below the second it grows

@@ -29,8 +29,6 @@ from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.effects import catalogue, Effect, find_effect
 from piezo_ident.identification.results import Progress
 
-__all__ = ['TESTED', 'ForwardSelection', 'Selected']
-
 #: effects that have a test of their own, by lines and by coherence with a further channel
 TESTED = ('periodic_disturbance', 'cross_coupling')
 

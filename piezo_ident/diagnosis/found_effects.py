@@ -12,8 +12,6 @@ from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FoundEffect, FoundParameter
 from piezo_ident.diagnosis.rows import Rows
 
-__all__ = ['found_effects']
-
 
 def found_effects(
     rows: Rows, base: Fitted, selected: Selected, explainable: float, last: Fitted

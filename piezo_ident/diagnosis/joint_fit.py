@@ -32,15 +32,6 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = [
-    'Fitted',
-    'base_at',
-    'cost_of_decays',
-    'fit_base',
-    'fit_jointly',
-]
-
-
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
 #: first damping, a share of the energy of each column, and the least
 DAMPING, LEAST_DAMPING = 1e-4, 1e-9

@@ -18,8 +18,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
 
-__all__ = ['left_over', 'part_judged', 'part_searched', 'sentence', 'warnings_of']
-
 #: share of the data that needs no word about the rest
 NEARLY_ALL = 0.9
 

@@ -25,15 +25,6 @@ from piezo_ident.model.sines import sine_frequency
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import rests
 
-__all__ = [
-    'CONTAINS',
-    'LOOK_ALIKES',
-    'Experiment',
-    'look_alikes',
-    'next_experiment',
-    'separating_experiment',
-]
-
 Kind = Literal['sweeps', 'holds']
 Motion = Callable[[Sequence[Record], float], bool]
 

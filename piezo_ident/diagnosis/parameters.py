@@ -12,8 +12,6 @@ from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.state import State
 from piezo_ident.effects.trials import number_of
 
-__all__ = ['FreeParameter', 'free_parameters']
-
 #: finite difference of the logarithm of a parameter
 LOG_STEP = 1e-2
 

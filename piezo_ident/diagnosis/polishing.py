@@ -17,8 +17,6 @@ from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import score_trials, started
 
-__all__ = ['good_enough', 'least_gain', 'polished', 'with_fresh_columns', 'without_needless']
-
 
 def least_gain(rows: Rows, noise: float) -> float:
     """Return the gain that a step of a fit has to bring, beside a noise; both mean squares."""

@@ -22,9 +22,6 @@ from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['WANDERS', 'Refined', 'lasting', 'moved_zeros', 'refine']
-
-
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
 #: effect that is a gain which changes with time

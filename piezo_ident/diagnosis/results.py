@@ -15,21 +15,6 @@ from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Piece
 
-__all__ = [
-    'FORMULA',
-    'Candidate',
-    'Class',
-    'Diagnosis',
-    'DiagnosisSettings',
-    'Errors',
-    'FoundEffect',
-    'FoundParameter',
-    'Residual',
-    'Unexplained',
-    'Unseen',
-    'Untestable',
-]
-
 FORMULA = (
     '100 rms(y - y_hat) / (max y - min y), free run, the zero of each record free; before: the '
     'model as it was given; after: each kind of motion with the parameters fitted to the others'

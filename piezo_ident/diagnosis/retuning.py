@@ -12,8 +12,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.operators.dynamics import Dynamics
 
-__all__ = ['BEYOND', 'RETUNING', 'retuned', 'retuning_factor', 'retuning_terms']
-
 #: corner frequencies of the relaxations that a retuned G may show [Hz]
 RELAXATIONS = (15.0, 100.0)
 #: how far G may be retuned: about samples of delay, their squares, and two relaxations

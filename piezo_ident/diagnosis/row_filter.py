@@ -21,8 +21,6 @@ from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.sections import rounding_of
 
-__all__ = ['RowFilter', 'group_of', 'serves']
-
 #: samples in a row and in a run from which it is quicker than G itself
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000
 #: samples in a group of rows, about

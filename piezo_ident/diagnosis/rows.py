@@ -30,8 +30,6 @@ from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means, without_spikes
 
-__all__ = ['Rows', 'centred', 'make_rows', 'means']
-
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
 #: fewest rows that can be cut into blocks

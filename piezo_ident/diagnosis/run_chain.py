@@ -17,8 +17,6 @@ from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['RunChain', 'asked_once', 'columns_of', 'effects_around', 'place_of', 'place_of_core']
-
 #: the largest of a derivative, as the small change that a link which bends sees
 SMALL = 1e-6
 

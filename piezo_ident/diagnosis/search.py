@@ -32,8 +32,6 @@ from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['Round', 'gains_of', 'search_round', 'stands_out', 'takes']
-
 
 @dataclass(frozen=True, eq=False)
 class Round:

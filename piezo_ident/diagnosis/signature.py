@@ -29,8 +29,6 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.residual.stretches import block_means, rests
 from scipy.ndimage import uniform_filter1d
 
-__all__ = ['follows_motion', 'has_place', 'shows']
-
 #: what dynamics leave behind a motion has died away after this time at rest [s]
 SETTLED = 0.05
 #: fewest rows of a rest or a motion

@@ -45,8 +45,6 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
-__all__ = ['Simulator']
-
 T = TypeVar('T')
 
 #: runs that go side by side at most

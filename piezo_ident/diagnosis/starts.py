@@ -14,8 +14,6 @@ from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 
-__all__ = ['Failure', 'fit_starts']
-
 #: what fails one start, and leaves the others going
 Failure = ModelError | IdentificationError
 

@@ -17,8 +17,6 @@ from piezo_ident.effects.trials import with_number
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-__all__ = ['CREEP', 'Added', 'State']
-
 #: effect that goes on when the motion has ended
 CREEP = 'creep'
 

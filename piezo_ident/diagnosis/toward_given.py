@@ -31,9 +31,6 @@ from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 
-__all__ = ['loops', 'toward_given']
-
-
 #: samples of a sweep over the range
 SWEEP = 60
 

@@ -31,8 +31,6 @@ from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['Scored', 'Tick', 'best_trials', 'score_trials', 'started']
-
 #: called with the share of the work that is done; may raise `Cancelled`
 Tick = Callable[[float], None]
 

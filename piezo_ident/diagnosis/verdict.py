@@ -36,17 +36,6 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import gains_of, Round
 from piezo_ident.effects import catalogue, find_effect
 
-__all__ = [
-    'Findings',
-    'candidates_of',
-    'errors_of_laws',
-    'judge',
-    'rivals_of',
-    'set_aside',
-    'smallest_detectable',
-    'untestable_of',
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Findings:

@@ -13,8 +13,6 @@ from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['AmplifierLag']
-
 
 @kernel
 def _follow(x: Array, pole: float, state: Array) -> Array:

@@ -14,8 +14,6 @@ from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import held
 
-__all__ = ['Backlash']
-
 
 @kernel
 def _play(x: Array, width: float, state: Array) -> Array:

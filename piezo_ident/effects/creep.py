@@ -17,8 +17,6 @@ from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['AT_ONCE', 'Creep']
-
 #: time after a step up to which motion may be that of dynamics [s]
 AT_ONCE = 0.05
 #: share of what creeps on after a step that may come back

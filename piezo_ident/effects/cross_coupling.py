@@ -16,8 +16,6 @@ from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 from piezo_ident.record.channels import role_of
 
-__all__ = ['CrossCoupling']
-
 #: corner below which nothing follows another axis but heat [Hz]
 SLOWEST = 0.5
 

@@ -16,8 +16,6 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, Vie
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['GainDrift']
-
 
 @ordered_kernel
 def _with_gain(x: Array, t: Array, at: Integers, knots: Array, gains: Array) -> Array:

@@ -18,8 +18,6 @@ from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import held
 from piezo_ident.operators.play import initial_memory
 
-__all__ = ['NoncongruentMinorLoops']
-
 
 @kernel
 def _tilted(v: Array, r: Array, slope: Array, bend: Array, bias: float, memory: Array) -> Array:

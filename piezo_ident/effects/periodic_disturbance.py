@@ -10,8 +10,6 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['PeriodicDisturbance']
-
 
 class PeriodicDisturbance(Effect):
     """

@@ -14,8 +14,6 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator, LANES
 from piezo_ident.operators.kernels import curve, curve_slope, held
 
-__all__ = ['RateDependentHysteresis']
-
 #: relative step of the low-pass of the speed, for the slope of the power
 NEAR = 1e-5
 #: speed below which the slope of its power is taken at it [spans/s]

@@ -16,8 +16,6 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, Vie
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['Saturation']
-
 #: beyond this many knees from an end, rounding changes nothing that a float can hold
 FAR = 40.0
 #: L(z) in C

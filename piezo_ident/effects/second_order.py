@@ -13,8 +13,6 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.operators.c_code import CCode
 
-__all__ = ['SecondOrderSection', 'sections_in_c', 'slope_of_mode']
-
 
 @kernel
 def _run(x: Array, c: Array, state: Array) -> Array:

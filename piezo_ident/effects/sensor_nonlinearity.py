@@ -11,8 +11,6 @@ from piezo_ident.effects.effect import Effect, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['SensorNonlinearity']
-
 
 class SensorNonlinearity(Effect):
     """

@@ -13,8 +13,6 @@ from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-__all__ = ['SlewLimit']
-
 
 @kernel
 def _limit(x: Array, most: float, state: Array) -> Array:

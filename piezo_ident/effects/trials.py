@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.arrays import Array
 
-__all__ = ['Trial', 'View', 'ladder', 'number_of', 'with_number']
-
 
 @dataclass(frozen=True, eq=False)
 class View:

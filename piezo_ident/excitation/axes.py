@@ -13,8 +13,6 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import Program, Sequence
 from piezo_ident.record.record import Segment
 
-__all__ = ['build_axes']
-
 
 def build_axes(
     program: Program,

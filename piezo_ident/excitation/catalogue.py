@@ -16,8 +16,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as excitation
 
-__all__ = ['REQUIRED', 'SIGNALS', 'Option', 'Part', 'Setting', 'Signal']
-
 #: default of an option that must be given
 REQUIRED = object()
 

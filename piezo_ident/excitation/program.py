@@ -33,8 +33,6 @@ from piezo_ident.excitation import signals as excitation
 from piezo_ident.excitation.catalogue import Option, Part, REQUIRED, Setting, SIGNALS
 from piezo_ident.record.record import Segment
 
-__all__ = ['Entry', 'Program', 'Sequence', 'parse_program']
-
 _HEAD = {
     'limits': Option('V', many=True),
     'sample_rate': Option('Hz', default=None, positive=True),

@@ -14,8 +14,6 @@ from piezo_ident.excitation.catalogue import Option, SIGNALS
 from piezo_ident.excitation.program import Program
 import yaml
 
-__all__ = ['program_to_yaml', 'scaled']
-
 #: highest frequency over the sampling rate; noise ends at 1.2 times its cutoff
 HIGHEST = 0.4
 

@@ -18,21 +18,6 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import ConfigError
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-__all__ = [
-    'PAPER_PEAKS',
-    'PAPER_SLOPE',
-    'corners',
-    'multisine',
-    'noise',
-    'odd_lines',
-    'ramp',
-    'sample_count',
-    'settling_sweep',
-    'sine',
-    'staircase',
-    'triangle',
-]
-
 #: eq. (7) of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868: peaks [V], slope [V/s]
 PAPER_PEAKS = (3.0, 6.0, 9.0)
 PAPER_SLOPE = 6.0

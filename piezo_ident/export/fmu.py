@@ -20,8 +20,6 @@ from piezo_ident.export.header import c_number, export_c, plain_text, render
 from piezo_ident.export.links import LinkGroup, links_of
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['export_fmu']
-
 
 def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'stage') -> None:
     """

@@ -38,8 +38,6 @@ from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, LinkGroup, links_of
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['c_number', 'export_c', 'plain_text', 'render']
-
 #: [spans] beyond which no displacement is looked for
 FAR = 100.0
 #: width of a line of numbers or words

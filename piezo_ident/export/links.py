@@ -18,8 +18,6 @@ from piezo_ident.operators.chain import Operator
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 
-__all__ = ['Link', 'LinkGroup', 'links_of']
-
 #: what the statements of a link may be given
 _GIVEN = ('u', 'v', 't', 'c')
 

@@ -21,8 +21,6 @@ from piezo_ident.identification.step2_dynamics import (
     instrumental_variables,
 )
 
-__all__ = ['upheld']
-
 Signals = tuple[Array, Array]
 
 #: orders (n, n), and delays below those that are asked about [samples], that are tried

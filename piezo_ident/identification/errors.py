@@ -27,15 +27,6 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
-__all__ = [
-    'errors_of',
-    'fast_error',
-    'key_of',
-    'noise_floor_of',
-    'predictions_of',
-    'validation_errors',
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Prediction:

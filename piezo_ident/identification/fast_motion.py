@@ -20,17 +20,6 @@ from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step1_delay import find_jumps
 from scipy import ndimage, signal
 
-__all__ = [
-    'EDGES',
-    'FAINT',
-    'HIGH_PASS',
-    'FastAndCalm',
-    'FastMotion',
-    'high_passed',
-    'moving',
-    'rms_above',
-]
-
 #: below this the signals are taken away before G is fitted [Hz]
 HIGH_PASS = 30.0
 #: time after a jump in which the dynamics are looked for [s]

@@ -20,8 +20,6 @@ from piezo_ident.identification.fast_motion import EDGES, FAINT, HIGH_PASS, rms_
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import Settings
 
-__all__ = ['MOVES', 'fitted_parts', 'held_out_place']
-
 #: samples at the end of an unlabelled record that an error needs at least
 MIN_HELD = 10
 #: samples that a fit needs at least

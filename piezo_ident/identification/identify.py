@@ -61,8 +61,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Record, records_of
 import scipy
 
-__all__ = ['first_steps', 'identify']
-
 #: level of small motion from which loops drift, in parts of the rms that H leaves of the triangles
 ELSEWHERE = 2.0
 #: share by which a model may err more without a pair of G that H may stand for

@@ -38,12 +38,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.residual.coherence import cross_spectra
 from scipy import optimize, signal
 
-__all__ = [
-    'LinearPart',
-    'find_linear_part',
-    'refined_linear_part',
-]
-
 #: na of further starts by instrumental variables
 INSTRUMENTS = (4, 8)
 #: of the output error, which starts far from its optimum while H is rough

@@ -14,8 +14,6 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import END_HELD, Run
 from piezo_ident.identification.spectra import excited_band, prefilter
 
-__all__ = ['NoiseSegment', 'band_of', 'longest_noise', 'noise_segment']
-
 
 @dataclass(frozen=True, eq=False)
 class NoiseSegment:

@@ -23,17 +23,6 @@ from piezo_ident.record.gaps import bridged
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
-__all__ = [
-    'Excerpt',
-    'Prepared',
-    'Run',
-    'common_rate',
-    'prepare',
-    'runs_of',
-    'same_rate',
-    'scaling_of',
-]
-
 #: share of a triangle that is one block of held-out data, and how many blocks share one
 BLOCKS, EVERY = 60, 5
 #: share at the end of every noise and step segment that is not fitted

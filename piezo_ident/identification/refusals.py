@@ -15,8 +15,6 @@ from piezo_ident.residual.coherence import cross_spectra
 from piezo_ident.residual.stretches import block_means
 from scipy import signal
 
-__all__ = ['refuse_closed_loop', 'refuse_undriven']
-
 #: chance below which the displacement answers the voltage, and samples that it takes to tell
 CHANCE, MIN_COHERENCE = 1e-7, 256
 #: means to which a record is thinned for its slow motion

@@ -21,20 +21,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 
-__all__ = [
-    'DelayResult',
-    'DynamicsResult',
-    'ErrorRow',
-    'Headline',
-    'Identification',
-    'Memories',
-    'Progress',
-    'Settings',
-    'Steps',
-    'rms_percent',
-    'silent',
-]
-
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = dict[tuple[str, float], Array]
 #: called with the name of the step and the share of it that is done; raises `Cancelled` to stop

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.operators.dynamics import Dynamics
 
-__all__ = ['fast_part', 'without_pairs', 'without_slow_part']
-
 #: real poles below this are creep or what H lacks, never dynamics [Hz]
 SLOWEST = 40.0
 #: at low sampling rates, as a share of the rate

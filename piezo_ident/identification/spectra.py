@@ -14,15 +14,6 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.coherence import cross_spectra
 from scipy import fft, signal
 
-__all__ = [
-    'FrequencyResponse',
-    'broadband_response',
-    'excited_band',
-    'frequency_response',
-    'highest_frequency',
-    'prefilter',
-]
-
 #: longest segment of a frequency response [samples]
 SEGMENT = 8192
 #: a response of any motion keeps points of at most this relative standard deviation

@@ -35,8 +35,6 @@ from piezo_ident.identification.step3_hysteresis import (
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 
-__all__ = ['fit_starts', 'lag_of', 'with_starts', 'without_harm']
-
 Rule = Callable[[Array], Array]
 #: of each run whose start is sought: the share of each play
 Shares = dict[int, Array]

@@ -18,8 +18,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.record.record import Piece
 
-__all__ = ['StepDelay', 'delay_from_loss', 'delay_from_steps', 'find_jumps', 'step_responses']
-
 #: the average response counts as risen at this many standard deviations of its noise
 THRESHOLD = 5.0
 #: rise over the smallest loss, as a share of it, that counts as none

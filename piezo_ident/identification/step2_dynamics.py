@@ -26,19 +26,6 @@ from piezo_ident.identification.solvers.output_error import lag_products
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from scipy.linalg import solve_triangular
 
-__all__ = [
-    'ArxFactor',
-    'OrderTable',
-    'arx_factor',
-    'delayed',
-    'factor_of',
-    'free_run_error',
-    'instrumental_variables',
-    'instruments_of',
-    'scan_orders',
-    'stabilised',
-]
-
 #: what is left of a column of unit length, once those before it are taken off, must be more
 INDEPENDENT = 1e-10
 #: poles that are mirrored into the circle come to lie within

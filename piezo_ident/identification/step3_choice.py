@@ -31,17 +31,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
-__all__ = [
-    'PAPER_COUNT',
-    'Choice',
-    'Means',
-    'choose_law',
-    'choose_thresholds',
-    'merged',
-    'third_step',
-    'with_small',
-]
-
 #: plays of the paper, where the data cannot choose their number
 PAPER_COUNT = 10
 #: numbers of evenly spaced thresholds that are tried, one after the other

@@ -35,16 +35,6 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.operators.kernels import hysteresis
 from scipy.optimize import OptimizeResult
 
-__all__ = [
-    'HysteresisFit',
-    'even_thresholds',
-    'factorise',
-    'filtered_rows',
-    'fine_thresholds',
-    'fit_again',
-    'fit_hysteresis',
-]
-
 Solver = Literal['least_squares', 'swarm']
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range

@@ -63,17 +63,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
 
-__all__ = [
-    'beside_law',
-    'first_step',
-    'model_of',
-    'motion_excerpts',
-    'second_step',
-    'small_excerpts',
-    'triangle_excerpts',
-    'within',
-]
-
 #: orders within this share of the best held-out error count as equal; smaller ones go first
 SLACK = 0.05
 #: share by which instrumental variables must err less than least squares to choose the orders

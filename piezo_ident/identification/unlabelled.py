@@ -52,8 +52,6 @@ from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 
-__all__ = ['JointFit', 'fit_unlabelled', 'joint_fit']
-
 Vector = NDArray[np.float64]
 
 #: how often starts, H and G are fitted in turn

@@ -18,8 +18,6 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.faults import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
 
-__all__ = ['LAW_WORDS', 'warn_of_range', 'warn_of_starts', 'warn_of_zeros', 'warnings_of']
-
 #: change of G within the excited band below which the band is too narrow to know G by
 HARDLY = 0.1
 #: measured and modelled small-signal gain may differ by this share before it is said

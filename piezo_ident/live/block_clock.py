@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.record.clock import has_restarted
 
-__all__ = ['BlockClock']
-
 
 class BlockClock:
     """

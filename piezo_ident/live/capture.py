@@ -24,8 +24,6 @@ from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
 
-__all__ = ['Capture', 'Snapshot', 'refuse_incomplete']
-
 #: segments that the three steps stand on
 NEEDED = ('step', 'noise', 'triangle')
 #: samples and blocks of a topic that are kept, and labels that are counted, whatever the times are

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Companion']
-
 #: samples that are kept at most
 MOST = 1_000_000
 

@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.kernel import kernel
 
-__all__ = ['LAST_RAMP', 'Applied', 'Guard', 'GuardSettings']
-
 #: how long the ramp of a node that is ending may take [s]
 LAST_RAMP = 0.7
 #: why a sample was altered, in the order of the kernel's counts

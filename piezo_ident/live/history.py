@@ -20,8 +20,6 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['History', 'TurningPoints']
-
 #: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
 #: time before each turning point of which the samples are kept [s]

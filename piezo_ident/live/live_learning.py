@@ -14,9 +14,6 @@ from piezo_ident.live.guard import GuardSettings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['LiveLearning']
-
-
 #: time at the first voltage of a repetition before it begins [s]
 SETTLE = 0.05
 

@@ -15,8 +15,6 @@ from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['LiveError', 'Matched', 'Matcher', 'Preview', 'PreviewBin', 'TrackingError']
-
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
 #: after this time without a match, two streams are taken to be in the same run [s]

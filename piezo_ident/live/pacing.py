@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 
-__all__ = ['ArrivalClock', 'Pace', 'Rate', 'Schedule']
-
 #: a block this much behind its time is not caught up with: readers keep only so many blocks [s]
 SLIP = 0.25
 #: the clock was set when it moved by more, which is less than a block [ns]

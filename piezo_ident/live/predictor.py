@@ -24,8 +24,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['Predictor', 'warm_up']
-
 #: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
 BRIDGE = 0.5
 #: shortest sampling period that is accepted [s]

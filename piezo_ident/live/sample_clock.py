@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.clock import has_restarted
 
-__all__ = ['Kind', 'SampleClock', 'Verdict']
-
 #: returns the ids of all publishers of a topic
 Publishers = Callable[[], Collection[Hashable]]
 

@@ -25,8 +25,6 @@ from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.history import History
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['Drive', 'Successor', 'Tracker']
-
 
 @dataclass(frozen=True, eq=False)
 class Drive:

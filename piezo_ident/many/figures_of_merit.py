@@ -13,8 +13,6 @@ from __future__ import annotations
 import numpy as np
 from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['figures_of_merit']
-
 #: samples of one branch of the loop, and frequencies at which G is evaluated
 BRANCH, FREQUENCIES = 400, 4000
 #: lowest of them, as a share of the highest

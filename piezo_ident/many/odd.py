@@ -11,8 +11,6 @@ import statistics
 
 from piezo_ident.many.table import Row
 
-__all__ = ['stand_out']
-
 #: fewer values than these say little about how far others of the kind lie apart
 FEWEST = 8
 #: distance from the median that stands out: in standard deviations, as the median of the distances

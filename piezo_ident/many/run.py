@@ -33,8 +33,6 @@ from piezo_ident.record import io as record_io
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
-__all__ = ['Diagnose', 'Identify', 'Task', 'run_many']
-
 MARK = 'many.json'
 
 

@@ -18,18 +18,6 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.many.figures_of_merit import figures_of_merit
 from piezo_ident.record.record import Record
 
-__all__ = [
-    'COLUMNS',
-    'Row',
-    'Value',
-    'columns_of',
-    'csv_text',
-    'diagnosed',
-    'identified',
-    'natural',
-    'unit_of',
-]
-
 #: content of a cell
 Value = str | float | int | None
 

@@ -16,8 +16,6 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.process import Job, WorkerProcess
 
-__all__ = ['Submit', 'dask', 'processes']
-
 #: takes a job, and returns its result to be
 Submit = Callable[[Any], Future[Any]]
 

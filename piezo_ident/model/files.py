@@ -22,19 +22,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 import yaml
 
-__all__ = [
-    'SCHEMA_VERSION',
-    'check_keys',
-    'finite',
-    'load',
-    'model_from_dict',
-    'model_to_dict',
-    'model_to_yaml',
-    'number',
-    'numbers',
-    'plain',
-]
-
 SCHEMA_VERSION = 1
 #: effects of a model, and coefficients of G, whose roots cost their third power
 EFFECTS, ORDER = 50, 200

@@ -35,17 +35,6 @@ from piezo_ident.record.gaps import bridged, connected_pieces
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
-__all__ = [
-    'FreeRun',
-    'FreeRunErrors',
-    'PieceRun',
-    'free_run',
-    'piece_runs',
-    'predict',
-    'run_pieces',
-    'same_part_errors',
-]
-
 
 @dataclass(frozen=True)
 class FreeRunErrors:

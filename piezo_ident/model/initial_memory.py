@@ -35,16 +35,6 @@ from piezo_ident.record.gaps import connected_pieces
 from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
 
-__all__ = [
-    'crept',
-    'early_part',
-    'fit_start',
-    'forgetting',
-    'forgotten',
-    'is_at_rest',
-    'unknown_starts',
-]
-
 #: share of its range that the voltage must sweep until the start is forgotten
 SHARE = 0.98
 #: share of a lag's start that may be left where it is forgotten

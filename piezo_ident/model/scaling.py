@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 
-__all__ = ['Scaling']
-
 
 @dataclass(frozen=True)
 class Scaling:

@@ -30,15 +30,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.record.record import Fault, Piece, Record
 
-__all__ = [
-    'Converter',
-    'Sensor',
-    'SimulatedStage',
-    'StageRun',
-    'seed_of',
-    'stage_from_dict',
-]
-
 _SENSOR = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
 
 

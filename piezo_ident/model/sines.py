@@ -15,8 +15,6 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 
-__all__ = ['SineError', 'sine_errors', 'sine_frequency', 'sines_of']
-
 #: what is dropped at the start of a sine: this time and at least one period [s]
 SETTLING = 1.0
 

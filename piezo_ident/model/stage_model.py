@@ -34,8 +34,6 @@ from piezo_ident.record.record import Piece, Record
 if TYPE_CHECKING:
     from piezo_ident import Inverse
 
-__all__ = ['EffectSetting', 'StageModel']
-
 #: share of the identified range below which a wrong unit is likelier than a small signal
 FAINT = 2e-3
 

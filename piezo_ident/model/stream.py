@@ -21,8 +21,6 @@ from piezo_ident.record.record import Piece
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
 
-__all__ = ['CHUNK', 'Start', 'StartLike', 'Stream']
-
 #: samples that pass the chain at once; small enough for the signals to stay in the cache
 CHUNK = 8192
 

@@ -43,8 +43,6 @@ from piezo_ident.model.simulated_stage import seed_of, SimulatedStage, stage_fro
 from piezo_ident.record.record import Piece, Record
 from scipy.linalg import expm
 
-__all__ = ['TwoAxisRun', 'TwoAxisStage', 'load_stage', 'two_axis_stage_from_dict']
-
 #: steps of the mechanics in a sample
 STEPS = 4
 _KEYS = ('axes', 'sample_rate', 'gain', 'modes', 'hysteresis', 'creep', 'noise_rms', 'seed')

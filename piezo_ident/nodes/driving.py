@@ -19,8 +19,6 @@ from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import LabNode
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
-__all__ = ['DRIVING', 'NOW', 'PERIOD', 'DrivingNode']
-
 #: period of the timer that waits, ramps and watches [s]
 PERIOD = 0.01
 #: states in which the node holds the right to drive, and what it does in them

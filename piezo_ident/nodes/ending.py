@@ -18,8 +18,6 @@ import sys
 import threading
 import time
 
-__all__ = ['ENDING', 'SIGNALS', 'Ending']
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -44,8 +44,6 @@ from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.channels import role_of
 
-__all__ = ['ExcitationNode']
-
 #: unit of a program, and what it is in SI
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
 #: most blocks that are sent at once after a delay

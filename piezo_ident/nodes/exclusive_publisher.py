@@ -16,8 +16,6 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['ExclusivePublisher']
-
 #: how long to listen whether somebody else drives [s]
 LISTEN = 0.5
 #: how long it may take to match all publishers [s]

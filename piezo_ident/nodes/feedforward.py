@@ -54,8 +54,6 @@ from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_messa
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['FeedforwardNode']
-
 #: parameters that are taken over between two references
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
 #: how long a stage may answer nothing to a reference that goes on, before it is told [s]

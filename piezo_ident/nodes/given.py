@@ -21,8 +21,6 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-__all__ = ['begin', 'home_problem', 'no_parameter', 'unknown_to']
-
 
 def begin() -> None:
     """

@@ -15,8 +15,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-__all__ = ['FromPackage', 'Journal', 'RecentFaults', 'one_line', 'shortened', 'shown']
-
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
 #: for how long the very same line is left out [s]

@@ -46,8 +46,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-__all__ = ['LabNode', 'guard_settings', 'run']
-
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 #: how long a thread may keep the interpreter while another one waits for it [s]
 SWITCH = 2e-4

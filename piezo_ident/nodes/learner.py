@@ -16,8 +16,6 @@ from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
-__all__ = ['Learner']
-
 #: how long to wait for the last displacement of a repetition [s]
 PATIENCE = 2.0
 

@@ -14,8 +14,6 @@ import importlib
 
 from piezo_ident.nodes.ending import ENDING
 
-__all__ = ['excitation', 'feedforward', 'identifier', 'model', 'player', 'recorder', 'stage']
-
 
 def _run(module: str, name: str) -> None:
     ENDING.listen()

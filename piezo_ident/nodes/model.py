@@ -23,8 +23,6 @@ from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['ModelNode']
-
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4

@@ -19,8 +19,6 @@ from piezo_ident.nodes.wire import LATCHED
 from rclpy.node import Node
 from std_msgs.msg import String
 
-__all__ = ['ModelLoader', 'no_file']
-
 T = TypeVar('T')
 
 

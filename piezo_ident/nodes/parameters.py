@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ['LATCHED_TOPICS', 'NODES', 'SAMPLE_TOPICS', 'Declaration']
-
 #: topics of blocks of samples, and of texts that a node that comes late must still hear
 SAMPLE_TOPICS = (
     'voltage',

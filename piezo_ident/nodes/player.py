@@ -31,8 +31,6 @@ from piezo_ident.record.bags.recover import Bag
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
-__all__ = ['PlayerNode', 'chosen_topics']
-
 #: how long the end of the node waits for the replay to end [s]
 PATIENCE = 1.0
 #: between the match of the subscribers and the first message, for them to know of it too [s]

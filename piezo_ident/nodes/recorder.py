@@ -30,8 +30,6 @@ from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
 
-__all__ = ['RecorderNode']
-
 #: how often the subscriptions are emptied [s]
 POLL = 0.02
 #: how often publishers are looked for [s]

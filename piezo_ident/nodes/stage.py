@@ -69,8 +69,6 @@ from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['StageNode']
-
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
 #: how long a block waits for that of a further axis [s]

@@ -32,15 +32,6 @@ from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from std_msgs.msg import Float64MultiArray
 
-__all__ = [
-    'DEPTH',
-    'BlockSubscriptions',
-    'RawSubscriptions',
-    'between_turns',
-    'message_class',
-    'topics_problem',
-]
-
 #: messages that a subscription keeps until it is emptied: five seconds of blocks
 DEPTH = 1000
 

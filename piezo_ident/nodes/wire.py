@@ -14,16 +14,6 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
-__all__ = [
-    'LATCHED',
-    'PREVIEW',
-    'SERVICE',
-    'STREAM',
-    'from_message',
-    'publisher_ids',
-    'to_message',
-]
-
 #: most samples of a block, and characters of a label
 MOST, LONGEST = 100_000, 200
 

@@ -20,8 +20,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import path_lines
 
-__all__ = ['CCode', 'Numbers', 'delay_in_c', 'dynamics_in_c', 'hysteresis_in_c']
-
 #: constants of an operator by name
 Numbers = dict[str, float | int | Array]
 

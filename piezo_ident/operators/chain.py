@@ -17,8 +17,6 @@ from typing import Literal, Protocol
 
 from piezo_ident.common.arrays import Array
 
-__all__ = ['Block', 'Chain', 'Operator', 'Slot']
-
 #: the slots of a chain for effects, in the order of the signal
 Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 

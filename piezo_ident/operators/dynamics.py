@@ -24,8 +24,6 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import dynamics as run_dynamics
 from piezo_ident.operators.sections import run_sections, sections_at_rest, sections_of
 
-__all__ = ['Delay', 'DelayOperator', 'Dynamics', 'DynamicsOperator', 'Mode', 'filter_arx']
-
 #: longest pure delay that a model may have [samples]
 MAX_DELAY = 1_000_000
 #: upper limit of `Dynamics.memory` [samples], longer than any record

@@ -37,8 +37,6 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import hysteresis, relaxing, wide_hysteresis
 from piezo_ident.operators.play import initial_memory
 
-__all__ = ['LANES', 'Hysteresis', 'HysteresisOperator']
-
 #: powers t^2 .. t^4 that a curve of a play may have
 POWERS = 3
 #: plays that run side by side in vector lanes; idle ones make up a multiple of it

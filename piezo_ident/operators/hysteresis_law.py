@@ -34,8 +34,6 @@ from piezo_ident.operators.hysteresis import Hysteresis, POWERS
 from piezo_ident.operators.play import play_columns
 from scipy.optimize import lsq_linear
 
-__all__ = ['LAWS', 'HysteresisLaw', 'LawName']
-
 LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'any']
 #: those that a stage may have, from the narrowest to the widest
 LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach', 'duhem')

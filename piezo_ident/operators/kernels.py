@@ -26,19 +26,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
-__all__ = [
-    'cascade',
-    'curve',
-    'curve_slope',
-    'dynamics',
-    'held',
-    'hysteresis',
-    'path_lines',
-    'plays',
-    'relaxing',
-    'wide_hysteresis',
-]
-
 #: samples that pass the loops while they are in the cache
 STRETCH = 1024
 

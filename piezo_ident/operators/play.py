@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.operators.kernels import plays
 
-__all__ = ['initial_memory', 'play_columns']
-
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> Array:
     """

@@ -17,8 +17,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, ordered_kernel
 
-__all__ = ['rounding_of', 'run_sections', 'sections_at_rest', 'sections_of']
-
 #: share of the output that eq. (5) may lose by rounding
 LOST = 2e-14
 #: difference of the static gain of sections from that of G, and of their products from B and A, as

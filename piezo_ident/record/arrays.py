@@ -28,8 +28,6 @@ from piezo_ident.record.columns import choose, RecordTable
 from piezo_ident.record.mat_read import flat, read_variables
 from piezo_ident.record.options import ReadOptions
 
-__all__ = ['read_hdf5', 'read_mat', 'read_npz', 'read_parquet', 'read_tdms']
-
 _LABELS = ('segment_name', 'segment_start')
 _USED = '[tvy]|[vyx]_.+|segment_name|segment_start'
 _HDF5 = b'\x89HDF\r\n\x1a\n'

@@ -26,8 +26,6 @@ from piezo_ident.record.ordering import at_times, in_order, OrderedRows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 from piezo_ident.record.rounded_time import unrounded
 
-__all__ = ['SegmentStarts', 'assemble', 'label_runs']
-
 #: label of each stretch and the row at which it begins; it lasts until the next begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
 

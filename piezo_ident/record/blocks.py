@@ -26,16 +26,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Segment
 
-__all__ = [
-    'BLOCK_SIZE',
-    'Dimension',
-    'Samples',
-    'cut_blocks',
-    'decode',
-    'encode',
-    'quantity_of',
-]
-
 #: samples in a block by default
 BLOCK_SIZE = 100
 

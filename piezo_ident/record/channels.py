@@ -27,17 +27,6 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.options import plain_unit, UNITS
 from piezo_ident.record.record import Piece, Record
 
-__all__ = [
-    'APPLIED',
-    'Axes',
-    'applied_key',
-    'channel_of_column',
-    'channel_of_quantity',
-    'column_of',
-    'quantity_of_channel',
-    'role_of',
-]
-
 #: what the amplifier of the first axis got; of another one with its name behind it
 APPLIED = 'applied_voltage'
 _QUANTITIES = {'v': 'voltage', 'y': 'displacement'}

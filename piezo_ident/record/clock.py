@@ -22,18 +22,6 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.scatter import residual_of, scatters, without_scatter
 
-__all__ = [
-    'JUMP_BACK',
-    'Clock',
-    'Resolution',
-    'fit_clock',
-    'has_restarted',
-    'nice_rates',
-    'rate_bounds',
-    'split_uniform',
-    'time_stamps',
-]
-
 #: rows looked at together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
 #: a clock that goes back by more samples than this (ten blocks) has restarted

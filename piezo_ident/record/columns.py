@@ -26,8 +26,6 @@ from piezo_ident.record.channels import channel_of_column, role_of
 from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
 from piezo_ident.record.record import Fault
 
-__all__ = ['RecordTable', 'choose', 'listed']
-
 _QUANTITIES = {'t': 'time', 'v': 'voltage', 'y': 'displacement'}
 _WORDS = {
     't': 't time times zeit timestamp elapsed temps tiempo',

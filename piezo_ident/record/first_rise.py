@@ -14,8 +14,6 @@ import numpy as np
 from piezo_ident.common.arrays import true_runs
 from piezo_ident.record.record import Piece
 
-__all__ = ['rises_first']
-
 #: share of the voltage's range within which it rests where it began
 NEAR = 0.005
 #: seconds and samples of a rest, at least

@@ -26,8 +26,6 @@ from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.tables import Blocks, blocks_of, labels_of, write_mat, write_npz
 from piezo_ident.record.text_table import read_text, write_csv
 
-__all__ = ['READERS', 'WRITERS', 'read', 'write', 'write_columns']
-
 READERS: Mapping[str, Callable[[Path, ReadOptions], RecordTable]] = {
     **dict.fromkeys(('.csv', '.txt', '.tsv', '.dat', '.lvm', '.asc'), read_text),
     '.npz': read_npz,

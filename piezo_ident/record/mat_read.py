@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.files import UNPACKED_SIZE
 
-__all__ = ['flat', 'read_variables']
-
 #: columns of a matrix, and structs of an array of them, at most
 WIDTH = 32
 

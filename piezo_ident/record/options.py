@@ -15,8 +15,6 @@ import unicodedata
 
 from piezo_ident.common.errors import DataError, expect
 
-__all__ = ['UNITS', 'ReadOptions', 'parse_columns', 'plain_unit', 'scaled_unit', 'unit_factor']
-
 #: how many of a unit make a second, a volt and a metre
 UNITS: Mapping[str, Mapping[str, float]] = {
     't': {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9, 'min': 1 / 60},

@@ -21,8 +21,6 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
 
-__all__ = ['OrderedRows', 'at_times', 'in_order']
-
 #: time may jump back in a record only between stretches of at least this many samples
 MIN_STRETCH = 10
 #: rows that start over and equal the old ones for longer than this are another run

@@ -20,8 +20,6 @@ from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Fault, Piece, Record
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-__all__ = ['with_quiet_voltage']
-
 #: samples of a window, and the share of the windows that may be quieter than the noise
 WINDOW, QUIET = 100, 10.0
 #: width of the play, in standard deviations of the noise

@@ -22,8 +22,6 @@ from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
 
-__all__ = ['KINDS', 'Fault', 'Piece', 'Record', 'Segment', 'records_of']
-
 #: the segment kinds that the programs use; other labels are kept and treated as unlabelled
 KINDS = (
     'step',

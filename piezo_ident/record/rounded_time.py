@@ -16,8 +16,6 @@ from piezo_ident.record.clock import nice_rates, rate_bounds, Resolution, time_s
 from piezo_ident.record.ordering import OrderedRows
 from piezo_ident.record.record import Fault
 
-__all__ = ['unrounded']
-
 #: by chance, a rate of so few digits lies within the bounds this seldom
 CHANCE = 0.1
 

@@ -16,8 +16,6 @@ from collections.abc import Iterator
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, true_runs
 
-__all__ = ['residual_of', 'scatters', 'without_scatter']
-
 #: fewer stamps tell no scatter from a change
 _LEAST = 16
 #: steps on either side over which time is averaged, so that scatter goes and a lost sample stays

@@ -19,8 +19,6 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.blocks import Samples
 
-__all__ = ['SPOOLED', 'BlockStream', 'LossCount']
-
 #: samples in a chunk of a stream
 CHUNK = 1 << 16
 #: samples that a spooled stream keeps in memory

@@ -19,8 +19,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.record.channels import column_of
 from piezo_ident.record.record import Record
 
-__all__ = ['ROWS', 'Blocks', 'blocks_of', 'labels_of', 'write_mat', 'write_npz']
-
 #: yields the columns block by block, each time it is called
 Blocks = Callable[[], Iterator[Mapping[str, Array]]]
 

@@ -17,8 +17,6 @@ import re
 
 from piezo_ident.record.options import plain_unit, UNITS
 
-__all__ = ['COMMENT', 'Layout', 'cells_of', 'find_layout', 'is_number']
-
 #: how comments begin, in the field's programs
 COMMENT = ('#', '%', '//', '!')
 

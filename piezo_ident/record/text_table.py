@@ -26,8 +26,6 @@ from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.tables import Blocks, ROWS
 from piezo_ident.record.text_layout import COMMENT, find_layout, is_number, Layout
 
-__all__ = ['read_text', 'write_csv']
-
 #: lines in which the table begins
 HEAD = 1000
 #: what programs write where there is no number, in lower case

@@ -30,13 +30,6 @@ from piezo_ident.report.table import (
 )
 from piezo_ident.residual.reversals import Way, ways
 
-__all__ = [
-    'brief_table',
-    'diagnosis_page',
-    'diagnosis_text',
-    'headline',
-]
-
 #: columns of every table of errors
 STATES = ('as given', 'H refitted', 'refined')
 #: what the source of a noise floor that is unknown may begin with

@@ -29,8 +29,6 @@ from piezo_ident.report.to_json import to_json
 if TYPE_CHECKING:
     from piezo_ident.report.figures.style import Drawn
 
-__all__ = ['PICTURES', 'check_report_folder', 'write_report']
-
 PAGE, MODEL = 'report.html', 'model.yaml'
 #: the numbers, by which an earlier report is known
 NUMBERS: Mapping[type, str] = {

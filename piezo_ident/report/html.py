@@ -17,8 +17,6 @@ from piezo_ident.report.table import Table
 if TYPE_CHECKING:
     import jinja2
 
-__all__ = ['Box', 'Page', 'Section', 'Shown', 'named', 'page_html', 'pairs', 'summary_html']
-
 #: size on the screen of a pixel of a picture: the letters of both then have one size
 SHOWN = 0.72
 #: a narrow screen shows a picture no smaller than this share of its width, and scrolls

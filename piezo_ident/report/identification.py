@@ -27,14 +27,6 @@ from piezo_ident.report.table import (
     table,
 )
 
-__all__ = [
-    'brief_table',
-    'headline',
-    'identification_page',
-    'identification_text',
-    'table_one',
-]
-
 #: how a headline begins, by the kind of data that it is about
 ABOUT = {
     'validation': 'On {records}, recorded for validation',

@@ -18,8 +18,6 @@ from piezo_ident.record.record import Record
 from piezo_ident.report.refined import changes
 from piezo_ident.report.table import listed, number
 
-__all__ = ['Prompt', 'Step', 'next_steps']
-
 #: an error of so many times the sensor noise leaves little to find
 ENOUGH = 2.0
 #: the programs of the experiments

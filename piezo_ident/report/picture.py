@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     Result = Identification | Diagnosis | FreeRun | Inverse
 
-__all__ = ['plot', 'save_plot', 'to_html', 'to_text']
-
 #: endings that a picture may have
 ENDINGS = ('.png', '.pdf', '.svg')
 #: dots an inch on a screen

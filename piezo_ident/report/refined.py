@@ -18,8 +18,6 @@ from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report.table import number
 
-__all__ = ['changes', 'law_told', 'validated']
-
 
 def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
     """

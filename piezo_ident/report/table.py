@@ -10,18 +10,6 @@ from dataclasses import dataclass
 import math
 import textwrap
 
-__all__ = [
-    'FAULTS',
-    'Table',
-    'length',
-    'listed',
-    'number',
-    'origin_tables',
-    'plain_text',
-    'share_text',
-    'table',
-]
-
 #: of a terminal [characters]
 WIDTH = 99
 #: columns of a table of faults in the data

@@ -30,8 +30,6 @@ from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from piezo_ident.report.identification import headline
 
-__all__ = ['diagnosis_schema', 'json_text', 'steps_to_json', 'to_json']
-
 VERSION = {'schema_version': 1, 'package_version': __version__}
 
 

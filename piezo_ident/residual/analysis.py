@@ -18,8 +18,6 @@ from piezo_ident.residual.lines import find_lines, Line, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
-__all__ = ['ResidualAnalysis', 'analyse']
-
 
 @dataclass(frozen=True, eq=False)
 class ResidualAnalysis:

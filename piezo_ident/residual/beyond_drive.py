@@ -16,8 +16,6 @@ from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
-__all__ = ['ChannelTest', 'channel_tests', 'drive_functions', 'without_channels', 'without_drive']
-
 #: rate of the means that are looked at [Hz]
 RATE = 2500.0
 #: plays of the drive, and of a channel, as shares of the range

@@ -14,8 +14,6 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.stretches import ResidualPart
 from scipy import fft, signal
 
-__all__ = ['Coherence', 'coherence', 'cross_spectra']
-
 #: samples whose segments are transformed at once
 TOGETHER = 1 << 18
 #: of the bound

@@ -12,8 +12,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 
-__all__ = ['Curve', 'curves_of']
-
 #: samples after averaging, bins of a curve, bins a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
 #: stretches of time that count as independent: so many, but none shorter than this [s]

@@ -17,8 +17,6 @@ from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-__all__ = ['FaultSearch', 'find_faults']
-
 #: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
 CHANCE, MOVED = 0.01, 3e-5
 #: repeats in a moving signal: at least so many, and this share of the samples that move

@@ -18,8 +18,6 @@ from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-__all__ = ['FAINT', 'FEWEST', 'Series', 'Spectrum', 'series_of']
-
 #: the search goes to this share of half the rate after averaging, which is about this rate [Hz]
 TOP, RATE = 0.8, 2500.0
 #: shortest stretch that is looked at [s]

@@ -23,8 +23,6 @@ from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
 
-__all__ = ['Line', 'LineSearch', 'find_lines', 'without_lines']
-
 #: most lines that are looked for
 LINES = 6
 #: chance of one false line in a search

@@ -13,8 +13,6 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
-__all__ = ['NoiseFloor', 'residual_noise_floor']
-
 #: a frame of differences is freed of a slow change of this order
 ORDER = 3
 #: shortest frame [s]: slower changes count as drift

@@ -13,8 +13,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.residual.stretches import block_means
 
-__all__ = ['EDGES', 'Way', 'turns_of', 'ways']
-
 #: edges of the stretches behind a turn, shares of the voltage range
 EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.01)
 #: a change of direction counts from this share of the range: noise turns all the time

@@ -21,18 +21,6 @@ from scipy.ndimage import (
     uniform_filter1d,
 )
 
-__all__ = [
-    'ResidualPart',
-    'Stretch',
-    'all_stretches',
-    'block_means',
-    'find_repeats',
-    'rests',
-    'stretches_of',
-    'strokes_of',
-    'without_spikes',
-]
-
 #: bad samples in a row that say nothing of their neighbours
 SPIKE = 3
 #: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]

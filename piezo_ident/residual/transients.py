@@ -14,8 +14,6 @@ from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, s
 from scipy import stats
 from scipy.ndimage import median_filter, uniform_filter1d
 
-__all__ = ['Transients', 'transients_in']
-
 #: time over which power is averaged, and over which what is slow is taken away [s]
 SHORT, SLOW = 0.004, 0.04
 #: power that a knock has at least, as a multiple of the usual

@@ -30,8 +30,6 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-__all__ = ['ENDS', 'Observer']
-
 #: a question that may have been lost with a dead node is asked again after this time [s]
 AGAIN = 5.0
 #: states in which a node has ended what it was asked for

@@ -18,18 +18,6 @@ import sys
 import tempfile
 from typing import Any, IO
 
-__all__ = [
-    'LIMIT',
-    'Handle',
-    'Late',
-    'alive',
-    'best_of_three',
-    'crowd',
-    'in_time',
-    'listens',
-    'take_domain',
-]
-
 #: what has not happened within this time will not happen [s]; the machine may be busy
 LIMIT = 60.0
 #: domains whose ports are clear of the system's own

@@ -13,8 +13,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear
 
-__all__ = ['bounded_least_squares', 'singular_is_ours', 'triangular_factor']
-
 #: rows that are factorised at once: a block of some dozen columns stays in the cache
 ROWS = 1024
 

@@ -23,8 +23,6 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
-__all__ = ['OutputErrorFit', 'lag_products', 'output_error', 'simulation_error']
-
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
 #: samples whose products are summed at once

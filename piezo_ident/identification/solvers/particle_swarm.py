@@ -25,8 +25,6 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.kernel import kernel
 from scipy.optimize import OptimizeResult
 
-__all__ = ['Quadratic', 'particle_swarm']
-
 #: constriction factor and attraction of Clerc and Kennedy
 CHI = 0.7298
 ATTRACTION = 1.49618

@@ -17,8 +17,6 @@ from piezo_ident.common.process import Tick
 from piezo_ident.live.capture import Snapshot
 from piezo_ident.nodes.identifier.jobs import IdentificationOutcome
 
-__all__ = ['MODEL_FILE', 'identify_axes_capture', 'save_axes']
-
 #: what ~/save writes into its folder
 MODEL_FILE = 'axes_model.yaml'
 

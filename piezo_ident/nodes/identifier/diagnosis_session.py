@@ -17,8 +17,6 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 
-__all__ = ['DiagnosisSession', 'Host']
-
 
 class Host(Protocol):
     """What a session needs from its node."""

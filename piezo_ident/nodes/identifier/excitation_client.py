@@ -18,8 +18,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-__all__ = ['ExcitationClient', 'Streams']
-
 #: states of the excitation in which it has ended, one way or the other, or not begun
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 #: before the first word since it was asked to start: what it said of an earlier run says nothing

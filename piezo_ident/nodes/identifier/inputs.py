@@ -19,8 +19,6 @@ from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantit
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-__all__ = ['Inputs']
-
 #: quantities that a topic may say it carries, beside its own name
 _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 

@@ -30,18 +30,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import headline, json_text, steps_to_json, write_report
 
-__all__ = [
-    'DiagnosisOutcome',
-    'IdentificationOutcome',
-    'diagnose_capture',
-    'identify_capture',
-    'percent_of',
-    'records_of_runs',
-    'save',
-    'settings_of',
-    'warm_up',
-]
-
 #: the shortest program that all three steps take
 _SMALL = """
 limits: [0, 10]

@@ -40,8 +40,6 @@ from piezo_ident.nodes.subscriptions import topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from std_msgs.msg import String
 
-__all__ = ['IdentifierNode']
-
 Result = IdentificationOutcome | DiagnosisOutcome | str
 
 #: how often the run of the excitation is looked at [s]

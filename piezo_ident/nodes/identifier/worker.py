@@ -13,8 +13,6 @@ from typing import Any
 from piezo_ident.common.errors import Cancelled, PiezoIdentError
 from piezo_ident.common.process import Job, WorkerProcess
 
-__all__ = ['Worker']
-
 #: time between two reports of progress [s]
 EVERY = 0.1
 

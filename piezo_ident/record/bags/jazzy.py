@@ -20,8 +20,6 @@ from piezo_ident.common.files import write_text
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import storage_mcap, StoragePlugin, Writer
 
-__all__ = ['DISTRIBUTION', 'JazzyWriter']
-
 #: that the message types are of
 DISTRIBUTION = 'jazzy'
 

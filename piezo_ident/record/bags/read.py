@@ -39,15 +39,6 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-__all__ = [
-    'MESSAGE_TYPE',
-    'carried_quantities',
-    'is_computed',
-    'opened_bag',
-    'read_bag',
-    'typestore',
-]
-
 MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
 
 

@@ -34,15 +34,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import parse_qos
 
-__all__ = [
-    'Bag',
-    'Stored',
-    'damage_as_data_error',
-    'is_unfinished',
-    'metadata',
-    'recovered_bag',
-]
-
 #: first and last bytes of an mcap file
 _MAGIC = b'\x89MCAP0\r\n'
 _SIDECARS = ('-journal', '-wal')

@@ -37,8 +37,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.errors import WriterError
 
-__all__ = ['SAMPLE_QOS', 'STORAGES', 'BagWriter', 'knows_type', 'write_bag']
-
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 #: how many numbered names are tried
 NAMES = 10_000

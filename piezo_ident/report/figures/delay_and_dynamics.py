@@ -23,8 +23,6 @@ from piezo_ident.model.free_run import PieceRun
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
-__all__ = ['delay_figure', 'orders_figure', 'response_figure']
-
 #: samples shown ahead of the delay, and behind it
 BEFORE, AFTER = 10, 15
 #: an error this many times the best ends the colour scale of the orders

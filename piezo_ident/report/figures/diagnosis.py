@@ -26,8 +26,6 @@ from piezo_ident.report.figures.residual import (
 from piezo_ident.report.figures.style import NothingToDraw, tidy
 from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
 
-__all__ = ['draw_diagnosis', 'errors_figure', 'worst_pieces']
-
 #: at most so many pieces get a picture of their own
 TRACES = 4
 #: segments that are shown, at most

@@ -12,8 +12,6 @@ from piezo_ident.control.inverse import Inverse
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, tidy
 
-__all__ = ['drive_figure']
-
 
 def drive_figure(drive: Inverse) -> Figure:
     """Draw voltage, wanted and predicted displacement, and their difference, over time."""

@@ -17,8 +17,6 @@ from piezo_ident.record.record import Record, Segment
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 
-__all__ = ['loops_figure', 'overview_figure', 'record_figure', 'segments_figure', 'sines_figure']
-
 #: segments shown side by side, and in which order they are chosen
 CELLS = 8
 ORDER = ('sine', 'staircase', 'hold', 'multisine', 'triangle', 'noise', 'step')

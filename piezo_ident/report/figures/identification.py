@@ -26,8 +26,6 @@ from piezo_ident.report.figures.free_run import (
 from piezo_ident.report.figures.style import draw_each, Drawn, Wanted
 from piezo_ident.report.table import number
 
-__all__ = ['draw_identification']
-
 #: at most so many records get a picture of their own
 OVERVIEWS = 4
 

@@ -19,16 +19,6 @@ from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
 from scipy import signal
 
-__all__ = [
-    'STATES',
-    'UNSHADED',
-    'differ',
-    'residual_coherence_figure',
-    'residual_dependence_figure',
-    'residual_figure',
-    'residual_spectrum_figure',
-]
-
 #: attribute of `Residual`, name, colour
 STATES = (
     ('given', 'as given', '#9A9A9A'),

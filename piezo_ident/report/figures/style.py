@@ -22,31 +22,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 
-__all__ = [
-    'COLOURS',
-    'Drawn',
-    'NothingToDraw',
-    'Picture',
-    'Wanted',
-    'axis_limit',
-    'draw_each',
-    'envelope',
-    'figure',
-    'legend',
-    'legend_above',
-    'length_unit',
-    'line',
-    'log_range',
-    'name_above',
-    'note',
-    'percent_axis',
-    'plain_log',
-    'png',
-    'safe',
-    'symmetric',
-    'tidy',
-]
-
 # Okabe and Ito's palette: told apart with every common colour vision, and by lightness in grey
 BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
 GREEN, ORANGE, PURPLE = '#009E73', '#E69F00', '#CC79A7'
