@@ -7,9 +7,8 @@ How often a diagnosis is right on stages that are no sums of plays.
     python benchmarks/study_foreign.py --set tuning docs/diagnosis_study_foreign.md
 
 Every case: a stage from `foreign`, identified from one record, diagnosed on another and judged on
-a third that nothing saw.  The sets `known`, `former` and `past` were the final ones once, in this
-order, and may be looked at since; nothing may be tuned on the laws of `final`.  One case in
-Python:
+a third that nothing saw.  The sets `tuning` and `known` may be looked at; nothing may be tuned on
+the laws of `final`.  One case in Python:
 
     from study_foreign import case_records, judged
     records = case_records(draw('tuning', 7))

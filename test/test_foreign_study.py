@@ -12,12 +12,10 @@ from foreign import (
     case,
     cores,
     families,
-    fresh_cores,
     make_stage,
     record_motion,
     references,
     sealed_cores,
-    unseen_cores,
 )
 from foreign.sizes import size_of
 from foreign.stage import Linear, make_core
@@ -66,7 +64,7 @@ def test_preisach_operator_is_the_sum_of_its_relays(monkeypatch):
     assert found == pytest.approx(np.array(expected), abs=1.0 / fine)
 
 
-@pytest.mark.parametrize('group', ['tuning', 'known', 'former', 'past', 'final'])
+@pytest.mark.parametrize('group', ['tuning', 'known', 'final'])
 def test_cores_are_those_of_piezos(group):
     for name in dict.fromkeys(families.SETS[group]):
         core = make_core(name, np.random.default_rng(5))
@@ -95,201 +93,13 @@ def tour(levels, count=400, bend=1.0):
 ROUND = [0.0, 1.0, 0.0, 0.6, 0.3, 0.6, 1.0, 0.0]
 
 
-@pytest.mark.parametrize('group', ['former', 'past', 'final'])
-def test_laws_know_no_time(group):
+def test_laws_of_the_final_set_know_no_time():
     levels = [*ROUND, *np.random.default_rng(2).uniform(0.0, 1.0, 20)]
-    for name in dict.fromkeys(families.SETS[group]):
+    for name in families.SETS['final']:
         law = families.LAWS[name](np.random.default_rng(5))
         (slow, at), (fast, then) = tour(levels, 1200), tour(levels, 150, 1.7)
         z = law(slow)[at]
         assert law(fast)[then] == pytest.approx(z, abs=1e-5 * np.ptp(z)), name
-
-
-def test_strain_is_exponential_in_a_stress_that_fades():
-    limit, most, fading = 0.1, 1.2, 3.0
-    one = np.ones(1)
-    u, at = tour(ROUND)
-    z = unseen_cores.back_stresses_of(
-        0.0, limit * one, 0.0 * one, most * one[None], fading * one[None], one
-    )(u)
-    rise, turned = u[: at[1] + 1], np.maximum(u[at[1] : at[2] + 1] + limit, limit)
-    expected = -np.log(1.0 - np.maximum(rise - limit, 0.0) / most) / fading
-    assert z[: at[1] + 1] == pytest.approx(expected, abs=1e-9)
-    # X begins at 1 - limit, and there is no strain until u + limit is less
-    gone = np.log((1.0 - limit + most) / (np.minimum(turned, 1.0 - limit) + most)) / fading
-    assert z[at[1] : at[2] + 1] == pytest.approx(z[at[1]] - gone, abs=1e-9)
-    # every loop goes on
-    assert z[at[5]] - z[at[3]] > 1e-3
-    nothing = np.zeros((1, 1))
-    play = unseen_cores.back_stresses_of(0.0, limit * one, 2.0 * one, nothing, nothing, one)(u)
-    own = 0.5 * (cores.play(u, 2 * limit) + limit)
-    assert play[at[1] :] == pytest.approx(own[at[1] :], abs=1e-12)
-
-
-def test_domains_grow_cell_by_cell():
-    rng, count = np.random.default_rng(7), 300
-    middle, half = rng.uniform(0.0, 1.0, count), rng.uniform(0.02, 0.2, count)
-    grow = np.stack([middle + half, middle - half])
-    alone = grow + np.array([[1.0], [-1.0]]) * rng.exponential(0.3, (2, count))
-    u, at = tour([*ROUND, *rng.uniform(0.0, 1.0, 8)], 100)
-    for begin in (alone, grow):
-        up, expected = np.zeros(count, dtype=bool), []
-        for x in u:
-            before = None
-            while before is None or (before != up).any():
-                before = up
-                risen, fallen = (np.roll(z, 1) | np.roll(z, -1) for z in (up, ~up))
-                rises = x >= np.where(risen, grow[0], begin[0])
-                falls = x <= np.where(fallen, grow[1], begin[1])
-                up = np.where(up, ~falls, rises)
-            expected.append(up.mean())
-        z = unseen_cores.growing_domains_of(grow, begin)(u)
-        assert z == pytest.approx(np.array(expected), abs=1e-12)
-        assert z[at[5]] == z[at[3]]
-    # with one place to begin, and none to end, a domain comes as far as the first pins
-    begin = np.stack([np.full(count, np.inf), np.full(count, -np.inf)])
-    begin[0, 0] = 0.2
-    grow[0, 0] = 0.2
-    z = unseen_cores.growing_domains_of(grow, begin)(np.array([0.0, 0.19, 0.6, 0.8]))
-    assert z[1] == 0.0
-    for x, share in zip((0.6, 0.8), z[2:], strict=True):
-        ahead = np.argmax(grow[0] > x)
-        behind = np.argmax(grow[0, ::-1] > x)
-        assert share == pytest.approx((ahead + behind) / count)
-
-
-def test_a_turn_scales_what_is_left_of_a_phase():
-    rise, fall, broad = 0.6, 0.35, 0.05
-    turns = np.array([[rise], [fall]])
-    law = unseen_cores.phase_fractions_of(turns, np.array([broad]), np.ones(1))
-    u, at = tour([-1.0, 0.6, 0.3, 0.6])
-    z = law(u)
-    up, down = 1.0 / (1.0 + np.exp((rise - u) / broad)), 1.0 / (1.0 + np.exp((fall - u) / broad))
-    first, second, third = (slice(at[i], at[i + 1] + 1) for i in range(3))
-    assert z[first] == pytest.approx(up[first], abs=1e-9)
-    assert z[second] == pytest.approx(0.5 * down[second] / down[at[1]], abs=1e-9)
-    missing = (1.0 - z[at[2]]) * (1.0 - up[third]) / (1.0 - up[at[2]])
-    assert z[third] == pytest.approx(1.0 - missing, abs=1e-9)
-    assert z[at[3]] - z[at[1]] > 0.05
-
-
-def test_moments_turn_to_the_field_and_jump():
-    one, reach = np.ones(1), (-2.0, 2.0)
-    u, at = tour([-2.0, 2.0, -2.0, 0.5], 1000)
-    # along the field a relay, across it no hysteresis
-    relay = unseen_cores.rotating_grains_of(0.0 * one, 0.8 * one, 0.1 * one, reach)(u)
-    first, second = u[: at[1]], u[at[1] : at[2]]
-    assert relay[: at[1]] == pytest.approx(np.where(first >= 0.7, 1.0, -1.0))
-    assert relay[at[1] : at[2]] == pytest.approx(np.where(second <= -0.9, -1.0, 1.0))
-    across = unseen_cores.rotating_grains_of(0.499 * np.pi * one, one, 0.0 * one, reach)(u)
-    assert across == pytest.approx(np.clip(u, -1.0, 1.0), abs=0.02)
-    # it jumps at the astroid, and rests where no torque is
-    for degrees, fold in ((15, 0.6147), (45, 0.5), (75, 0.6147)):
-        axis = np.radians(degrees)
-        z = unseen_cores.rotating_grains_of(axis * one, one, 0.0 * one, reach)(u)
-        steps = np.diff(z[: at[1] + 1])
-        assert u[np.argmax(steps) + 1] == pytest.approx(fold, abs=0.005)
-        upper = slice(at[1], at[1] + 600)
-        angle = np.arccos(z[upper])
-        torque = 0.5 * np.sin(2.0 * (angle - axis)) + u[upper] * np.sin(angle)
-        assert np.abs(torque).max() < 2e-3
-
-
-def test_a_grain_switches_where_the_work_is_enough():
-    along, u = np.array([[1.0, 0.0, 0.0]]), np.array([0.0, 0.69, 0.71, 0.51, 0.49, 0.31, 0.29])
-    # stress takes it to an axis across the field: +0.5 for 0 -> 1 beside the work of 0.2
-    stress, own = np.array([-0.5]), np.zeros(1)
-    for opposing, last in ((0.0, [1, 1, 1, 0]), (0.2, [1, 0, 0, 0])):
-        law = unseen_cores.tetragonal_grains_of(along, stress, own, (0.2, 0.5), opposing)
-        assert law(u) == pytest.approx(np.array([0, 0, 1, *last]))
-    # many, against trying every switch
-    rng, count = np.random.default_rng(7), 60
-    along = rng.standard_normal((count, 3))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    stress, own = -np.abs(rng.normal(0.0, 0.5, count)), rng.normal(0.2, 0.3, count)
-    u = tour(ROUND, 100)[0]
-    moments = np.concatenate([along, -along], axis=1)
-    expected = np.zeros((u.size, count))
-    for i in range(count):
-        s = int(np.argmin(moments[i]))
-        for k, x in enumerate(u):
-            while True:
-                change, longer = moments[i] - moments[i, s], moments[i] ** 2 - moments[i, s] ** 2
-                work = np.where(np.arange(6) % 3 == s % 3, 0.15, 0.1)
-                size = np.where(np.arange(6) == s, 1e-9, np.abs(change))
-                spare = ((x + own[i]) * change + stress[i] * longer - work) / size
-                if spare.max() < 0.0:
-                    break
-                s = int(np.argmax(spare))
-            expected[k, i] = moments[i, s] ** 2
-    z = unseen_cores.tetragonal_grains_of(along, stress, own, (0.1, 0.15))(u)
-    assert z == pytest.approx(expected.mean(axis=1), abs=0.03)
-    assert np.median(np.abs(z - expected.mean(axis=1))) < 1e-12
-
-
-def test_a_turn_begins_the_loss_of_energy_anew():
-    # without a reversible field: u - 0.5 = m + loss, whose sign changes behind a turn
-    p = np.array([1.0, 0.0, 3.0, 0.1, 0.0, 50.0])
-    u, at = tour(ROUND)
-    m = cores.law_of(fresh_cores._energy_balance, 0.5, p)(u)
-    rise, fall = slice(at[2] + 320, at[3]), slice(at[1] + 200, at[2])
-    assert m[rise] == pytest.approx(u[rise] - 0.6, abs=1e-3)
-    assert m[fall] == pytest.approx(u[fall] - 0.4, abs=1e-3)
-    turned = m[at[1] : at[2]]
-    loss = 0.1 * (1.0 - 2.0 * np.exp(-25.0 * (turned[0] - turned)))
-    assert turned - loss == pytest.approx(u[at[1] : at[2]] - 0.5, abs=1e-3)
-
-
-def test_a_branch_goes_over_into_its_limiting_one():
-    u, at = tour(ROUND)
-    z = np.arctanh(cores.law_of(fresh_cores._limiting_loops, 0.5, 0.1, 1.5, 0.8)(u)) / 1.5
-    # 0.1 ahead at the turn, where 0.2 of the slope is left, and no more than 0.16 behind it
-    fall = slice(at[1], at[1] + 2)
-    assert np.diff(z[fall])[0] == pytest.approx(0.2 * np.diff(u[fall])[0], rel=0.05)
-    assert z[at[1] + 100 : at[2]] == pytest.approx(u[at[1] + 100 : at[2]] - 0.45, abs=1e-3)
-    assert z[at[2] + 150 : at[3]] == pytest.approx(u[at[2] + 150 : at[3]] - 0.55, abs=1e-3)
-
-
-def test_a_line_hops_from_pin_to_pin():
-    rng = np.random.default_rng(7)
-    at_pin = np.cumsum(rng.uniform(0.02, 0.06, (40, 25)), axis=1) - 0.1
-    strength = rng.uniform(0.05, 0.2, at_pin.shape)
-    u, at = tour(ROUND, 100)
-    for tension in (0.0, 0.5):
-        z = fresh_cores.pinned_line_of(at_pin, strength, tension)(u)
-        held = strength.copy()
-        gap = (0.5 + tension) * np.diff(at_pin, axis=1)
-        held[:, 1:] = np.maximum(held[:, 1:], gap)
-        held[:, :-1] = np.maximum(held[:, :-1], gap)
-        pin, sites = np.argmax(at_pin >= 0.0, axis=1), np.arange(40)
-        expected = []
-        for x in u:
-            moved = True
-            while moved:
-                here = at_pin[sites, pin]
-                pull = x - here + tension * (np.roll(here, 1) + np.roll(here, -1) - 2.0 * here)
-                up = (pull > held[sites, pin]) & (pin < 24)
-                down = (-pull > held[sites, pin]) & (pin > 0)
-                pin = pin + up - down
-                moved = (up | down).any()
-            expected.append(at_pin[sites, pin].mean())
-        assert z == pytest.approx(np.array(expected), abs=1e-12)
-        assert z[at[5]] == pytest.approx(z[at[3]], abs=1e-12)
-
-
-def test_strain_comes_nearer_to_its_bounding_line():
-    one = np.ones(1)
-    u, at = tour(ROUND, 4000)
-    z = cores.law_of(fresh_cores._bounding_lines, 0.5, 0.1 * one, 4.0 * one, one)(u)
-    fall = slice(at[1], at[2] + 1)
-    # the slope is 1 / (1 + hard gap / (first - gap))
-    gap = 0.1 - z[fall] + (u[fall] - 0.5)
-    slope = np.diff(z[fall]) / np.diff(u[fall])
-    middle = 0.5 * (gap[1:] + gap[:-1])
-    expected = (gap[0] - middle) / (gap[0] + 3.0 * middle)
-    assert slope == pytest.approx(expected, abs=0.01)
-    assert gap[0] == pytest.approx(0.2, abs=1e-3)
-    assert gap[-1] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_a_moment_follows_its_field_on_a_tractrix():

@@ -16,14 +16,14 @@ from .families import SETS
 from .motion import POORER
 
 #: how many cases a set has
-CASES = {'tuning': 72, 'known': 216, 'former': 216, 'past': 216, 'final': 216}
+CASES = {'tuning': 72, 'known': 216, 'final': 216}
 BLOCK = 24
 #: of a block: nothing hidden, pairs, faults of the data; the rest has one effect
 NOTHING, PAIRS, FAULTY = 6, 2, 2
 FAULTS = ('stuck', 'repeated', 'jitter', 'outliers', 'clipping')
 #: of those, which are common to effects that no record of some seconds tells from one another
 SAME = (('thermal_drift', 'gain_drift'), ('amplifier_lag', 'delay_change'))
-SEEDS = {'tuning': 15, 'known': 2800, 'former': 3600, 'past': 4100, 'final': 4700}
+SEEDS = {'tuning': 15, 'known': 2800, 'final': 4700}
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Case:
 
     Attributes
     ----------
-    group : {'tuning', 'known', 'former', 'past', 'final'}
+    group : {'tuning', 'known', 'final'}
     number : int
     core : str
     kind : {'none', 'one', 'pair', 'fault'}
@@ -101,7 +101,7 @@ def draw(group: str, number: int) -> Case:
 
     Parameters
     ----------
-    group : {'tuning', 'known', 'former', 'past', 'final'}
+    group : {'tuning', 'known', 'final'}
     number : int
         0 .. ``CASES[group] - 1``.
     """

@@ -13,7 +13,7 @@ is one of
 - the law of Bouc and Wen (Wen, J. Eng. Mech. 102 (1976) 249),
 - Duhem's equation in the form of Coleman and Hodgdon (Int. J. Eng. Sci. 24 (1986) 897).
 
-Further laws are in `more_cores`, `unseen_cores`, `fresh_cores` and `sealed_cores`.
+Further laws are in `more_cores` and `sealed_cores`.
 """
 
 from __future__ import annotations

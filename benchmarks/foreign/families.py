@@ -6,12 +6,6 @@
 from __future__ import annotations
 
 from .cores import bouc_wen, coleman_hodgdon, uneven
-from .fresh_cores import (
-    bounding_lines,
-    energy_balance,
-    limiting_loops,
-    pinned_line,
-)
 from .more_cores import (
     dahl,
     hills,
@@ -20,19 +14,7 @@ from .more_cores import (
     skewed_bouc_wen,
     turning_curves,
 )
-from .sealed_cores import (
-    dragged_moments,
-    gap_shares,
-    loaded_sliders,
-    random_bonds,
-)
-from .unseen_cores import (
-    back_stresses,
-    growing_domains,
-    phase_fractions,
-    rotating_grains,
-    tetragonal_grains,
-)
+from .sealed_cores import dragged_moments, gap_shares, loaded_sliders, random_bonds
 
 LAWS = {
     'preisach': uneven,
@@ -44,15 +26,6 @@ LAWS = {
     'skewed-bouc-wen': skewed_bouc_wen,
     'dahl': dahl,
     'turning-curves': turning_curves,
-    'back-stresses': back_stresses,
-    'growing-domains': growing_domains,
-    'phase-fractions': phase_fractions,
-    'rotating-grains': rotating_grains,
-    'tetragonal-grains': tetragonal_grains,
-    'bounding-lines': bounding_lines,
-    'energy-balance': energy_balance,
-    'limiting-loops': limiting_loops,
-    'pinned-line': pinned_line,
     'dragged-moments': dragged_moments,
     'gap-shares': gap_shares,
     'loaded-sliders': loaded_sliders,
@@ -71,23 +44,5 @@ SETS = {
         'dahl',
         'turning-curves',
     ),
-    'former': (
-        'back-stresses',
-        'growing-domains',
-        'phase-fractions',
-        'rotating-grains',
-        'tetragonal-grains',
-    ),
-    'past': (
-        'bounding-lines',
-        'energy-balance',
-        'limiting-loops',
-        'pinned-line',
-    ),
-    'final': (
-        'dragged-moments',
-        'gap-shares',
-        'loaded-sliders',
-        'random-bonds',
-    ),
+    'final': ('dragged-moments', 'gap-shares', 'loaded-sliders', 'random-bonds'),
 }

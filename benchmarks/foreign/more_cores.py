@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Laws of the known set, which the diagnosis was judged on before it was tuned on them.
+Laws of the known set, which the diagnosis may be tuned on.
 
 - Preisach operators whose relays lie in Gaussian and Lorentzian hills,
 - a few Krasnosel'skii-Pokrovskii kernels (Systems with Hysteresis, Springer 1989),
