@@ -20,6 +20,7 @@ from piezo_ident.axes.frequency_response import excited_lines, frequency_respons
 from piezo_ident.axes.linear_fit import refined
 from piezo_ident.axes.modal import Modal
 from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.common.arrays import Array
 
 #: modes nearer than this part of their frequency trade places from fit to fit: neither is followed
 APART = 0.02
@@ -46,9 +47,9 @@ class AmplitudeDependence:
     """
 
     groups: tuple[str, ...]
-    voltage: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    damping: NDArray[np.float64]
+    voltage: Array
+    frequency: Array
+    damping: Array
     models: tuple[Modal, ...]
 
 

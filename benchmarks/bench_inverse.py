@@ -19,8 +19,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 import piezo_ident as pi
+from piezo_ident.common.arrays import Array
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 from side_by_side import markdown, ratio, seconds, show, take_turns
@@ -36,8 +36,6 @@ EFFECTS = (
 RATE_DEPENDENT = EffectSetting(
     'rate_dependent_hysteresis', {'gain': 1e-4, 'exponent': 1.0, 'cutoff': 1000.0}
 )
-
-Array = NDArray[np.float64]
 
 
 def of_law(name: LawName, plain: StageModel) -> StageModel:

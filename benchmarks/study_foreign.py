@@ -37,7 +37,6 @@ from foreign.faults import NAMES, spoilt
 from foreign.references import basis, FORMS, remainder, ROWS
 from foreign.sizes import scaled
 import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.diagnosis import diagnose
 from piezo_ident.effects import find_effect
 from piezo_ident.excitation.program import parse_program
@@ -47,8 +46,6 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from study_rows import all_rows, section
 from truths import other_axis
-
-Array = NDArray[np.float64]
 
 #: in the data, not in the stage: they count whatever their size
 ADDED = ('periodic_disturbance', 'cross_coupling')

@@ -28,12 +28,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from amplitude_dependence import amplitude_dependence, AmplitudeDependence
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from piezo_ident.axes.explain import explain, Explanation, groups, Rival, Score, scores
 from piezo_ident.axes.linear_fit import choose_order
 from piezo_ident.axes.loop_fit import loop_fit
 from piezo_ident.axes.loop_model import LoopModel
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
+from piezo_ident.common.arrays import Array
 from piezo_ident.report.figures import style
 
 RATE = 6400.0
@@ -202,7 +202,7 @@ def table(explanation: Explanation) -> str:
     return '\n'.join(rows)
 
 
-def spectra(records: Sequence[PeriodicRecord], candidate: Rival | None) -> NDArray[np.float64]:
+def spectra(records: Sequence[PeriodicRecord], candidate: Rival | None) -> Array:
     """Return the power of the errors, or of the motion, by line, as a share of that of y."""
     total, power = 0.0, 0.0
     for record in records:
@@ -213,12 +213,12 @@ def spectra(records: Sequence[PeriodicRecord], candidate: Rival | None) -> NDArr
     return np.asarray(total / power)
 
 
-def noise_spectra(records: Sequence[PeriodicRecord]) -> NDArray[np.float64]:
+def noise_spectra(records: Sequence[PeriodicRecord]) -> Array:
     total = sum((np.abs(np.fft.rfft(r.noise, axis=0)) ** 2).sum(axis=1) for r in records)
     return total / sum((np.abs(np.fft.rfft(r.y[-1], axis=0)) ** 2).sum() for r in records)
 
 
-def in_bands(power: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_bands(power: Array, edges: Array) -> Array:
     """Return 100 times the rms in each band."""
     frequency = np.arange(len(power)) * RATE / 2 / (len(power) - 1)
     sums, _ = np.histogram(frequency, edges, weights=power)
@@ -227,7 +227,7 @@ def in_bands(power: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[
 
 def all_spectra(
     held_out: Sequence[PeriodicRecord], explanation: Explanation
-) -> dict[str, list[NDArray[np.float64]]]:
+) -> dict[str, list[Array]]:
     """Return spectra by what they are of, one a group."""
     parts = groups(held_out)
     candidates = {
@@ -244,7 +244,7 @@ def all_spectra(
     return found
 
 
-def residual_picture(found: dict[str, list[NDArray[np.float64]]], names: Sequence[str]) -> Figure:
+def residual_picture(found: dict[str, list[Array]], names: Sequence[str]) -> Figure:
     """Draw the spectra at each amplitude."""
     fig = style.figure(6.2)
     panels = fig.subplots(len(names), 1, sharex=True, sharey=True)
@@ -445,7 +445,7 @@ def beside(share: float) -> str:
     return ', with less than one of them for itself: other work ran beside it' if share < 1 else ''
 
 
-def band_rows(found: dict[str, list[NDArray[np.float64]]]) -> str:
+def band_rows(found: dict[str, list[Array]]) -> str:
     edges = np.array(EDGES, dtype=float)
     by_band = {
         name: np.array([in_bands(s, edges) for s in of_groups])

@@ -21,8 +21,8 @@ from pathlib import Path
 from foreign import draw
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 import piezo_ident as pi
+from piezo_ident.common.arrays import Array
 from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.report import length
 from piezo_ident.report.figures import style
@@ -33,7 +33,6 @@ from tqdm import tqdm
 from truths import make_stage
 from truths.linear import RATE
 
-Array = NDArray[np.float64]
 #: plays a voltage [V] and returns the displacement [m]
 Play = Callable[[Array], Array]
 

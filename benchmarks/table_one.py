@@ -22,7 +22,7 @@ import sys
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis import diagnose
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
@@ -74,9 +74,7 @@ segments:
 """
 
 
-def record_of(
-    v: NDArray[np.float64], labels: list[tuple[str, int, int]], name: str, seed: int
-) -> Record:
+def record_of(v: Array, labels: list[tuple[str, int, int]], name: str, seed: int) -> Record:
     """Return what the stage answers, as a record."""
     t = np.arange(v.size) / RATE
     y = table_one_stage(seed).respond(t, v)

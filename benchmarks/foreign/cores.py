@@ -25,10 +25,8 @@ import math
 
 from numba import njit
 import numpy as np
-from numpy.typing import NDArray
-from truths.cores import extremes_left
+from truths.cores import Array, extremes_left
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 Law = Callable[[Array], Array]
 

@@ -6,10 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Rng = np.random.Generator
+from .cores import Array, Rng
 
 #: by what names a fault may be reported
 NAMES = {

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from truths import laws
 from truths.linear import lag
 
-Array = NDArray[np.float64]
-Rng = np.random.Generator
+from .cores import Array, Rng
 
 #: the number of the further form of each effect that has one
 FURTHER = {

@@ -20,12 +20,8 @@ import math
 
 from numba import njit
 import numpy as np
-from numpy.typing import NDArray
 
-from .cores import bouc_wen_of, DEPTH, Law, law_of, preisach, STEP
-
-Array = NDArray[np.float64]
-Rng = np.random.Generator
+from .cores import Array, bouc_wen_of, DEPTH, Law, law_of, preisach, Rng, STEP
 
 #: Krasnosel'skii-Pokrovskii kernels on each axis
 KERNELS = 7

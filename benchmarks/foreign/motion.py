@@ -11,12 +11,10 @@ from itertools import pairwise
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import firwin, lfilter
 from truths.programs import Label, Tape
 
-Array = NDArray[np.float64]
-Rng = np.random.Generator
+from .cores import Array, Rng
 
 #: top speed of the moves between segments [spans/s]
 SPEED = 4.0

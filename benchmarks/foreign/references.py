@@ -14,10 +14,8 @@ from scipy.linalg import qr, solve_triangular
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import lsq_linear
 
-from .cores import play
+from .cores import Array, play
 from .stage import Stage
-
-Array = NDArray[np.float64]
 
 #: rows that are fitted at most
 ROWS = 30_000

@@ -22,10 +22,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-from .cores import Law, law_of, STEP
-
-Array = NDArray[np.float64]
-Rng = np.random.Generator
+from .cores import Array, Law, law_of, Rng, STEP
 
 #: how many moments, spins, bonds to either side of each, and sliders
 MOMENTS, SPINS, BONDS, SLIDERS = 6, 12000, 4, 14

@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .cores import Array
 from .stage import Stage
-
-Array = NDArray[np.float64]
 
 #: of each law the parameter that hardly shows, and the largest that a stage would have; see
 #: `truths.laws` and `stage`

@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from truths.linear import lag
 
-Array = NDArray[np.float64]
+from .cores import Array
 
 #: the speed is smoothed with this corner [Hz]; well below this one [spans/s] it counts as slow
 CORNER, SLOW = 600.0, 2.0

@@ -11,7 +11,6 @@ import math
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 from truths import laws
@@ -19,12 +18,9 @@ from truths.linear import delayed, relaxation
 from truths.table import LATER
 
 from . import forms
-from .cores import Core, core_of, WIDTHS
+from .cores import Array, Core, core_of, Rng, WIDTHS
 from .families import LAWS
 from .speed import spent_on_speed
-
-Array = NDArray[np.float64]
-Rng = np.random.Generator
 
 #: forms of each effect's law
 VARIANTS = {

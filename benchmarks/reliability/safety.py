@@ -31,7 +31,7 @@ import sys
 import time
 
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.record.blocks import Samples
@@ -40,7 +40,6 @@ from piezo_ident.record.blocks import Samples
 ROUNDING, ULPS = 1e-8, 4
 #: longest ramp that is followed to its end [samples]
 PATIENCE = 20_000
-Array = NDArray[np.float64]
 
 
 class Broken(Exception):

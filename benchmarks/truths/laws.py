@@ -9,12 +9,11 @@ import math
 
 from numba import njit
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
+from .cores import Array
 from .linear import band, lag, RATE
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 

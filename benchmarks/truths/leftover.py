@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .cores import plays, Row
+from .cores import Array, plays, Row
 from .stage import Base, Stage, VOLTS
-
-Array = NDArray[np.float64]
 
 #: thresholds of the refitted base
 THRESHOLDS = 40

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import firwin, freqz, lfilter
 
-Array = NDArray[np.float64]
+from .cores import Array
 
 #: internal sampling rate [Hz]
 RATE = 20000.0

@@ -10,9 +10,9 @@ from itertools import pairwise
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from .cores import Array
+
 Label = tuple[str, int, int]
 
 #: top speed of the moves between segments [V/s]

@@ -12,14 +12,12 @@ from types import MappingProxyType
 import zlib
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from . import laws
-from .cores import Density, everett, plays
+from .cores import Array, Density, everett, plays
 from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
 from .table import EFFECTS, gain_of, LATER, OUTSIDE, VARIANTS
-
-Array = NDArray[np.float64]
 
 #: displacement [m] and voltage [V] of the whole range
 SPAN = 75e-6

@@ -12,15 +12,13 @@ from typing import Any
 import zlib
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 import yaml
 
-from .cores import plays, Row
+from .cores import Array, plays, Row
 from .laws import speed_of
 from .linear import ARX, delayed, RATE, relaxation
 from .stage import SPAN, VOLTS
-
-Array = NDArray[np.float64]
 
 #: Table I of Gu, Li, Zhu, Su (2016), doi:10.1109/TMECH.2015.2465868: error of the model with
 #: dynamics [% of stroke] at each frequency of v = 5 + 5 sin(2 pi f t) [Hz]
