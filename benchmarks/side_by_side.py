@@ -60,11 +60,7 @@ class Turn:
 
 
 def take_turns(
-    works: Mapping[str, Callable[[int], Any]],
-    runs: int,
-    *,
-    fewer: Mapping[str, int] | None = None,
-    warm: Iterable[str] = (),
+    works: Mapping[str, Callable[[int], Any]], runs: int, *, warm: Iterable[str] = ()
 ) -> dict[str, Turn]:
     """
     Run every work in turns.
@@ -74,8 +70,6 @@ def take_turns(
     works : mapping of str to callable
         Each is given the number of the turn.
     runs : int
-    fewer : mapping of str to int, optional
-        Works that take fewer turns, the first ones.
     warm : iterable of str, optional
         Works that are run once before, untimed: what compiles on its first call.
     """
@@ -84,8 +78,6 @@ def take_turns(
     turns = {name: Turn() for name in works}
     for k in range(runs):
         for name, work in works.items():
-            if k >= (fewer or {}).get(name, runs):
-                continue
             start = time.perf_counter()
             result = work(k)
             turns[name].times.append(time.perf_counter() - start)

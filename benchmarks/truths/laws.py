@@ -98,10 +98,10 @@ def hinge(u: Array, amount: float, variant: int) -> Array:
     return np.asarray(-amount * np.maximum(at - u, 0.0) ** 1.5)
 
 
-def speed_of(u: Array, corner: float = 400.0, rate: float = RATE) -> Array:
+def speed_of(u: Array, corner: float = 400.0) -> Array:
     """Return the smoothed speed of u in spans a second."""
-    du = np.diff(u, prepend=u[0]) * rate
-    return np.abs(lag(du, corner, rate=rate))
+    du = np.diff(u, prepend=u[0]) * RATE
+    return np.abs(lag(du, corner))
 
 
 def drift(t: Array, amount: float, variant: int, rng: Rng) -> Array:

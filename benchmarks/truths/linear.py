@@ -210,7 +210,7 @@ def lag(x: Array, corner: float, order: int = 1, rate: float = RATE) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _relax(h: Array, pole: Array, weight: Array, up: float, down: float, out: Array) -> None:
+def _relax(h: Array, pole: Array, weight: Array, up: float, out: Array) -> None:
     x = np.full(pole.size, h[0])
     whole = weight.sum()
     for k in range(h.size):
@@ -218,12 +218,10 @@ def _relax(h: Array, pole: Array, weight: Array, up: float, down: float, out: Ar
         for i in range(pole.size):
             x[i] = pole[i] * x[i] + (1.0 - pole[i]) * h[k]
             behind += weight[i] * (x[i] - h[k])
-        out[k] = (1.0 + whole) * h[k] + (up if behind < 0 else down) * behind
+        out[k] = (1.0 + whole) * h[k] + (up if behind < 0 else 1.0) * behind
 
 
-def relaxation(
-    h: Array, law: str, amount: float, up: float = 1.0, down: float = 1.0, rate: float = RATE
-) -> Array:
+def relaxation(h: Array, law: str, amount: float, up: float = 1.0, rate: float = RATE) -> Array:
     """
     Return h with creep, every change of h relaxing on its own (Boltzmann's superposition).
 
@@ -238,8 +236,8 @@ def relaxation(
     law : {'log', 'power'}
     amount : float
         Per factor e of time, early on.
-    up, down : float
-        Multiply what is still missing after rises and after falls; 0 makes that way immediate.
+    up : float
+        Multiplies what is still missing after rises; 0 makes them immediate.
     rate : float
         [Hz]
     """
@@ -249,7 +247,7 @@ def relaxation(
     if law == 'power':
         spectrum *= (tau / t0) ** nu / math.gamma(1.0 - nu)
     out = np.empty(h.size)
-    _relax(np.ascontiguousarray(h), np.exp(-1.0 / (rate * tau)), amount * spectrum, up, down, out)
+    _relax(np.ascontiguousarray(h), np.exp(-1.0 / (rate * tau)), amount * spectrum, up, out)
     return out
 
 

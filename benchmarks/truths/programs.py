@@ -212,14 +212,12 @@ def other_axis(t: Array, rng: np.random.Generator) -> Array:
     return np.asarray(v * 0.5 * (1 - np.cos(np.pi * soft)))
 
 
-def table_one_sines(
-    sample_rate: float = 20000.0, amplitude: float = 5.0
-) -> tuple[Array, Array, list[Label]]:
-    """Return the published six sines, v = 5 + A sin(2 pi f t), each reached by a soft move."""
+def table_one_sines(sample_rate: float = 20000.0) -> tuple[Array, Array, list[Label]]:
+    """Return the published six sines, v = 5 + 5 sin(2 pi f t), each reached by a soft move."""
     tape = _Voltages(sample_rate, SPEED)
     tape.rest('idle', 0.2)
     for f, periods in ((1, 3), (10, 20), (50, 75), (80, 120), (100, 150), (120, 180)):
-        tape.sine(f'sine:{f}Hz', 5.0, amplitude, float(f), periods)
+        tape.sine(f'sine:{f}Hz', 5.0, 5.0, float(f), periods)
     tape.move(0.0)
     tape.rest('idle', 0.2)
     return tape.result()
