@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cache
 import os
 from pathlib import Path
-import platform
 import sys
 from typing import Any
 
@@ -34,7 +33,8 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
-from study_rows import all_rows, section
+from side_by_side import machine
+from study_rows import all_rows, section, some
 from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, program
 
 RATE = 20_000.0
@@ -238,24 +238,14 @@ def single(done: Done) -> str:
     heads = f'effect, counted, {", ".join(KINDS)}, unseen error before, after'
     outcomes = [outcome(case, row) for case, row in counted]
     exact, named, wrong, hidden = (
-        f'{n} of {len(counted)} ({n / max(len(counted), 1):.0%})'
-        for n in (
-            outcomes.count('exact'),
-            outcomes.count('exact') + outcomes.count('class'),
-            outcomes.count('wrong'),
-            outcomes.count('hidden'),
-        )
+        some(outcome in kinds for outcome in outcomes)
+        for kinds in (('exact',), ('exact', 'class'), ('wrong',), ('hidden',))
     )
     text = section('One effect', heads, map(line, EFFECTS))
     text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
     text += f'no name, and among what may hide in the base model: {hidden}. '
-    stated, told = (
-        f'{n} of {len(counted)} ({n / max(len(counted), 1):.0%})'
-        for n in (
-            sum(set(row.found) == set(case.effects) for case, row in counted),
-            sum(is_told(case, row) for case, row in counted),
-        )
-    )
+    stated = some(set(row.found) == set(case.effects) for case, row in counted)
+    told = some(is_told(case, row) for case, row in counted)
     text += 'As the second study counts, where what stands among the effects is named, however '
     text += f'much is left and whatever is as good: {stated}; with classes, that of a refit '
     text += f'included: {told}.'
@@ -286,27 +276,25 @@ def none(done: Done) -> str:
 def outside(done: Done) -> str:
     """Return the section of effects that are not among the candidates."""
     own = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
-    wrong = sum(r.verdict == 'named' for _, r in own)
-    return section(
+    text = section(
         'The own candidate taken out of the catalogue, and effects outside it',
         'truth, seed, size, verdict, added, class',
         ([c.effects[0], c.seed, f'{r.size:.2f}', *_names(r)] for c, r in own),
-    ) + (f'\n\nA wrong name in {wrong} of {len(own)} ({wrong / max(len(own), 1):.0%}).')
+    )
+    return f'{text}\n\nA wrong name in {some(r.verdict == "named" for _, r in own)}.'
 
 
 def _names(row: Row) -> list[str]:
     return [row.verdict, ', '.join(row.found), ', '.join(row.group)]
 
 
-def table(rows: dict[str, Row], todo: Sequence[Case], command: str) -> str:
+def table(rows: dict[str, Row], todo: Sequence[Case]) -> str:
     """Return the study as text."""
     done = [(case, rows[case.key]) for case in todo if case.key in rows]
     unseen = {c.key: [f'{r.unseen_before:.3f}', f'{r.unseen_after:.3f}'] for c, r in done}
     sections = [
         '# How often the diagnosis is right',
-        f'Made by `{command}`; {len(done)} of {len(todo)} cases done.\n'
-        f'Machine: {platform.machine()}, {os.cpu_count()} cores, Python '
-        f'{platform.python_version()}, numpy {np.__version__}.',
+        f'Made by `make study`; {len(done)} of {len(todo)} cases done.\nMachine: {machine()}.',
         NOTE,
         single(done),
         none(done),
@@ -349,7 +337,7 @@ def main() -> None:
         drawn = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
         todo = [todo[i] for i in drawn]
     rows = all_rows(arguments.kept, Row, todo, judged, arguments.processes)
-    arguments.out.write_text(table(rows, todo, 'make study'), encoding='utf-8')
+    arguments.out.write_text(table(rows, todo), encoding='utf-8')
     sys.stdout.write(f'{arguments.out}\n')
 
 

@@ -24,7 +24,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
-import platform
 import re
 import sys
 
@@ -44,7 +43,8 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-from study_rows import all_rows, section
+from side_by_side import machine
+from study_rows import all_rows, part_of, section, some
 from truths import other_axis
 
 #: in the data, not in the stage: they count whatever their size
@@ -383,17 +383,6 @@ NOTE = (
 )
 
 
-def part_of(count: int, whole: int) -> str:
-    """Return a count with its share."""
-    return f'{count} of {whole} ({count / whole:.0%})' if whole else '0 of 0'
-
-
-def some(facts: Iterable[object]) -> str:
-    """Return how many of them hold."""
-    known = [bool(x) for x in facts]
-    return part_of(sum(known), len(known))
-
-
 def spread(values: Sequence[float]) -> str:
     """Return median and 90th percentile."""
     sound = [x for x in values if np.isfinite(x)]
@@ -547,8 +536,7 @@ def table(rows: dict[str, Row], todo: Sequence[Case], group: str) -> str:
     sections = [
         '# How often the diagnosis is right on stages of another family',
         f'Made by `make study`, set `{group}`; {len(done)} of {len(todo)} cases done.\n'
-        f'Machine: {platform.machine()}, {os.cpu_count()} cores, Python '
-        f'{platform.python_version()}, numpy {np.__version__}.',
+        f'Machine: {machine()}.',
         NOTE,
         summary(done),
         by_effect(done),

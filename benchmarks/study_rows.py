@@ -16,6 +16,17 @@ from side_by_side import markdown
 from tqdm import tqdm
 
 
+def part_of(count: int, whole: int) -> str:
+    """Return a count with its share."""
+    return f'{count} of {whole} ({count / whole:.0%})' if whole else '0 of 0'
+
+
+def some(facts: Iterable[object]) -> str:
+    """Return how many of them hold."""
+    known = [bool(x) for x in facts]
+    return part_of(sum(known), len(known))
+
+
 def section(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
     """Return a section with a table; the heads are separated by commas."""
     return f'## {title}\n\n{markdown(heads.split(", "), rows)}'
