@@ -4,7 +4,6 @@
 """Signals and programs: what they promise, and what would prove it wrong."""
 
 from itertools import pairwise
-from pathlib import Path
 
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -21,12 +20,7 @@ import pytest
 import yaml
 
 FS = 20_000.0
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ('identification', 'validation', 'minor_loops', 'survey', 'diagnosis', 'holds')
-
-
-def config(name: str) -> Program:
-    return Program.load(ROOT / f'config/program_{name}.yaml')
 
 
 def program(*segments: dict, **head) -> Program:
@@ -103,7 +97,7 @@ def test_seed_reproduces_and_matters():
 
     assert_array_equal(noise(1), noise(1))
     assert not np.array_equal(noise(1), noise(2))
-    one, two = config('identification'), config('identification')
+    one, two = Program.load('identification'), Program.load('identification')
     assert_array_equal(one.build().v, two.build().v)
     other = one.build(rng=np.random.default_rng(99))
     assert not np.array_equal(one.build().v, other.v)
@@ -167,7 +161,7 @@ def test_settling_sweep_starts_full_and_dies_out_evenly():
 
 
 def test_noise_after_the_sweep_does_not_ratchet_the_plays():
-    s = config('identification').build()
+    s = Program.load('identification').build()
     noise = next(x for x in s.segments if x.kind == 'noise')
     # thresholds wider than twice the noise stand still; without the sweep they wander
     memory = play_columns(s.v / 10, [0.1, 0.2, 0.5])[:, noise.start : noise.stop]
@@ -269,7 +263,7 @@ def test_every_program_keeps_its_promises_or_is_refused(items, rest):
 
 @pytest.mark.parametrize('name', CONFIG)
 def test_programs_that_come_along(name):
-    s = config(name).build()
+    s = Program.load(name).build()
     assert s.sample_rate == FS
     assert np.all((s.v >= 0.0) & (s.v <= 10.0))
     assert s.v[0] == s.v[-1] == 0.0
@@ -279,13 +273,13 @@ def test_programs_that_come_along(name):
         segment.start for segment in s.segments
     ]
     # any rate will do
-    assert config(name).build(5000 if name != 'identification' else 10_000).duration == (
+    assert Program.load(name).build(5000 if name != 'identification' else 10_000).duration == (
         pytest.approx(s.duration, rel=1e-2)
     )
 
 
 def test_identification_program_has_what_the_three_steps_need():
-    s = config('identification').build()
+    s = Program.load('identification').build()
     assert 14 < s.duration < 18
     kinds = [x.kind for x in s.segments if x.kind not in ('ramp', 'idle')]
     assert kinds == ['step', 'settle', 'noise', 'triangle']
@@ -296,7 +290,7 @@ def test_identification_program_has_what_the_three_steps_need():
 
 
 def test_validation_program_is_the_papers_six_sines():
-    s = config('validation').build()
+    s = Program.load('validation').build()
     sines = [x for x in s.segments if x.kind == 'sine']
     assert [x.label for x in sines] == [f'sine:{f}Hz' for f in (1, 10, 50, 80, 100, 120)]
     for x, f in zip(sines, (1, 10, 50, 80, 100, 120), strict=True):
@@ -333,14 +327,14 @@ def test_limits_of_the_caller_only_narrow():
 
 @pytest.mark.parametrize('name', CONFIG)
 def test_a_scaled_program_is_the_same_motion_over_another_range(name):
-    one = config(name).build(FS)
-    other = scaled(config(name), (-20.0, 120.0), FS).build()
+    one = Program.load(name).build(FS)
+    other = scaled(Program.load(name), (-20.0, 120.0), FS).build()
     assert [s.n for s in other.segments] == [s.n for s in one.segments]
     # a level may be in a label
     assert [s.kind for s in other.segments] == [s.kind for s in one.segments]
     assert_allclose(other.v, -20.0 + 14.0 * one.v, atol=1e-6)
     # what a slow rate cannot carry is left out
-    slow = scaled(config(name), (0.0, 100.0), 500.0).build()
+    slow = scaled(Program.load(name), (0.0, 100.0), 500.0).build()
     assert slow.duration == pytest.approx(one.duration, rel=0.1)
     assert (slow.v.min(), slow.v.max()) == pytest.approx((0.0, 10.0 * one.v.max()), rel=0.02)
 

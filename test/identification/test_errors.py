@@ -4,21 +4,17 @@
 """What G and the delay leave of fast motion."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from paper_stage import PAPER as MODEL
+from paper_stage import STAGE
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.errors import fast_error
 from piezo_ident.identification.prepare import runs_of
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.operators.hysteresis import Hysteresis
 from programs import identification_program
 import pytest
-
-ROOT = Path(__file__).resolve().parents[2]
-STAGE = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
-MODEL = STAGE.model
 
 
 @pytest.fixture(scope='module')

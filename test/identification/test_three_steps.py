@@ -4,10 +4,10 @@
 """Delay from steps or scan, G with the hysteresis undone, and which samples are used."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import STAGE as PAPER
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.prepare import runs_of, scaling_of
@@ -19,7 +19,6 @@ from piezo_ident.identification.three_steps import (
     second_step,
     triangle_excerpts,
 )
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program
@@ -28,8 +27,6 @@ from scipy import signal
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
-ROOT = Path(__file__).resolve().parents[2]
-PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
 PROGRAM = identification_program(steps=12, noise=1, slope=30)
 COARSE = """
 limits: [0, 100]

@@ -4,10 +4,10 @@
 """One record without labels: what it excites is found, what it does not is named."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose
+from paper_stage import PAPER
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
@@ -21,13 +21,12 @@ import pytest
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
-ROOT = Path(__file__).resolve().parents[2]
 FS = 5000.0
 # a lightly damped mode at 700 Hz, as a small stage at 5 kHz has it
 POLE = np.exp(2 * np.pi * 700 / FS * (-0.03 + 1j * np.sqrt(1 - 0.03**2)))
 G = Dynamics(np.real(np.poly([POLE, np.conj(POLE)]))[1:], [0.3, 0.3]).normalised()
 STAGE = replace(
-    SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model,
+    PAPER,
     sample_rate=FS,
     dynamics=G,
     delay=Delay(2),

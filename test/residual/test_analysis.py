@@ -3,8 +3,6 @@
 
 """The whole analysis: dependence, faults met first, and what is too little to look at."""
 
-from pathlib import Path
-
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.excitation.program import Program
@@ -14,16 +12,14 @@ from piezo_ident.residual import analyse, ResidualPart
 import pytest
 from residual_data import creep, noise, part_of, RATE, T, V
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
-
 
 def curves(found, against: str) -> list:
     return [c for c in found.curves if c.against == against]
 
 
 def test_survey_with_creep_that_the_model_lacks():
-    stage = SimulatedStage.load(CONFIG / 'stage_paper.yaml')
-    sequence = Program.load(CONFIG / 'program_survey.yaml').build()
+    stage = SimulatedStage.load('paper')
+    sequence = Program.load('survey').build()
     read = stage.play(sequence, np.random.default_rng(1)).pieces[0]
     y = stage.ideal.play(sequence).pieces[0].y
     piece = Piece(read.v, read.y + creep(read.v, 20_000.0), 20_000.0, 0.0, read.segments)

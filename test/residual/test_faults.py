@@ -3,7 +3,6 @@
 
 """Faults of the data: each is named where it is, and none where it is not."""
 
-from pathlib import Path
 import re
 
 import numpy as np
@@ -15,7 +14,6 @@ from piezo_ident.residual import find_faults, ResidualPart
 import pytest
 from scipy.signal import lfilter
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
 RATE = 20_000.0
 PROGRAM = """
 limits: [0, 10]
@@ -31,7 +29,7 @@ segments:
 
 @pytest.fixture(scope='module')
 def stage():
-    return SimulatedStage.load(CONFIG / 'stage_paper.yaml')
+    return SimulatedStage.load('paper')
 
 
 @pytest.fixture(scope='module')
@@ -69,7 +67,7 @@ def test_readings_without_any_noise_have_no_fault(truth):
 
 @pytest.mark.parametrize('name', ['identification', 'validation', 'minor_loops'])
 def test_shipped_programs_have_no_fault(stage, name):
-    sequence = Program.load(CONFIG / f'program_{name}.yaml').build()
+    sequence = Program.load(name).build()
     read = stage.play(sequence, np.random.default_rng(2)).pieces[0]
     y = stage.ideal.play(sequence).pieces[0].y
     assert faults(read.v, read.y, y)[0] == {}

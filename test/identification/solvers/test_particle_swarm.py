@@ -3,10 +3,9 @@
 
 """The swarm: its manners, and how near it comes to the optimum it can be judged by."""
 
-from pathlib import Path
-
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from paper_stage import PAPER
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.signals import triangle
 from piezo_ident.identification.solvers import particle_swarm as swarm
@@ -17,11 +16,8 @@ from piezo_ident.identification.step3_hysteresis import (
     factorise,
     fit_hysteresis,
 )
-from piezo_ident.model.simulated_stage import SimulatedStage
 import pytest
 from scipy.optimize import lsq_linear
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def rng(seed=0):
@@ -115,12 +111,11 @@ def test_no_box_and_no_swarm_are_refused(wrong):
 @pytest.fixture(scope='module')
 def paper():
     """Return the factor of the paper's stage under a triangle, sensor noise 2e-5 of its span."""
-    stage = SimulatedStage.load(ROOT / 'config/stage_paper.yaml').model
     v = np.concatenate([np.zeros(100), triangle([10 / 3, 20 / 3, 10], 0, 6, 20_000)])
-    y = stage.stream().process(v) / 75e-6 + 2e-5 * rng(1).standard_normal(v.size)
+    y = PAPER.stream().process(v) / 75e-6 + 2e-5 * rng(1).standard_normal(v.size)
     use = np.ones(v.size, dtype=bool)
     r = even_thresholds(1.0, 10)
-    R = factorise([Excerpt(v / 10, y, use)], r, stage.dynamics.normalised(), stage.delay)
+    R = factorise([Excerpt(v / 10, y, use)], r, PAPER.dynamics.normalised(), PAPER.delay)
     return R, r, v.size
 
 
