@@ -42,15 +42,12 @@ class AmplitudeDependence:
         rms of the voltages.
     frequency, damping : ndarray, shape (groups, modes)
         In Hz, and as a ratio.
-    models : tuple of Modal
-        Of each group.
     """
 
     groups: tuple[str, ...]
     voltage: Array
     frequency: Array
     damping: Array
-    models: tuple[Modal, ...]
 
 
 def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> AmplitudeDependence:
@@ -64,13 +61,11 @@ def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> Amp
     """
     parts = groups(records)
     rate = records[0].rate
-    models = tuple(
-        refined(start, frequency_response(part), iterations=STEPS) for part in parts.values()
-    )
     highest = float(excited_lines(records).max()) * rate / len(records[0].mean_u)
     places = _strongest(start, rate, highest)
     frequency, damping = [], []
-    for model in models:
+    for part in parts.values():
+        model = refined(start, frequency_response(part), iterations=STEPS)
         s = _poles(model, rate)[places]
         frequency.append(np.abs(s) / (2 * np.pi))
         damping.append(-s.real / np.abs(s))
@@ -79,7 +74,6 @@ def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> Amp
         np.array([np.sqrt(np.mean([np.mean(r.u**2) for r in part])) for part in parts.values()]),
         np.array(frequency),
         np.array(damping),
-        models,
     )
 
 

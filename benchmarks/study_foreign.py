@@ -81,9 +81,9 @@ class Records:
     left : dict of str to float
         What a refit of forty plays leaves of each, % of stroke.
     fault : str
-    misfit, misfit_diagnosis : float
+    misfit : float
         Error of forty plays with the true linear part, fitted on the identification, of the stage
-        without its effects, on the unseen record and on that of the diagnosis, % of stroke.
+        without its effects, on the unseen record, % of stroke.
     unseen_forms : dict of str to float
         Error on the unseen record of each form of the hysteresis, likewise.
     stage : Stage
@@ -97,7 +97,6 @@ class Records:
     left: dict[str, float]
     fault: str
     misfit: float
-    misfit_diagnosis: float
     unseen_forms: dict[str, float]
     stage: Stage
 
@@ -117,7 +116,6 @@ class Row:
     left: dict[str, float] = field(default_factory=dict)
     fault: str = ''
     misfit: float = float('nan')
-    misfit_diagnosis: float = float('nan')
     unseen_forms: dict[str, float] = field(default_factory=dict)
     before: float = float('nan')
     refit: float = float('nan')
@@ -196,10 +194,11 @@ def case_records(case: Case, forms: bool = True) -> Records:
     plain = {
         name: (v, stage.read(stage.respond(v, name, {}, clean=True), name))
         for name, v in volts.items()
+        if name != 'diagnosis'
     }
     sweeps = [x[1:] for x in moved['identification'].labels if x[0].startswith('triangle')]
     best = references(stage, plain, FORMS if forms else ('forty plays',), sweeps)
-    misfit = best['forty plays'].unseen
+    misfit = best['forty plays']
     coupled = 'cross_coupling' in case.effects
     others = {
         name: other_axis(
@@ -250,8 +249,7 @@ def case_records(case: Case, forms: bool = True) -> Records:
         left=left,
         fault=case.fault,
         misfit=misfit,
-        misfit_diagnosis=best['forty plays'].diagnosis,
-        unseen_forms={form: r.unseen for form, r in best.items()},
+        unseen_forms=best,
         stage=stage,
     )
 
@@ -281,7 +279,6 @@ def judged(case: Case) -> Row:
             left=records.left,
             fault=records.fault,
             misfit=records.misfit,
-            misfit_diagnosis=records.misfit_diagnosis,
             unseen_forms=records.unseen_forms,
             before=result.before.overall,
             refit=result.refit.overall,

@@ -13,14 +13,13 @@ the stage, what is hidden in it and how it is measured:
 
 from .case import Case, CASES, draw
 from .motion import Motion, record_motion
-from .references import Reference, references
+from .references import references
 from .stage import make_stage, Stage
 
 __all__ = [
     'CASES',
     'Case',
     'Motion',
-    'Reference',
     'Stage',
     'draw',
     'make_stage',

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +22,6 @@ ROWS = 30_000
 WINDOW = 0.6
 #: ten plays, forty plays, and on each a form of the hysteresis
 FORMS = ('ten plays', 'forty plays', 'and a square', 'weighted by the bias', 'relay plane')
-
-
-@dataclass(frozen=True)
-class Reference:
-    """Error of a form on another record, % of stroke: identification's weights, mean removed."""
-
-    form: str
-    diagnosis: float
-    unseen: float
 
 
 def _columns(u: Array, form: str) -> tuple[list[Array], int]:
@@ -93,18 +83,19 @@ def references(
     records: Mapping[str, tuple[Array, Array]],
     forms: tuple[str, ...] = FORMS,
     sweeps: Sequence[tuple[int, int]] = (),
-) -> dict[str, Reference]:
+) -> dict[str, float]:
     """
-    Return what each form reaches, fitted on the identification.
+    Return the error of each form on the unseen record, % of stroke, its mean removed.
 
-    Fitted on all of it, where the stage moves far, and on its sweeps, since a stage that is no sum
-    of plays creeps away in the steps and the noise; the one that predicts better is kept.
+    Fitted on the identification: on all of it, where the stage moves far, and on its sweeps, since
+    a stage that is no sum of plays creeps away in the steps and the noise; the one that predicts
+    better is kept.
 
     Parameters
     ----------
     stage : Stage
     records : mapping of str to (v, y)
-        Of every record: command [V], and displacement in parts of the stroke.
+        Identification and unseen: command [V], and displacement in parts of the stroke.
     forms : tuple of str, optional
     sweeps : sequence of (start, stop), optional
         Samples of the identification that follow its triangles.
@@ -116,15 +107,13 @@ def references(
             X, positive = basis(stage, v, name, form)
             thinned[name] = X, y[:: max(1, v.size // ROWS)]
         X, y = thinned['identification']
-        tries = []
         v = records['identification'][0]
         at = np.arange(0, v.size, max(1, v.size // ROWS))
         swept = [(a <= at) & (at < b) for a, b in sweeps]
-        for rows in (np.ones(y.size, dtype=bool), _moved(stage, v), *swept):
-            weights = _fitted(X[rows], y[rows], positive)
-            errors = [_error(*thinned[name], weights) for name in ('diagnosis', 'unseen')]
-            tries.append(Reference(form, *errors))
-        found[form] = min(tries, key=lambda one: one.unseen)
+        found[form] = min(
+            _error(*thinned['unseen'], _fitted(X[rows], y[rows], positive))
+            for rows in (np.ones(y.size, dtype=bool), _moved(stage, v), *swept)
+        )
     return found
 
 
