@@ -17,7 +17,7 @@ Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 import math
@@ -28,13 +28,15 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
-from piezo_ident.model.metrics import percent
+from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95
 #: step below which a correction that harms is not tried again
 SMALLEST = 0.2
+#: correlation of measured and predicted displacement below which that is not of the stage
+WITH = 0.5
 #: corner of F, in parts of the lowest mode that rings, and of the sampling rate
 OF_MODE, OF_RATE = 0.7, 0.1
 #: share of the error that a run leaves where the corner holds it up, and by what it then grows
@@ -165,7 +167,8 @@ class Learning:
         Raises
         ------
         DataError
-            When there are more or fewer samples, one is not finite, or they are far off.
+            When there are more or fewer samples, one is not finite, they are far off, or they do
+            not move as the model does.
         """
         drive = self.drive
         try:
@@ -183,6 +186,8 @@ class Learning:
                 f'learning: the stage is {1e6 * np.abs(e).max():.4g} um off the wanted motion; is '
                 'it measured in metres?'
             )
+        for doubt in self._doubts(y):
+            raise DataError(f'learning: {doubt}')
         error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
         if error <= self.best.error:
@@ -205,3 +210,13 @@ class Learning:
         # no other voltage of the same motion: another one errs elsewhere
         self.drive = self._invert(self._reference, like=self.best.drive)
         return error
+
+    def _doubts(self, y: Array) -> Iterator[str]:
+        """Yield why measured displacement cannot be that of the stage under the drive."""
+        if not np.ptp(y) and np.ptp(self.drive.v):
+            yield 'the displacement stands still; is the sensor connected?'
+        pieces = [(y, self.drive.predicted)]
+        yield from doubts(pieces, self._model_span)
+        # another axis does not run against the model, but not with it, either
+        if runs_against(pieces, self._model_span, below=WITH):
+            yield REVERSED

@@ -78,6 +78,28 @@ def test_what_was_not_measured_is_refused():
             pi.Learning(PAPER, RASTER, corner=corner)
 
 
+def test_what_is_not_the_stage_is_refused():
+    learning = pi.Learning(PAPER, RASTER)
+    y, t = learning.drive.predicted, np.arange(learning.drive.v.size) / FS
+    noise = 3e-9 * np.random.default_rng(0).standard_normal(y.size)
+    for wrong, why in (
+        (np.full(y.size, 30e-6), 'stands still'),
+        (30e-6 + noise, 'times as much as the model says'),
+        (70e-6 - y, 'runs against the model'),
+        # the slow axis of the raster
+        (35e-6 + 100e-6 * t + noise, 'runs against the model'),
+        (0.02 * y, 'times as much'),
+    ):
+        with pytest.raises(DataError, match=why):
+            learning.take(wrong)
+        assert not learning.repetitions
+    small = pi.Learning(PAPER, 35e-6 + 0.01 * (RASTER - 35e-6))
+    with pytest.raises(DataError, match='stands still'):
+        small.take(np.full(small.drive.v.size, 35e-6))
+    # a scan of 0.3 um on a stage that drifts by as much
+    small.take(small.drive.predicted + 0.3e-6 * np.linspace(0.0, 1.0, small.drive.v.size))
+
+
 @pytest.mark.parametrize('off', [0.97, 1.03])
 def test_a_mode_that_is_somewhere_else_does_no_harm(off):
     def with_mode(frequency):
