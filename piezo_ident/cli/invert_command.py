@@ -65,6 +65,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
             'formula': FORMULA,
             'percent_of_stroke': drive.error,
             'expected_percent_of_stroke': drive.expected,
+            'expected_offset': drive.expected_offset,
             'lead': drive.lead,
             'clipped': int(np.count_nonzero(drive.clipped)),
             'voltage_range': [float(drive.v.min()), float(drive.v.max())],

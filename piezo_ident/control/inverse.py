@@ -24,18 +24,17 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
+from piezo_ident.control.expectation import expect
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.inputs import checked_limits, checked_motion, padded
-from piezo_ident.control.linear_inverse import linear_inverse, lowest_mode
+from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
-from piezo_ident.effects.creep import Creep
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
-from piezo_ident.model.metrics import expected_error, percent_of_stroke
+from piezo_ident.model.metrics import percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
-from scipy.signal import butter, sosfiltfilt
 
 #: passes of the iteration, at most
 PASSES = 30
@@ -55,10 +54,6 @@ SHORT = 1e-4
 #: changes of the voltage [of the span of the model] below which the lead may be cut off, the
 #: largest first, and how far that may move the motion [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
-#: time of a way to the beginning of a motion, and of a wait there [s]
-RISE, HOLD = 0.2, 1.0
-#: how the warning of that begins
-CREEPS = 'the stage creeps'
 #: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
 FAR, FAINT = 30.0, 2e-3
 
@@ -87,11 +82,15 @@ class Inverse(Showable):
         100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: what the
         inversion leaves; of the span of the model where the motion stands still.
     expected : float or None
-        What the stage will err by [%, as `error`], if that of the model is known, as of its
-        diagnosis or its identification: as many metres as over its range, however small the
-        motion is.
+        What the stage will err by without the mean [%, as `error`], if that of the model is known,
+        as of its diagnosis or its identification: as many metres as on the kind of motion that
+        the model knows least, however small this one is; what lies above the lowest mode; and
+        what creeps on.
     expected_rms : float or None
         The same [m].
+    expected_offset : float or None
+        The mean of what the stage will err by [m], where it waits for a second at the beginning
+        and goes on creeping; None for a model without creep.
     warnings : tuple of str
 
     Examples
@@ -114,6 +113,7 @@ class Inverse(Showable):
     error: float
     expected: float | None
     expected_rms: float | None
+    expected_offset: float | None
     warnings: tuple[str, ...]
 
 
@@ -248,21 +248,14 @@ def invert(
             raise DataError('; '.join([*warnings, *_faint(model, y)]), options='--clip')
     e = e[~maximum_filter1d(short, near)]
     left = float(np.sqrt(np.mean(e**2))) / span if e.size else 0.0
-    if left > MATTERS:
+    expected = expect(model, v, y)
+    relative = 0.0 if expected.rms is None else expected.rms / abs(s.Y) / span
+    if left > max(MATTERS, relative):
         warnings.append(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
             'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
         )
     warnings += _extrapolated(model, v, y)
-    known = expected_error(model)
-    expected = None if known is None else known / span
-    warnings += _ringing(model, y, expected)
-    # the same of nearly the same motion
-    warnings += (
-        _creeping(model, float(v[0]))
-        if like is None
-        else [text for text in like.warnings if text.startswith(CREEPS)]
-    )
     goal = np.pad(y, (lead, 0), mode='edge')[used]
     lead -= used.start
     return Inverse(
@@ -274,9 +267,10 @@ def invert(
         clipped=short,
         passes=passes,
         error=percent_of_stroke(y, predicted[lead:], span * abs(s.Y)),
-        expected=expected,
-        expected_rms=None if known is None else 0.01 * known * abs(s.Y),
-        warnings=tuple(warnings),
+        expected=None if expected.rms is None else percent(expected.rms, span * abs(s.Y)),
+        expected_rms=expected.rms,
+        expected_offset=expected.offset,
+        warnings=(*warnings, *expected.warnings),
     )
 
 
@@ -342,40 +336,6 @@ def _faint(model: StageModel, y: Array) -> list[str]:
         f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
         f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
     ]
-
-
-def _ringing(model: StageModel, y: Array, expected: float | None) -> list[str]:
-    """Return a warning where a motion holds more above the lowest mode than is expected."""
-    mode = lowest_mode(model)
-    if expected is None or not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
-        return []
-    sos = butter(4, mode, btype='highpass', fs=model.sample_rate, output='sos')
-    fast = sosfiltfilt(
-        sos, np.pad(y - y[0], max(16, round(model.sample_rate / mode)), mode='edge')
-    )
-    share = percent_of_stroke(fast, np.zeros_like(fast), float(np.ptp(y)))
-    if share <= expected:
-        return []
-    return [
-        f'{share:.2g} % of the motion lie above {mode:.4g} Hz, where the stage rings: corners or '
-        'jumps. What the model does not know of that comes on top; round the corners, or let the '
-        'scan learn'
-    ]
-
-
-def _creeping(model: StageModel, v0: float) -> list[str]:
-    """Return a warning where the stage takes long to rest at the beginning of a motion."""
-    low, rate = model.scaling.range[0], model.sample_rate
-    only = replace(model, effects=tuple(e for e in model.effects if e.name == Creep.name))
-    if not only.effects:
-        return []
-    rise = np.linspace(low, v0, round(RISE * rate))
-    risen = only.stream().process(np.pad(rise, (0, round(HOLD * rate)), 'edge'))
-    left = only.stream().reset(v0) - risen
-    if (off := abs(float(left[-1]))) < MATTERS * abs(model.scaling.Y):
-        return []
-    text = f'{CREEPS}: {HOLD:g} s after it came from {low:g} V, {1e6 * off:.2g} um are'
-    return [f'{text} left to where the motion begins; wait longer, or begin it under {low:g} V']
 
 
 def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:

@@ -260,8 +260,7 @@ def _diagnosed(
             last.held_out_residual(rows, rows.group),
         )
     )
-    overall = before.overall, after.overall
-    refined = refine(simulator, given, last, findings, noise, overall)
+    refined = refine(simulator, given, last, findings, noise, (before, after))
     if refined.is_given:
         after = before
     smallest = smallest_detectable(rows, base, selected, noise)

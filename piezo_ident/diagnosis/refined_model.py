@@ -13,7 +13,7 @@ from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds, takes_shape
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.results import FORMULA
+from piezo_ident.diagnosis.results import Errors, FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
@@ -54,7 +54,7 @@ def refine(
     fitted: Fitted,
     findings: Findings,
     noise: float,
-    errors: tuple[float, float],
+    errors: tuple[Errors, Errors],
 ) -> Refined:
     """
     Return the model that the user gets, from a refit with what was found.
@@ -221,7 +221,7 @@ def _model(
     state: State,
     findings: Findings,
     span: tuple[float, float],
-    errors: tuple[float, ...],
+    errors: tuple[Errors, ...],
 ) -> StageModel:
     """Return the model of a state, in the record that holds the most rows, and its range."""
     rows = simulator.rows
@@ -243,7 +243,12 @@ def _model(
             'errors': {
                 'unit': '% of stroke',
                 'formula': FORMULA,
-                **dict(zip(('before', 'after'), map(float, errors), strict=False)),
+                **{
+                    name: float(e.overall)
+                    for name, e in zip(('before', 'after'), errors, strict=False)
+                },
+                # of the kind of motion that the model knows least
+                'worst': float(max(errors[-1].by_segment.values(), default=np.nan)),
             },
         },
     }

@@ -370,6 +370,7 @@ def _provenance(result: Identification, names: list[str], fast: float) -> dict[s
                 if np.isfinite(result.error(data))
             },
             'fast_motion': fast,
+            'worst': max((row.percent for row in result.errors if row.driven), default=np.nan),
         },
         'uncertainties': {
             'delay': result.delay.std if np.isfinite(result.delay.std) else None,

@@ -27,6 +27,7 @@ __all__ = [
     'percent_of_stroke',
     'runs_against',
     'strokes',
+    'worst_error',
 ]
 
 #: times that a displacement moves as much, or as little, from which its unit is in doubt
@@ -141,6 +142,16 @@ def expected_error(model: StageModel) -> float | None:
     Of a refined model that of its diagnosis, on kinds of motion that were held out; else that of
     its identification, on data as far from the fit as there are.
     """
+    return next((value for value, _ in _known_errors(model)), None)
+
+
+def worst_error(model: StageModel) -> float | None:
+    """Return the error on the kind of motion where it is largest, as `expected_error`."""
+    return next((worst for _, worst in _known_errors(model)), None)
+
+
+def _known_errors(model: StageModel) -> Iterator[tuple[float, float]]:
+    """Yield the errors that a model holds, the first to be quoted, each with the worst."""
     found = model.identification
     diagnosis = found.get('diagnosis')
     places = (
@@ -150,7 +161,9 @@ def expected_error(model: StageModel) -> float | None:
     for errors, kinds in places:
         known = errors if isinstance(errors, Mapping) else {}
         for kind in kinds:
-            value = known.get(kind)
-            if isinstance(value, int | float) and 0.0 < value < float('inf'):
-                return float(value)
-    return None
+            value, worst = (
+                float(x) if isinstance(x, int | float) and 0.0 < x < float('inf') else 0.0
+                for x in (known.get(kind), known.get('worst'))
+            )
+            if value:
+                yield value, max(value, worst)

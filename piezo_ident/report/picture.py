@@ -160,10 +160,17 @@ def _drive(result: Inverse) -> tuple[str, Table]:
     expected = 'unknown, the model holds no error on data it was not fitted to'
     if result.expected is not None and result.expected_rms is not None:
         rms = length(result.expected_rms)
-        expected = f'{number(result.expected)} % of stroke, {rms} rms, as the model errs elsewhere'
+        expected = (
+            f'{number(result.expected)} % of stroke, {rms} rms without the mean, as the model '
+            'errs elsewhere'
+        )
         if result.error > result.expected:
             expected += '; what the inversion leaves comes on top'
     rows += [('expected', expected)]
+    offset = 'unknown, the model has no creep'
+    if result.expected_offset is not None:
+        offset = f'{length(result.expected_offset)}, where the stage waits 1 s at the beginning'
+    rows += [('expected mean', offset)]
     rows += [('warning', warning) for warning in result.warnings]
     rows += [('% of stroke', FORMULA)]
     text = f'A voltage of {result.v.size} samples moves {length(float(np.ptp(result.wanted)))}.'

@@ -14,7 +14,7 @@ from piezo_ident.control import linear_inverse
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
-from piezo_ident.model.metrics import expected_error
+from piezo_ident.model.metrics import expected_error, worst_error
 from piezo_ident.model.stage_model import EffectSetting
 from programs import identification_program
 import pytest
@@ -78,6 +78,12 @@ def test_an_identified_model_brings_the_stage_where_it_is_told(name, request):
         assert drive.expected < 0.5 * request.getfixturevalue('labelled').inverse(wanted).expected
 
 
+def test_a_model_holds_its_error_on_the_motion_that_it_knows_least(labelled, refined):
+    for model in (labelled, refined):
+        assert 1.1 * expected_error(model) < worst_error(model) < 10.0 * expected_error(model)
+    assert worst_error(refined) < 0.5 * worst_error(labelled)
+
+
 @pytest.fixture(scope='module')
 def behind_amplifier():
     """Return a stage whose amplifier lags, and the model that has the lag in its G."""
@@ -122,14 +128,15 @@ def test_corners_that_ring_are_told(behind_amplifier):
 
 def test_what_is_expected_is_as_many_metres_for_small_motion(behind_amplifier):
     _, model = behind_amplifier
-    large, small = (pi.invert(model, scan(5.0) * part) for part in (1.0, 0.1))
-    assert large.expected_rms == pytest.approx(0.01 * expected_error(model) * abs(model.scaling.Y))
-    assert small.expected_rms == large.expected_rms
-    assert small.expected == pytest.approx(10.0 * large.expected)
-    assert large.expected * 60e-6 == pytest.approx(100 * large.expected_rms, rel=1e-3)
+    soft = scan(5.0, corners=4e-3)
+    large, small = (pi.invert(model, soft * part) for part in (1.0, 0.1))
+    assert large.expected_rms == pytest.approx(0.01 * worst_error(model) * abs(model.scaling.Y))
+    assert small.expected_rms == pytest.approx(large.expected_rms)
+    assert small.expected == pytest.approx(10.0 * large.expected, rel=1e-3)
+    assert large.expected * np.ptp(soft) == pytest.approx(100 * large.expected_rms, rel=1e-3)
     # a motion that stands still has no span
     still = pi.invert(model, np.full(2000, 20e-6))
-    assert still.expected == expected_error(model)
+    assert still.expected == pytest.approx(worst_error(model))
     assert pi.invert(PAPER, scan(5.0)).expected_rms is None
 
 

@@ -14,6 +14,7 @@ from piezo_ident.model.metrics import (
     fit_percent,
     percent_of_stroke,
     runs_against,
+    worst_error,
 )
 import pytest
 
@@ -83,3 +84,16 @@ def test_expected_error_is_that_of_data_as_far_from_the_fit_as_there_are():
     assert of(errors=errors, diagnosis={'errors': {'before': 0.5, 'after': 0.05}}) == 0.05
     assert of(errors=errors, diagnosis={'errors': {'before': 0.5}}) == 0.5
     assert of(errors=errors, diagnosis={'verdict': 'named'}) == 0.3
+
+
+def test_worst_error_is_that_of_the_kind_of_motion_that_is_known_least():
+    def worst(**identification):
+        return worst_error(replace(PAPER, identification=identification))
+
+    assert worst() is None
+    errors = {'fitted': 0.1, 'held_out': 0.3, 'worst': 0.8}
+    assert worst(errors=errors) == 0.8
+    assert worst(errors={**errors, 'worst': float('nan')}) == 0.3
+    # that of its diagnosis replaces that of the model as given
+    assert worst(errors=errors, diagnosis={'errors': {'after': 0.05, 'worst': 0.09}}) == 0.09
+    assert worst(errors=errors, diagnosis={'errors': {'after': 0.05}}) == 0.05

@@ -1,0 +1,104 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What a stage will err by under the voltage of an inverse, as far as its model tells.
+
+The zero of a stage and the shape of its motion are two things.  A diagnosis takes the zero of each
+record as free, so what a model errs by is that of the shape; where the stage is, is a matter of
+what still creeps, which a model with creep knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.control.linear_inverse import lowest_mode
+from piezo_ident.effects.creep import Creep
+from piezo_ident.model.metrics import worst_error
+from piezo_ident.model.stage_model import StageModel
+from scipy.signal import butter, sosfiltfilt
+
+__all__ = ['Expectation', 'expect', 'known_rms']
+
+#: time of a way to the beginning of a motion, and of a wait there [s]
+RISE, HOLD = 0.2, 1.0
+#: what is left to creep that is worth a warning where nothing is known of the model [of its span]
+MATTERS = 1e-3
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """
+    What a stage will err by [m].
+
+    `rms` is that without its mean, None where the model does not tell how well it holds; `offset`
+    is the mean, None for a model without creep.
+    """
+
+    rms: float | None
+    offset: float | None
+    warnings: tuple[str, ...]
+
+
+def known_rms(model: StageModel) -> float | None:
+    """Return what a model errs by on the kind of motion that it knows least [m]."""
+    worst = worst_error(model)
+    return None if worst is None else 0.01 * worst * abs(model.scaling.Y)
+
+
+def expect(model: StageModel, v: Array, y: Array) -> Expectation:
+    """
+    Return what is to be expected of a stage that is to move as y [m] under v [V], shape (n,) each.
+
+    The stage comes from its lowest voltage, and waits for `HOLD` where the motion begins.
+    """
+    known, late = known_rms(model), _late(model, v)[-y.size :]
+    limit = MATTERS * abs(model.scaling.Y) if known is None else known
+    warnings = []
+    fast = 0.0
+    if known is not None:
+        mode, fast = lowest_mode(model), _above_mode(model, y)
+        if fast > known:
+            warnings.append(
+                f'{100 * fast / np.ptp(y):.2g} % of the motion lie above {mode:.4g} Hz, where the '
+                'stage rings: corners or jumps. The model may miss all of that, which is in what '
+                'is expected; round the corners, or let the scan learn'
+            )
+    if late.size and abs(late[0]) >= limit:
+        low = model.scaling.range[0]
+        warnings.append(
+            f'the stage creeps: {HOLD:g} s after it came from {low:g} V, '
+            f'{1e6 * abs(late[0]):.2g} um are left to where the motion begins; wait longer, or '
+            f'begin it under {low:g} V'
+        )
+    drifts = float(np.std(late)) if late.size else 0.0
+    return Expectation(
+        None if known is None else math.hypot(known, fast, drifts),
+        float(late.mean()) if late.size else None,
+        tuple(warnings),
+    )
+
+
+def _above_mode(model: StageModel, y: Array) -> float:
+    """Return the rms of a motion above the lowest mode that rings [m]."""
+    mode = lowest_mode(model)
+    if not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
+        return 0.0
+    sos = butter(4, mode, btype='highpass', fs=model.sample_rate, output='sos')
+    around = max(16, round(model.sample_rate / mode))
+    fast = sosfiltfilt(sos, np.pad(y - y[0], around, mode='edge'))
+    return float(np.sqrt(np.mean(fast**2)))
+
+
+def _late(model: StageModel, v: Array) -> Array:
+    """Return where a stage that creeps is beside one that rested at first [m]; empty without."""
+    only = replace(model, effects=tuple(e for e in model.effects if e.name == Creep.name))
+    if not only.effects:
+        return np.empty(0)
+    rise = np.linspace(model.scaling.range[0], v[0], round(RISE * model.sample_rate))
+    way = np.pad(rise, (0, round(HOLD * model.sample_rate)), 'edge')
+    return only.stream().process(np.append(way, v))[way.size :] - only.stream().process(v)

@@ -1,0 +1,66 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is expected of a stage, beside what it then does."""
+
+from dataclasses import replace
+import re
+
+import numpy as np
+from paper_stage import FS, PAPER
+import piezo_ident as pi
+from piezo_ident.control.expectation import HOLD, RISE
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Dynamics
+import pytest
+
+CREEP = EffectSetting('creep', {'gain': [0.01, 0.01, 0.01], 'time_constant': [0.1, 1.0, 10.0]})
+KNOWN = {'errors': {'held_out': 0.02, 'worst': 0.05}}
+CREEPS = replace(PAPER, effects=(CREEP,), identification=KNOWN)
+
+
+def played(stage, drive):
+    """Return the displacement of a stage that came from its lowest voltage and waited."""
+    way = np.pad(np.linspace(0.0, drive.v[0], round(RISE * FS)), (0, round(HOLD * FS)), 'edge')
+    return stage.simulate(np.append(way, drive.v))[way.size + drive.lead :]
+
+
+def scan(start, size, frequency=5.0, seconds=1.0):
+    """Return a raised cosine [m]."""
+    t = np.arange(round(seconds * FS)) / FS
+    return start + 0.5 * size * (1.0 - np.cos(2.0 * np.pi * frequency * t))
+
+
+@pytest.mark.parametrize(('start', 'size'), [(40e-6, 1e-6), (10e-6, 40e-6), (2e-6, 10e-6)])
+def test_where_a_stage_is_that_creeps_is_promised_beside_its_shape(start, size):
+    wanted = scan(start, size)
+    drive = pi.invert(CREEPS, wanted)
+    e = played(CREEPS, drive) - wanted
+    assert drive.expected_offset == pytest.approx(e.mean(), rel=0.05, abs=2e-9)
+    # no less than the model errs by elsewhere, and what creeps on is in it
+    assert drive.expected_rms > max(0.0005 * 75e-6, 0.99 * e.std())
+    assert drive.expected_rms < 2.0 * max(0.0005 * 75e-6, e.std())
+    # it is told where it is more than the stage errs by anyhow
+    assert bool(drive.warnings) == (abs(e[0]) > 0.0005 * 75e-6)
+    assert f'{1e9 * abs(e.mean()):.0f}'[0] in repr(drive)
+
+
+def test_a_model_without_creep_does_not_tell_where_a_stage_is():
+    drive = pi.invert(replace(PAPER, identification=KNOWN), scan(40e-6, 1e-6))
+    assert drive.expected_offset is None and 'unknown, the model has no creep' in repr(drive)
+    assert drive.expected_rms == pytest.approx(0.0005 * 75e-6)
+
+
+def test_corners_above_a_mode_are_in_what_is_expected():
+    def ringing(frequency):
+        poles = np.exp(2 * np.pi * frequency / FS * np.array([-0.01 + 1j, -0.01 - 1j]))
+        G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
+        return replace(PAPER, dynamics=G, identification=KNOWN)
+
+    t = np.arange(4000) / FS
+    wanted = 10e-6 + 40e-6 * (1.0 - np.abs(2.0 * ((100.0 * t) % 1.0) - 1.0))
+    drive = pi.invert(ringing(700.0), wanted)
+    e = played(ringing(730.0), drive) - wanted
+    assert 5.0 * 0.0005 * 75e-6 < e.std() < 1.5 * drive.expected_rms
+    (told,) = drive.warnings
+    assert re.match(r'\S+ % of the motion lie above 700 Hz', told)
