@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
-from piezo_ident.control.expectation import expect
+from piezo_ident.control.expectation import expect, known_rms
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.control.inputs import checked_limits, checked_motion, padded
 from piezo_ident.control.linear_inverse import linear_inverse
@@ -51,6 +51,10 @@ MATTERS, LARGE = 1e-3, 0.1
 STANDS = 1e-9
 #: difference from what is wanted at rest, normalised, from which it is out of reach
 SHORT = 1e-4
+#: the same, of its span, of a model that errs by more elsewhere
+SLIGHT = 1e-2
+#: step of a motion from one sample to the next that is a jump [of its span]
+JUMPS = 0.05
 #: changes of the voltage [of the span of the model] below which the lead may be cut off, the
 #: largest first, and how far that may move the motion [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
@@ -243,8 +247,16 @@ def invert(
     e, t, short, miss = e[used], t[used], short[used], miss[used]
     warnings = []
     if short.any():
-        warnings.append(_unreached(t[short], abs(s.Y) * float(miss[short].max()), low, high, slew))
-        if not clip:
+        most, off = abs(s.Y) * float(miss[short].max()), s.Y * e[short]
+        jumps = maximum_filter1d(np.abs(np.diff(x[used], append=x[-1])), near)[short]
+        remedy = ''
+        if jumps.max() > JUMPS * span:
+            remedy = '; the motion jumps there: round it over two periods of the lowest mode'
+        elif np.isinf(slew) and (off.max() < 0.0 or off.min() > 0.0):
+            remedy = f'; {_shifted(-most if off.max() > 0.0 else most)}'
+        text = _unreached(t[short], most, low, high, slew)
+        warnings.append(f'{text}{remedy}')
+        if not clip and most > _tolerance(model, y):
             raise DataError('; '.join([*warnings, *_faint(model, y)]), options='--clip')
     e = e[~maximum_filter1d(short, near)]
     left = float(np.sqrt(np.mean(e**2))) / span if e.size else 0.0
@@ -300,18 +312,24 @@ def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) 
         return float(model.chain().reset(u, u)) - x0
 
     below, above = miss(bounds[0]), miss(bounds[1])
-    if (below > SHORT or above < -SHORT) and not (clip and max(below, -above) < FAR):
+    near = max(SHORT, _tolerance(model, y) / abs(s.Y))
+    if (below > near or above < -near) and not (clip and max(below, -above) < FAR):
         ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
-        is_far = max(below, -above) > FAR
+        is_far, missed = max(below, -above) > FAR, s.Y * (below if below > 0.0 else above)
         raise DataError(
             f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
             f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'
-            + ('; is the motion in metres?' if is_far else ''),
+            + ('; is the motion in metres?' if is_far else f'; {_shifted(missed)}'),
             options='' if is_far else '--clip',
         )
     if below >= 0.0 or above <= 0.0:
         return bounds[0] if below >= 0.0 else bounds[1]
     return float(brentq(miss, *bounds, xtol=1e-14))
+
+
+def _tolerance(model: StageModel, y: Array) -> float:
+    """Return by how much a motion may leave the limits: less than the stage errs by [m]."""
+    return min(known_rms(model) or 0.0, SLIGHT * float(np.ptp(y)))
 
 
 def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
@@ -336,6 +354,10 @@ def _faint(model: StageModel, y: Array) -> list[str]:
         f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
         f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
     ]
+
+
+def _shifted(by: float) -> str:
+    return f'{"raise" if by > 0.0 else "lower"} the motion by {1e6 * abs(by):.3g} um'
 
 
 def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is expected of a stage, beside what it then does."""
+"""What is expected of a stage, beside what it then does, and what of that stops a drive."""
 
 from dataclasses import replace
 import re
@@ -9,6 +9,7 @@ import re
 import numpy as np
 from paper_stage import FS, PAPER
 import piezo_ident as pi
+from piezo_ident.common.errors import DataError
 from piezo_ident.control.expectation import HOLD, RISE
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
@@ -64,3 +65,27 @@ def test_corners_above_a_mode_are_in_what_is_expected():
     assert 5.0 * 0.0005 * 75e-6 < e.std() < 1.5 * drive.expected_rms
     (told,) = drive.warnings
     assert re.match(r'\S+ % of the motion lie above 700 Hz', told)
+
+
+def test_a_motion_that_dips_below_rest_by_less_than_the_stage_errs_by_is_made():
+    rest = float(PAPER.simulate([0.0, 0.0])[0])
+    known = replace(PAPER, identification=KNOWN)
+    dips = scan(rest, 40e-6) - 13e-9
+    with pytest.raises(DataError, match=r'raise the motion by 0\.013 um'):
+        pi.invert(PAPER, dips)
+    assert not pi.invert(PAPER, dips + 13e-9).clipped.any()
+    drive = pi.invert(known, dips)
+    assert drive.clipped.any() and 'out of reach' in drive.warnings[0]
+    assert np.abs(drive.predicted - drive.wanted).max() < 14e-9
+    # more than the stage errs by, or much of a small motion
+    for refused in (dips - 50e-9, scan(rest, 0.4e-6) - 13e-9):
+        with pytest.raises(DataError, match='raise the motion by'):
+            pi.invert(known, refused)
+
+
+def test_a_jump_that_no_voltage_makes_is_called_that():
+    poles = np.exp(2 * np.pi * 600.0 / FS * np.array([-0.01 + 1j, -0.01 - 1j]))
+    G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
+    wanted = np.where(np.arange(4000) < 2000, 20e-6, 60e-6)
+    with pytest.raises(DataError, match=r'out of reach .* the motion jumps .*round'):
+        pi.invert(replace(PAPER, dynamics=G), wanted)
