@@ -9,7 +9,8 @@ Iterative learning: the same motion again, corrected by what was measured before
 F is a low-pass without phase: where the model is not known, above the lowest mode that rings, a
 correction may do harm.  What repeats from run to run falls by the share to which the model is
 right; noise does not, so the best run is kept and learning ends where the error falls no more.
-After a run that was worse, the step s from the best one is half as large.  Where the error falls
+After a run that was worse, the step s from the best one is half as large.  The mean alone is no
+reason for that: a stage that creeps moves it from run to run.  Where the error falls
 slowly, what is left lies above the corner of F, which then grows until it harms.
 D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
 Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
@@ -123,6 +124,7 @@ class Learning:
             invert, model, limits=limits, slew=slew, clip=True, channels=channels
         )
         self.drive = self._invert(wanted, clip=clip)
+        self._best_drive = self.drive
         self._wanted = self._reference = self._best_reference = self.drive.wanted[
             self.drive.lead :
         ]
@@ -131,6 +133,7 @@ class Learning:
         self._model_span = abs(model.scaling.Y)
         self._span = float(np.ptp(self._wanted)) or self._model_span
         self.repetitions: list[Repetition] = []
+        self._shapes: list[float] = []
         self._step, self._missed = 1.0, np.zeros_like(self._wanted)
         own = min(OF_MODE * lowest_mode(model), OF_RATE * model.sample_rate)
         self.corner = own if corner is None else corner
@@ -149,11 +152,13 @@ class Learning:
     @property
     def is_done(self) -> bool:
         """Whether the error falls no more."""
-        errors = [r.error for r in self.repetitions]
+        errors, shapes = [r.error for r in self.repetitions], self._shapes
         if len(errors) < 2 or errors[-1] <= WORTH * min(errors[:-1]):
             return False
-        # after a harm a smaller step may still help
-        return errors[-1] <= min(errors[:-1]) / WORTH or self._step < SMALLEST
+        harms = errors[-1] > min(errors[:-1]) / WORTH
+        # after a harm a smaller step may still help, and the mean where the rest still falls
+        falls = shapes[-1] <= WORTH * min(shapes[:-1]) and shapes[-1] > 0.0
+        return not (harms or falls) or self._step < SMALLEST
 
     def take(self, measured: ArrayLike) -> float:
         """
@@ -190,12 +195,14 @@ class Learning:
             raise DataError(f'learning: {doubt}')
         error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
-        if error <= self.best.error:
+        # the mean of a stage that creeps goes on from run to run: no harm of the correction
+        shape, before = percent(float(np.std(e[self._counts])), self._span), self._shapes
+        self._shapes = [*before, shape]
+        if error <= self.best.error or shape <= min(before):
             # what is out of reach would grow from run to run
             self._missed = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
-            self._best_reference = self._reference
-            before = [r.error for r in self.repetitions[:-1]]
-            self._is_wider = self._may_widen and bool(before) and error > SLOW * min(before)
+            self._best_reference, self._best_drive = self._reference, drive
+            self._is_wider = self._may_widen and bool(before) and shape > SLOW * min(before)
             self._is_wider &= WIDER * self.corner <= OF_RATE * self._rate
             if self._is_wider:
                 # what is left lies above the corner
@@ -208,13 +215,16 @@ class Learning:
         correction = smoothed(self._missed, self.corner, self._rate)
         self._reference = self._best_reference + self._step * correction
         # no other voltage of the same motion: another one errs elsewhere
-        self.drive = self._invert(self._reference, like=self.best.drive)
+        self.drive = self._invert(self._reference, like=self._best_drive)
         return error
 
     def _doubts(self, y: Array) -> Iterator[str]:
         """Yield why measured displacement cannot be that of the stage under the drive."""
         if not np.ptp(y) and np.ptp(self.drive.v):
             yield 'the displacement stands still; is the sensor connected?'
+        if self.repetitions:
+            # a drive that has learned moves the model by what the stage does not do
+            return
         pieces = [(y, self.drive.predicted)]
         yield from doubts(pieces, self._model_span)
         # another axis does not run against the model, but not with it, either
