@@ -29,7 +29,7 @@ def drive_figure(drive: Inverse) -> Figure:
     unit, scale = style.length_unit(max(largest, band))
     if band:
         its, factor = style.length_unit(band)
-        label = f'expected of the stage: {factor * band:.3g} {its} rms'
+        label = f'expected of the stage: {factor * band:.3g} {its} rms without the mean'
         error.axhspan(-scale * band, scale * band, color=COLOURS['band'], alpha=0.6, label=label)
     style.line(error, t, scale * e, COLOURS['model'], 'left by the inversion', linewidth=0.8)
     style.symmetric(error, scale * max(limit, 1.3 * band))
