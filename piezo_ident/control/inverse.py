@@ -247,13 +247,14 @@ def invert(
     e, t, short, miss = e[used], t[used], short[used], miss[used]
     warnings = []
     if short.any():
-        most, off = abs(s.Y) * float(miss[short].max()), s.Y * e[short]
+        most = abs(s.Y) * float(miss[short].max())
+        at_top = u[used][short] > 0.5 * sum(H.limits)
         jumps = maximum_filter1d(np.abs(np.diff(x[used], append=x[-1])), near)[short]
         remedy = ''
         if jumps.max() > JUMPS * span:
             remedy = '; the motion jumps there: round it over two periods of the lowest mode'
-        elif np.isinf(slew) and (off.max() < 0.0 or off.min() > 0.0):
-            remedy = f'; {_shifted(-most if off.max() > 0.0 else most)}'
+        elif np.isinf(slew) and (at_top.all() or not at_top.any()):
+            remedy = f'; {_shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
         text = _unreached(t[short], most, low, high, slew)
         warnings.append(f'{text}{remedy}')
         if not clip and most > _tolerance(model, y):

@@ -83,6 +83,14 @@ def test_a_motion_that_dips_below_rest_by_less_than_the_stage_errs_by_is_made():
             pi.invert(known, refused)
 
 
+def test_a_motion_beyond_a_limit_is_told_by_how_much_to_move_it():
+    high = scan(30e-6, 50e-6)
+    with pytest.raises(DataError, match=r'lower the motion by \d\S* um') as refused:
+        pi.invert(PAPER, high)
+    by = float(re.search(r'lower the motion by (\S+) um', str(refused.value))[1])
+    assert not pi.invert(PAPER, high - 1e-6 * by).clipped.any()
+
+
 def test_a_jump_that_no_voltage_makes_is_called_that():
     poles = np.exp(2 * np.pi * 600.0 / FS * np.array([-0.01 + 1j, -0.01 - 1j]))
     G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
