@@ -99,6 +99,6 @@ def _late(model: StageModel, v: Array) -> Array:
     only = replace(model, effects=tuple(e for e in model.effects if e.name == Creep.name))
     if not only.effects:
         return np.empty(0)
-    rise = np.linspace(model.scaling.range[0], v[0], round(RISE * model.sample_rate))
+    rise = np.linspace(model.scaling.range[0], v[0], max(round(RISE * model.sample_rate), 2))
     way = np.pad(rise, (0, round(HOLD * model.sample_rate)), 'edge')
     return only.stream().process(np.append(way, v))[way.size :] - only.stream().process(v)

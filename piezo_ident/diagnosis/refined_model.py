@@ -248,7 +248,7 @@ def _model(
                     for name, e in zip(('before', 'after'), errors, strict=False)
                 },
                 # of the kind of motion that the model knows least
-                'worst': float(max(errors[-1].by_segment.values(), default=np.nan)),
+                **({'worst': float(max(errors[-1].by_segment.values()))} if errors else {}),
             },
         },
     }

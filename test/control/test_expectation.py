@@ -46,6 +46,13 @@ def test_where_a_stage_is_that_creeps_is_promised_beside_its_shape(start, size):
     assert f'{1e9 * abs(e.mean()):.0f}'[0] in repr(drive)
 
 
+def test_a_stage_that_is_sampled_slowly_has_a_way_to_its_motion():
+    slow = replace(CREEPS, sample_rate=2.0)
+    drive = pi.invert(slow, 30e-6 + 1e-6 * np.sin(np.arange(40.0)))
+    # it begins long before
+    assert abs(drive.expected_offset) < 1e-9
+
+
 def test_a_model_without_creep_does_not_tell_where_a_stage_is():
     drive = pi.invert(replace(PAPER, identification=KNOWN), scan(40e-6, 1e-6))
     assert drive.expected_offset is None and 'unknown, the model has no creep' in repr(drive)
