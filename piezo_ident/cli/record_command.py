@@ -13,7 +13,7 @@ from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
 from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
 from piezo_ident.common.config import find_config
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import Program
@@ -34,6 +34,8 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
         check_file(out, overwrite=args.overwrite)
     else:
         _check_record_output(args, voltage_only=args.voltage_only)
+    if is_program or args.voltage_only:
+        _refuse_unused(args)
     files = {}
     for kind, name in (('stage', args.config), ('program', args.program)):
         check_link(Path(name))
@@ -93,6 +95,16 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     console.result(
         {**data, 'seed': seed, 'out': str(out), **data_of(record, losses), 'warnings': warnings}
     )
+
+
+def _refuse_unused(args: SimpleNamespace) -> None:
+    if args.storage is not None:
+        raise DataError(f'{args.out}: a storage is for bags only; leave it out')
+    if args.seed is not None:
+        raise ConfigError(
+            f'{args.out}: --seed is of the sensor noise, and nothing is measured; leave it out, '
+            'and write the seed of noise and multisines into the program'
+        )
 
 
 def _write_program(out: Path, program: Program, axes: int, console: Console) -> None:

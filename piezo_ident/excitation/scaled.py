@@ -45,7 +45,7 @@ def scaled(program: Program, limits: tuple[float, float], sample_rate: float) ->
 
     entries = []
     for entry in program.entries:
-        if entry.options.get('preset') == 'paper':
+        if entry.options.get('preset') == 'paper' and limits != program.limits:
             raise ConfigError(
                 f'{program.name}: preset: paper cannot be scaled; give peaks, base and slope'
             )

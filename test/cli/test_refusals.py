@@ -75,6 +75,11 @@ COMMANDS = (
     ('simulate --sample-rate 1000 T/r.csv', 'stage_paper.yaml', 'leave out --sample-rate'),
     ('simulate --limits 9 0 T/r.csv', '--limits', 'the lower one first'),
     ('simulate --voltage-only T/bag', 'T/bag', '.csv'),
+    *(
+        (f'simulate {option} {out}', option.split()[0].strip('-'), 'leave it out')
+        for option in ('--seed 2', '--storage mcap')
+        for out in ('T/p.yaml', '--voltage-only T/p.csv')
+    ),
     # options of bags, for tables
     ('identify R --namespace other', 'is for bags', 'record.npz'),
     ('predict M R --voltage-topic v', 'is for bags', 'record.npz'),

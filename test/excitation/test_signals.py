@@ -13,7 +13,7 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as ex
 from piezo_ident.excitation.catalogue import SIGNALS
 from piezo_ident.excitation.program import parse_program, Program
-from piezo_ident.excitation.scaled import scaled
+from piezo_ident.excitation.scaled import program_to_yaml, scaled
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import KINDS
 import pytest
@@ -343,6 +343,9 @@ def test_a_signal_with_voltages_of_its_own_is_not_scaled():
     p = program({'signal': 'triangle', 'preset': 'paper'})
     with pytest.raises(ConfigError, match='paper cannot be scaled'):
         scaled(p, (0.0, 100.0), FS)
+    # its own limits, and another rate
+    other = parse_program(program_to_yaml(scaled(p, p.limits, FS / 2)))
+    np.testing.assert_array_equal(other.build().v, p.build(FS / 2).v)
 
 
 HEAD = 'limits: [0, 10]\nsegments: [{signal: idle, duration: 1}]\n'
