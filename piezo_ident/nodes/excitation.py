@@ -190,8 +190,15 @@ class ExcitationNode(LabNode):
         self._thread.start()
         return (
             f'{_name(sequence)}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
-            f'{sequence.n} samples{self._unused(sequence)}'
+            f'{sequence.n} samples{self._unused(sequence)}{self._other_rate(sequence)}'
         )
+
+    def _other_rate(self, sequence: Sequence) -> str:
+        """Say where the rate of this node takes the place of that of the program."""
+        own, rate = read_program(self.values['program']).sample_rate, sequence.sample_rate
+        if own is None or own == rate:
+            return ''
+        return f'; at the {rate:g} Hz of this node, not at the {own:g} Hz of the program'
 
     def _unused(self, sequence: Sequence) -> str:
         """Say where a program leaves most of the range alone, as one of 0 .. 10 V does."""

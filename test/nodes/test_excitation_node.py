@@ -280,6 +280,13 @@ def test_bad_parameters_at_the_start_end_it_with_the_reason():
             assert reason in node.log
 
 
+def test_a_program_of_another_rate_is_said(lab):
+    assert lab.set('excitation', 'program', f'sample_rate: 10000\n{QUIET}') == (True, '')
+    ok, said = lab.call('excitation/start')
+    assert ok and 'at the 20000 Hz of this node, not at the 10000 Hz of the program' in said, said
+    lab.wait(lambda: state(lab) == 'done', 'the end')
+
+
 def test_it_says_what_it_drives_and_by_how_much_blocks_were_late(lab):
     assert lab.set('excitation', 'program', QUIET) == (True, '')
     since = len(lab.collect('voltage'))

@@ -117,6 +117,15 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     lab.wait(lambda: len(lab.texts('model')) == models + 1, 'the model')
 
 
+def test_a_stage_that_refuses_the_rate_ends_the_run():
+    with Graph() as g:
+        g.start_all(('excitation', {'sample_rate': 10_000.0}), ('stage',), ('identifier', QUICK))
+        text = ended(g, run(g, 'identification'), 'failed')
+        assert 'none at all; it says: a block is refused: it is sampled at 10000 Hz' in text
+        g.wait(lambda: g.status('excitation')['state'] == 'stopped', 'the excitation to stop')
+        assert float(g.status('excitation')['progress']) < 60.0
+
+
 def test_a_stage_that_stops_answering_in_a_run(lab):
     models, stage = len(lab.texts('model')), lab.handle('stage')
     assert lab.set('identifier', 'excitation_limit', 2.0)[0]

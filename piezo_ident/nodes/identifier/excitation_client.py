@@ -24,6 +24,8 @@ _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 _UNHEARD = 'unheard'
 #: how long the last blocks may be under way after the excitation says done [s]
 _TAIL = 1.0
+#: how long a stage that warns may leave the voltage unanswered [s]: a rate that it refuses, say
+_UNANSWERED = 3.0
 #: after how long a program that is not acknowledged is set once more [s]
 _AGAIN = 2.0
 
@@ -71,7 +73,8 @@ class ExcitationClient:
             )
         )
         node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
-        self._phase = ''
+        node.create_subscription(DiagnosticStatus, 'stage/status', self._hear_stage, LATCHED)
+        self._phase = self._trouble = ''
         self._future: Any = None
         self._asked = 0.0
         self._state, self._message = '', ''
@@ -148,10 +151,18 @@ class ExcitationClient:
             except ValueError:
                 pass
 
+    def _hear_stage(self, message: DiagnosticStatus) -> None:
+        text = {pair.key: pair.value for pair in message.values}.get('text', message.message)
+        self._trouble = '' if message.level == DiagnosticStatus.OK else text
+
     def poll(self) -> None:
         """Continue the run, or give it up after too long a silence."""
         if self._phase:
             getattr(self, f'_{self._phase}')()
+
+    @property
+    def _patience(self) -> float:
+        return min(self._limit, _UNANSWERED) if self._trouble else self._limit
 
     def _silent(self) -> bool:
         return time.monotonic() - self._sign > self._limit
@@ -237,12 +248,11 @@ class ExcitationClient:
                 self._end(None)
         elif started and self._state in _RESTING:
             self._end(f'the excitation ended early ({self._state}): {self._message}')
-        elif behind and heard and now - self._stage_sign > self._limit:
+        elif behind and heard and now - self._stage_sign > self._patience:
             at = streams.displacement_time
             since = 'none at all' if math.isnan(at) else f'since t = {at:.6g} s'
-            self._end(
-                f'no displacement from the stage for {self._limit:g} s, {since}; is it running?'
-            )
+            why = f'it says: {self._trouble}' if self._trouble else 'is it running?'
+            self._end(f'no displacement from the stage for {self._patience:g} s, {since}; {why}')
         elif self._silent():
             last = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
             self._end(f'no status of the excitation for {self._limit:g} s{last}')
