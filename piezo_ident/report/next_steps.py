@@ -7,23 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain, count
 import math
 import shlex
 
-from piezo_ident.diagnosis.next_experiment import next_experiment
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.diagnosis.next_experiment import Kind, next_experiment
 from piezo_ident.diagnosis.results import Diagnosis
+from piezo_ident.excitation.program import Program
+from piezo_ident.excitation.scaled import scaled
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.refined import changes
 from piezo_ident.report.table import listed, number
+from scipy.signal import correlate
 
 #: an error of so many times the sensor noise leaves little to find
 ENOUGH = 2.0
 #: the programs of the experiments
-PROGRAMS = {'sweeps': 'diagnosis', 'holds': 'holds'}
+PROGRAMS: dict[Kind, str] = {'sweeps': 'diagnosis', 'holds': 'holds'}
 #: what a lab records next; the name stands for a file that is not there yet
 OTHER = 'other.csv'
+#: a voltage is compared with a program by means over so long [s], which must correlate so well
+COARSE, SAME = 0.01, 0.98
 
 
 @dataclass(frozen=True)
@@ -117,15 +125,20 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
 
 def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
     records = [Record((residual.piece,), residual.record) for residual in result.residuals]
+    files = prompt.files(result.records)
+    names = chain([OTHER], (f'other_{k}.csv' for k in count(2)))
+    other = next(name for name in names if name not in files)
     experiment = None
     if result.verdict != 'none' or result.untestable:
-        experiment = next_experiment(result, records)
+        # the motions of a record without labels cannot be told apart
+        played = [k for k, name in PROGRAMS.items() if any(_plays(r, name) for r in records)]
+        experiment = next_experiment(result, records, played)
     if experiment is not None:
         program = PROGRAMS[experiment.kind]
         yield _experiment(experiment.reason, program, result.given, prompt)
         yield Step(
             'diagnose again, with that record',
-            prompt.command('diagnose', prompt.given, *prompt.files(result.records), OTHER),
+            prompt.command('diagnose', prompt.given, *files, other),
         )
     is_changed = bool(changes(result.given, result.model))
     if result.verdict == 'none' and not is_changed:
@@ -133,8 +146,38 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
     elif not result.unseen and is_changed:
         yield Step(
             'check the refined model on a record that took no part',
-            prompt.command('predict', prompt.model, OTHER),
+            prompt.command('predict', prompt.model, other),
         )
+
+
+def _plays(record: Record, name: str) -> bool:
+    """Return whether the voltage of a record is that of a shipped program, of any range."""
+    program = Program.load(name)
+    return any(_is_played(program, piece) for piece in record)
+
+
+def _is_played(program: Program, piece: Piece) -> bool:
+    # programs that are scaled take as long
+    rate = min(piece.sample_rate, 2000.0)
+    built = scaled(program, program.limits, rate).build()
+    wanted, v = _means(built.v, rate), _means(piece.v, piece.sample_rate)
+    # what was cut off at the ends is rest
+    wanted = wanted[wanted.size // 10 : -(wanted.size // 10)]
+    if v.size < wanted.size:
+        return False
+    wanted, v, window = wanted - wanted.mean(), v - v.mean(), np.ones(wanted.size)
+    mean, square = (correlate(x, window, 'valid') / wanted.size for x in (v, v**2))
+    moved = np.sqrt(np.maximum(square - mean**2, 1e-6 * float(v @ v) / v.size))
+    like = correlate(v, wanted, 'valid') / wanted.size
+    return bool(np.any(like > SAME * float(wanted.std()) * moved))
+
+
+def _means(v: Array, rate: float) -> Array:
+    """Return the means over `COARSE`."""
+    edges = np.arange(0.0, v.size / rate, COARSE)
+    total = np.concatenate([[0.0], np.cumsum(v)]) / rate
+    means: Array = np.diff(np.interp(edges, np.arange(v.size + 1) / rate, total)) / COARSE
+    return means
 
 
 def _experiment(reason: str, program: str, model: StageModel, prompt: Prompt) -> Step:

@@ -6,10 +6,15 @@
 from dataclasses import replace
 from html import unescape
 import shlex
+from types import SimpleNamespace
 
 from diagnosis_examples import example
+import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli.main import cli
+from piezo_ident.diagnosis.results import FoundEffect
+from piezo_ident.excitation.scaled import scaled
+from piezo_ident.record.record import Piece
 from piezo_ident.report import next_steps, Prompt
 import pytest
 
@@ -81,6 +86,28 @@ def test_a_diagnosis_asks_for_the_experiment_that_decides(verdict):
     assert [line.split()[:3] for line in check] == [
         ['piezo_ident', 'predict', 'new.yaml']
     ] * is_new
+
+
+@pytest.mark.parametrize(('rate', 'limits'), [(20_000.0, (0.0, 10.0)), (5_000.0, (-20.0, 130.0))])
+def test_what_a_record_without_labels_plays_is_not_asked_for_again(rate, limits):
+    effect = FoundEffect('rate_dependent_hysteresis', 'hidden', 0.99, 0.3, {})
+    rng, residuals = np.random.default_rng(0), []
+    for name, wanted in (('holds', 'diagnosis'), ('diagnosis', None)):
+        q = scaled(pi.Program.load(name), limits, rate).build()
+        # as an amplifier's monitor shows it, and recorded for longer
+        v = 0.97 * np.pad(q.v, (1234, 4321), mode='edge') + rng.normal(0.2, 0.02, q.n + 5555)
+        piece = Piece(v, np.zeros(v.size), rate)
+        residuals.append(SimpleNamespace(piece=piece, record=name))
+        found = replace(example('named'), effects=(effect,), untestable=())
+        result = replace(found, residuals=tuple(residuals))
+        asked = [line.split()[3] for line in commands(result) if ' simulate ' in line]
+        assert asked == ([wanted] if wanted else [])
+
+
+def test_a_record_that_is_there_is_not_named_as_the_next():
+    prompt = replace(NAMED, records={'val.npz': 'other.csv'})
+    _, diagnose, check = commands(example('named'), prompt)
+    assert 'old.yaml other.csv other_2.csv' in diagnose and ' other_2.csv' in check
 
 
 def test_a_model_that_lacks_nothing_is_used():
