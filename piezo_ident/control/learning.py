@@ -31,6 +31,7 @@ from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.faults import MAX_WILD, wild_readings
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95
@@ -164,6 +165,8 @@ class Learning:
         """
         Take what was measured under `drive`, correct it, and return the error [% of stroke].
 
+        Few wild readings are bridged by a straight line.
+
         Parameters
         ----------
         measured : array_like, shape (n,)
@@ -185,13 +188,13 @@ class Learning:
                 f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '
                 'finite number each'
             )
-        e = self._wanted - y[drive.lead :]
+        e = _bridged(self._wanted - y[drive.lead :], self._model_span)
         if np.abs(e).max() > FAR * self._model_span:
             raise DataError(
                 f'learning: the stage is {1e6 * np.abs(e).max():.4g} um off the wanted motion; is '
                 'it measured in metres?'
             )
-        for doubt in self._doubts(y):
+        for doubt in self._doubts(np.concatenate([y[: drive.lead], self._wanted - e])):
             raise DataError(f'learning: {doubt}')
         error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
@@ -230,3 +233,12 @@ class Learning:
         # another axis does not run against the model, but not with it, either
         if runs_against(pieces, self._model_span, below=WITH):
             yield REVERSED
+
+
+def _bridged(e: Array, stroke: float) -> Array:
+    """Return an error without wild readings: what is learned of one would be played."""
+    wild = wild_readings(e, stroke)
+    if not wild.any() or wild.mean() > MAX_WILD:
+        return e
+    k = np.arange(e.size)
+    return np.where(wild, np.interp(k, k[~wild], e[~wild]), e)

@@ -10,10 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.faults import AROUND, MAX_WILD, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
@@ -23,6 +25,8 @@ CATCH_UP = 1.0
 MOST = 500
 #: number of bins after which a late quantity is no longer waited for
 LAG = 25
+#: samples on either side by which a reading is judged
+EDGE = AROUND + 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,12 +240,16 @@ class TrackingError:
             Samples(pair.t, pair.y_hat - pair.y, pair.segment, 'tracking_error') for pair in pairs
         ]
         for error in errors:
-            self.live.add(error.t, error.values)
+            self.live.add(error.t, error.values, self._high - self._low)
         return errors
 
 
 class LiveError:
-    """Rms of the residual over a window of sample time [s]."""
+    """
+    Mean and rms of the residual over a window of sample time [s].
+
+    Wild readings are left out, as offline, where they are few.
+    """
 
     def __init__(self, window: float) -> None:
         self.window = window
@@ -250,11 +258,16 @@ class LiveError:
 
     def clear(self) -> None:
         """Forget all samples."""
-        # begin, end, samples and sum of squares of each stretch
-        self._parts: deque[tuple[float, float, int, float]] = deque()
+        # begin and end of each stretch; number, sum and sum of squares of what is kept, and wild
+        self._parts: deque[tuple[float, float, Array, Array]] = deque()
+        self._forget_last()
 
-    def add(self, t: NDArray[np.float64], residual: NDArray[np.float64]) -> None:
-        """Take the residual [m] of the next samples."""
+    def _forget_last(self) -> None:
+        # samples that came last, and how many of them are judged
+        self._last, self._judged = np.empty(0), 0
+
+    def add(self, t: Array, residual: Array, stroke: float = np.inf) -> None:
+        """Take the residual [m] of the next samples, of a stage of some stroke [m]."""
         e = residual[np.isfinite(residual)]
         if not e.size:
             return
@@ -263,9 +276,31 @@ class LiveError:
             return
         if kind is Kind.START:
             self.clear()
-        self._parts.append((float(t[0]), float(t[-1]), e.size, float(e @ e)))
+        elif kind is Kind.GAP:
+            self._forget_last()
+        self._parts.append((float(t[0]), float(t[-1]), *self._sorted(e, stroke)))
         while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
             self._parts.popleft()
+
+    def _sorted(self, e: Array, stroke: float) -> tuple[Array, Array]:
+        """Return the sums of what is kept and of what is wild, of all that has neighbours."""
+        wild = np.zeros(e.size, dtype=bool)
+        if np.isfinite(stroke):
+            x = np.concatenate([self._last, e])
+            begin, end = self._judged, max(self._judged, x.size - EDGE)
+            e, wild = x[begin:end], wild_readings(x, stroke)[begin:end]
+            first = max(0, end - EDGE)
+            self._last, self._judged = x[first:], end - first
+        kept, out = (np.array([x.size, x.sum(), x @ x]) for x in (e[~wild], e[wild]))
+        return kept, out
+
+    def _sums(self) -> tuple[Array, int]:
+        sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 3).sum(axis=0)
+        kept, out = sums[0], sums[1]
+        # what happens often is the way of the stage
+        if out[0] > MAX_WILD * (kept[0] + out[0]):
+            return kept + out, 0
+        return kept, int(out[0])
 
     @property
     def seconds(self) -> float:
@@ -273,7 +308,18 @@ class LiveError:
         return self._parts[-1][1] - self._parts[0][0] if self._parts else 0.0
 
     @property
+    def outliers(self) -> int:
+        """Samples of the window that are left out."""
+        return self._sums()[1]
+
+    @property
+    def mean(self) -> float:
+        """Mean [m]; NaN before the first sample."""
+        (n, total, _), _ = self._sums()
+        return float(total / n) if n else float('nan')
+
+    @property
     def rms(self) -> float:
         """Root mean square [m]; NaN before the first sample."""
-        n = sum(part[2] for part in self._parts)
-        return float(np.sqrt(sum(part[3] for part in self._parts) / n)) if n else float('nan')
+        (n, _, square), _ = self._sums()
+        return float(np.sqrt(square / n)) if n else float('nan')

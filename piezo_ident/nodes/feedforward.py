@@ -347,6 +347,9 @@ class FeedforwardNode(DrivingNode):
             # what was found before says nothing of now
             self._error.live.clear()
             self._faults.note('silent', 'no displacement comes from the stage', 0)
+        if outliers := self._error.live.outliers:
+            about = 'wild readings of displacement are left out of the tracking error'
+            self._faults.note('outliers', f'{outliers} {about}', 0)
         # a figure that changed with each block would flood the status
         self._told = self._error.percent
         self.report_state()

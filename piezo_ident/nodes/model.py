@@ -148,13 +148,15 @@ class ModelNode(LabNode):
             self._compare(self._matcher.measured(samples))
 
     def _compare(self, pairs: list[Matched]) -> None:
+        model = self._predictor.model
+        stroke = abs(model.scaling.Y) if model else float('inf')
         for pair in pairs:
             residual = pair.residual
             self._compared += residual.t.size
             self._residual.publish(to_message(residual))
             self._publish_preview(self._preview.add('residual', residual.t, residual.values))
             if self._predictor.memory_known:
-                self._error.add(residual.t, residual.values)
+                self._error.add(residual.t, residual.values, stroke)
 
     def _publish_preview(self, bins: list[PreviewBin]) -> None:
         for b in bins:
@@ -184,10 +186,18 @@ class ModelNode(LabNode):
         ratio = self.values['warn_ratio']
         if before is None or now <= ratio * before:
             return ''
-        return (
-            f'identify again, or diagnose on this motion: the live error is {now:.3g} % of '
-            f'stroke, {now / before:.1f} times that at identification'
-        )
+        said = f'{now:.3g} % of stroke, {now / before:.1f} times that at identification'
+        mean = percent(self._error.mean, abs(model.scaling.Y))
+        if now**2 - mean**2 <= (ratio * before) ** 2:
+            return (
+                f'the displacement is a constant {mean:+.3g} % of stroke off the prediction, as '
+                f'creep from motion before the stream leaves it, or a zero that moved: {said}'
+            )
+        return f'identify again, or diagnose on this motion: the live error is {said}'
+
+    def _left_out(self) -> str:
+        n = self._error.outliers
+        return f'{n} wild readings of displacement are left out of the live error' if n else ''
 
     def _mismatch(self) -> str:
         """Return why predictions cannot be judged, empty when they can; once a second."""
@@ -212,7 +222,7 @@ class ModelNode(LabNode):
     def _report_state(self) -> None:
         fresh = [p for p, at in self._problems.items() if time.monotonic() - at < REMEMBER]
         self._problems = {p: self._problems[p] for p in fresh[-MOST:]}
-        problems = [self._refusal, *self._problems]
+        problems = [self._refusal, *self._problems, self._left_out()]
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
         if self._predictor.model is not None and self._predictor.memory_lost:
@@ -249,7 +259,9 @@ class ModelNode(LabNode):
         values['memory_known'] = p.memory_known
         values['residual_rms'] = f'{self._error.rms:.6g}'
         values['residual_percent'] = f'{self._live_error(model):.4g}'
-        problems = [mismatch or self._verdict()]
+        values['residual_mean'] = f'{self._error.mean:.6g}'
+        values['outliers'] = self._error.outliers
+        problems = [mismatch or self._verdict(), self._left_out()]
         if p.memory_lost:
             problems.append('the memory is unknown until the voltage has been at its lowest')
         if low <= high:

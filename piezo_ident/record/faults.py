@@ -11,12 +11,22 @@ from dataclasses import replace
 import difflib
 
 import numpy as np
+from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
-__all__ = ['line_error', 'misspelt', 'quantum_of', 'suspicions', 'without_faults']
+__all__ = [
+    'AROUND',
+    'MAX_WILD',
+    'line_error',
+    'misspelt',
+    'quantum_of',
+    'suspicions',
+    'wild_readings',
+    'without_faults',
+]
 
 Runs = list[tuple[int, int]]
 
@@ -78,6 +88,22 @@ def without_faults(record: Record) -> Record:
         for name, times in met.items()
     ]
     return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
+
+
+def wild_readings(error: Array, stroke: float) -> NDArray[np.bool_]:
+    """
+    Return which readings are wild, of measured minus predicted displacement [m].
+
+    What the voltage does is in the prediction.
+
+    >>> wild_readings(np.array([0.0] * 9 + [1.0] + [0.0] * 9), stroke=10.0).nonzero()[0]
+    array([9])
+    """
+    wild = np.zeros(error.size, dtype=bool)
+    if error.size > 1 and np.abs(np.diff(error)).max() > LEAST * stroke:
+        for a, b in _alone(error, LEAST * stroke):
+            wild[a:b] = True
+    return wild
 
 
 def _overlaps(run: tuple[int, int], others: Runs) -> bool:

@@ -42,6 +42,20 @@ def test_the_error_of_effects_that_the_model_lacks_falls_and_the_best_is_kept():
     assert learning.best.error == min(errors) < 0.01
 
 
+@pytest.mark.parametrize('wild', [0.0, 3 * 75e-6, 1.0])
+def test_wild_readings_are_not_learned(wild):
+    stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
+    learning, rng = pi.Learning(PAPER, RASTER), np.random.default_rng(0)
+    for _ in range(3):
+        true = stage.simulate(learning.drive.v)
+        y = true.copy()
+        y[rng.integers(100, y.size - 100, 3)] = wild
+        e = RASTER - true[learning.drive.lead :]
+        said = learning.take(y)
+        assert said == pytest.approx(100 * np.sqrt(np.mean(e**2)) / np.ptp(RASTER), rel=1e-3)
+    assert said < 0.02
+
+
 def test_it_ends_at_the_noise():
     rng = np.random.default_rng(5)
     learning = pi.Learning(PAPER, RASTER)

@@ -365,6 +365,32 @@ def test_live_error_is_the_rms_of_the_window():
         assert short.rms == 2.0
 
 
+@pytest.mark.parametrize('size', [2, 7, 100, 4000])
+def test_live_error_leaves_out_what_is_wild(size):
+    rng, n = np.random.default_rng(0), 8000
+    e, live = rng.normal(1e-7, 1e-8, n), LiveError(1.0)
+    rms, mean = np.sqrt(np.mean(e**2)), e.mean()
+    wild = np.array([99, 100, 700, 1399, 4000, 4001, 4002])
+    e[wild] = 1.0
+    for k in range(0, n, size):
+        live.add(block(k, size).t, e[k : k + size], 75e-6)
+    assert live.outliers == wild.size
+    assert (live.rms, live.mean) == pytest.approx((rms, mean), rel=1e-3)
+    # what happens often is the way of the stage
+    often = LiveError(1.0)
+    e[::15] = 1.0
+    for k in range(0, n, size):
+        often.add(block(k, size).t, e[k : k + size], 75e-6)
+    assert often.outliers == 0 and often.rms > 0.2
+
+
+def test_live_error_starts_afresh_behind_a_gap():
+    live = LiveError(1.0)
+    for first, level in ((0, 0.0), (200, 1e-6)):
+        live.add(block(first, 100).t, np.full(100, level), 75e-6)
+    assert live.outliers == 0 and live.seconds == pytest.approx(0.03, abs=1e-3)
+
+
 @pytest.mark.parametrize('t', [np.array([0.0, 1.0, 2.0, 5.0, 6.0]) / RATE, 1e-9 * np.arange(100)])
 def test_ragged_time_and_clocks_faster_than_any_card_are_left_out(t):
     predictor = Predictor()

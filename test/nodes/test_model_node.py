@@ -264,10 +264,9 @@ def test_it_says_when_to_identify_again(fast):
         if first:
             send(fast, blocks(8000, 8000))
             _, y = heard(fast, 'prediction', since['prediction'] + 80, 80)
-        for block, part in zip(blocks(8000, first), np.split(y, 80), strict=True):
-            fast.publish(
-                'displacement', Samples(block.t, part + level, block.segment, 'displacement')
-            )
+        for k, (block, part) in enumerate(zip(blocks(8000, first), np.split(y, 80), strict=True)):
+            y = part + level * (-1) ** k
+            fast.publish('displacement', Samples(block.t, y, block.segment, 'displacement'))
             time.sleep(0.0005)
         fast.wait(
             lambda level=level, verdict=verdict: (
@@ -283,6 +282,23 @@ def test_it_says_when_to_identify_again(fast):
     assert fast.set('model', 'warn_ratio', 10.0) == (True, '')
     fast.wait(lambda: fast.diagnostics('model')['message'] == 'predicting', 'taken back')
     assert fast.set('model', 'warn_ratio', 3.0) == (True, '')
+
+
+def test_a_constant_error_is_said_and_wild_readings_are_left_out(fast):
+    reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.1}}))
+    _, v = sine(8000)
+    y = model_of(paper()).stream().process(v, np.arange(8000) / FS) + 0.5e-2 * 75e-6
+    # lost words, also on both sides of the end of a block
+    y[4950::500] = 1.0
+    y[5099:5101] = 0.0
+    judged(fast, blocks(8000), y)
+    said = 'wild readings of displacement are left out of the live error'
+    fast.wait(lambda: said in fast.diagnostics('model')['message'], 'the wild readings')
+    d = fast.diagnostics('model')
+    assert d['message'].startswith('the displacement is a constant +0.5 % of stroke off')
+    assert float(d['residual_rms']) == pytest.approx(0.5e-2 * 75e-6, rel=1e-3)
+    assert float(d['residual_mean']) == pytest.approx(0.5e-2 * 75e-6, rel=1e-3)
+    assert d['outliers'] == '9' and f'9 {said}' in fast.status('model')['text']
 
 
 def judged(g, several, y):
