@@ -60,9 +60,16 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
         missing[kind] = max(missing[kind], (sent or {}).get(kind, 0.0) - present[kind])
         whole = present[kind] + missing[kind]
         if missing[kind] > MAX_MISSING * whole:
+            guarded = [f.where for f in record.faults if f.name == 'guarded_voltage']
+            cure = (
+                f'the stage did not apply what was commanded, {guarded[0]}; look at its limits '
+                'and its slew'
+                if guarded
+                else 'find what loses samples, and run the program again'
+            )
             raise DataError(
                 f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
-                'are missing or not usable; find what loses samples, and run the program again'
+                f'are missing or not usable; {cure}'
             )
 
 

@@ -27,6 +27,8 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Segment
 
 #: samples in a block by default
+#: share of a sample by which times of ticks may be rounded
+ROUNDING = 1e-5
 BLOCK_SIZE = 100
 
 
@@ -81,8 +83,9 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
     """
     Return the samples of a block, from the numbers of its message, shape (2 n,), and their layout.
 
-    The numbers are not copied; `data_offset` is how many stand in front of the matrix.  DataError
-    when the layout is not that of a block, or does not fit the data.
+    The numbers are not copied; `data_offset` is how many stand in front of the matrix.  Times of
+    the ticks of a whole rate are k / rate, or streams would not meet on them: k times the period
+    is another number.  DataError when the layout is not that of a block, or does not fit the data.
     """
     flat = np.asarray(data, dtype=np.float64)
     quantity = quantity_of(dims)
@@ -102,7 +105,18 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
     if kind != 'sample':
         raise DataError(f"first dimension is {dims[0].label!r}, not 'sample:<segment>'")
     matrix = flat[data_offset:].reshape(n, 2)
-    return Samples(matrix[:, 0], matrix[:, 1], segment, quantity)
+    return Samples(_on_ticks(matrix[:, 0]), matrix[:, 1], segment, quantity)
+
+
+def _on_ticks(t: Array) -> Array:
+    """Return times as ticks over their rate, where they are that but for rounding."""
+    span = float(t[-1] - t[0]) if t.size > 1 else 0.0
+    rate = (t.size - 1) / span if 0.0 < span < np.inf else 0.0
+    # times that are no numbers, or jump, are for others to meet
+    if not 1.0 <= rate < 1e9 or abs(rate / round(rate) - 1.0) > ROUNDING:
+        return t
+    exact: Array = np.rint(t * round(rate)) / round(rate)
+    return np.where(np.abs(t - exact) * rate < ROUNDING, exact, t)
 
 
 def cut_blocks(

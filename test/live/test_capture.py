@@ -4,6 +4,8 @@
 
 """Blocks as they come to a record: the same as by way of a bag, and every fault said."""
 
+from dataclasses import replace
+
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.capture import Capture, refuse_incomplete
@@ -222,6 +224,16 @@ def test_too_much_missing_in_a_segment_is_refused(record):
     edge = without(blocks_of(record), *(('displacement', k) for k in range(45, 55)))
     with pytest.raises(DataError, match='of the step segments'):
         refuse_incomplete(capture_of(edge).record())
+
+
+def test_a_stage_that_applies_something_else_is_said(record):
+    middle = float(np.median(record.pieces[0].v))
+    blocks = [
+        (key, replace(b, values=np.minimum(b.values, middle)) if key == APPLIED else b)
+        for key, b in blocks_of(record)
+    ]
+    with pytest.raises(DataError, match=r'did not apply what was commanded, at 0.*limits'):
+        refuse_incomplete(capture_of(blocks).record())
 
 
 def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):

@@ -37,6 +37,18 @@ def test_layouts_that_do_not_fit(dims, reason):
         decode(np.zeros(4), dims)
 
 
+@pytest.mark.parametrize('rate', [20_000.0, 44_100.0, 16_384.5])
+def test_ticks_times_the_period_meet_ticks_over_the_rate(rate):
+    k = np.arange(100) + 12_345
+    blocks = [decode(*encode(Samples(t, 1.0 * k))) for t in (k / rate, k * (1.0 / rate))]
+    np.testing.assert_array_equal(blocks[0].t, k / rate)
+    is_whole = rate == round(rate)
+    assert np.array_equal(blocks[1].t, k / rate) == is_whole
+    # what lies between ticks, or is no number, stays
+    for t in ((k + 0.01) / rate, np.where(k == 12_400, np.nan, k / rate), 1e9 + k / rate):
+        np.testing.assert_array_equal(decode(*encode(Samples(t, 1.0 * k))).t, t)
+
+
 def test_no_block_spans_two_segments():
     segments = (Segment('noise', 130, 400), Segment('sine:50Hz', 400, 1050))
     got = list(cut_blocks(1050, segments))

@@ -200,7 +200,7 @@ class ExcitationClient:
             self._end(f'the excitation refuses the program: {result.reason}')
             return
         self._first, self._active, self._done = self._streams(), False, 0.0
-        self._seen, self._stage_sign = self._first, time.monotonic()
+        self._seen, self._stage_sign, self._slowest = self._first, time.monotonic(), 0.0
         self._state, self._message = _UNHEARD, ''
         self._phase, self._sign = 'starting', time.monotonic()
         self._future = self._start.call_async(Trigger.Request())
@@ -239,12 +239,16 @@ class ExcitationClient:
         behind = streams.displacement_time != streams.voltage_time
         gone_on = _moved(streams.displacement_time, self._seen.displacement_time)
         if gone_on or not behind or not heard:
+            if heard:
+                self._slowest = max(self._slowest, now - self._stage_sign)
             self._stage_sign = now
         self._seen = streams
         started = self._active or heard
         if started and self._state == 'done':
             self._done = self._done or now
-            if not behind or now - self._done > _TAIL:
+            # a driver that sends its answers in batches is as late with the last
+            late = now - max(self._done, self._stage_sign)
+            if not behind or late > max(_TAIL, 2.0 * self._slowest):
                 self._end(None)
         elif started and self._state in _RESTING:
             self._end(f'the excitation ended early ({self._state}): {self._message}')

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from piezo_ident.nodes.identifier import excitation_client
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
 from rcl_interfaces.msg import SetParametersResult
@@ -85,3 +86,36 @@ def test_a_program_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, r
         assert setter.calls > 2 and starter.calls == 0
     # requests that were given up are forgotten
     assert len(setter.waited_for) == 1
+
+
+@pytest.mark.parametrize('is_late', [True, False])
+def test_the_last_answers_of_a_late_driver_are_waited_for(monkeypatch, is_late):
+    clock, nan = [100.0], float('nan')
+    monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
+    sent, answered, ends = [nan], [nan], []
+    client = ExcitationClient(
+        Node(0), lambda: Streams(int(sent[0] > 0.0), sent[0], answered[0]), lambda: ''
+    )
+    client.start('a program', 20.0, ends.append)
+    for k in range(200):
+        clock[0] += 0.05
+        client.poll()
+        if k < 5:
+            continue
+        # three seconds of voltage, and all that is older than two, every 1.5 s
+        sent[0] = min(0.05 * (k - 4), 3.0)
+        if not is_late:
+            answered[0] = min(sent[0], 2.5)
+        elif k % 30 == 0:
+            answered[0] = min(0.05 * (k - 4) - 2.0, 3.0)
+        if sent[0] == 3.0:
+            values = [KeyValue(key='state', value='done')]
+            client._hear(DiagnosticStatus(values=values))
+        if ends:
+            break
+    assert ends == [None]
+    if is_late:
+        assert answered[0] == 3.0
+    else:
+        # what is lost is not waited for
+        assert 0.05 * (k - 4) < 4.2
