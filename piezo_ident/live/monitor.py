@@ -84,6 +84,11 @@ class Matcher:
         self.unmatched = self.unmeasured = 0
         self._predicted, self._measured = _Side(), _Side()
 
+    @property
+    def late(self) -> int:
+        """Measured samples that came again or out of turn."""
+        return self._measured.clock.late
+
     def predicted(self, samples: Samples) -> list[Matched]:
         """Take a predicted block; return the pairs that it completes."""
         pairs = self._match(samples, self._predicted, self._measured)

@@ -48,6 +48,8 @@ class ModelNode(LabNode):
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
         # samples of the last second, and seconds in which too few were compared
         self._predicted, self._measured, self._compared, self._unmet = 0, 0, 0, 0
+        # samples of displacement that came again, until the last second
+        self._again = 0
         self._models = 0
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
@@ -251,6 +253,7 @@ class ModelNode(LabNode):
             'unmatched': self._matcher.unmatched,
             'unmeasured': self._matcher.unmeasured,
         }
+        again, self._again = self._matcher.late - self._again, self._matcher.late
         (low, high), self._range = self._range, (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, now, 0.0
         model = p.model
@@ -262,6 +265,9 @@ class ModelNode(LabNode):
         values['residual_mean'] = f'{self._error.mean:.6g}'
         values['outliers'] = self._error.outliers
         problems = [mismatch or self._verdict(), self._left_out()]
+        if again:
+            about = 'samples of displacement came again or out of turn: do two nodes publish it?'
+            problems.append(f'{again} {about}')
         if p.memory_lost:
             problems.append('the memory is unknown until the voltage has been at its lowest')
         if low <= high:

@@ -349,7 +349,10 @@ def _left_over(name: str, t: Array, x: Array, left: Mask) -> list[Fault]:
     clash = np.flatnonzero(same_time & ~same_value & close & one_left)
     if clash.size:
         at = t[by][clash[0]]
-        raise DataError(f'two different samples of {name} at t = {at:.9g} s; keep one of them')
+        raise DataError(
+            f'two different samples of {name} at t = {at:.9g} s; keep one of them, and end the '
+            'other where two nodes publish it'
+        )
     twin = np.zeros(left.size, dtype=np.bool_)
     twin[by[1:][same_time & same_value]] = True
     twin[by[:-1][same_time & same_value]] = True

@@ -309,6 +309,18 @@ def judged(g, several, y):
     g.wait(lambda: g.diagnostics('model').get('residual_rms', 'nan') != 'nan', 'an error')
 
 
+def test_two_stages_at_once_are_said(fast):
+    reset(fast)
+    several = blocks(4000)
+    for block in several:
+        fast.publish('voltage', block)
+        for level in (0.0, 1e-6):
+            y = np.full(block.t.size, level)
+            fast.publish('displacement', Samples(block.t, y, block.segment, 'displacement'))
+    said = 'samples of displacement came again or out of turn: do two nodes publish it?'
+    fast.wait(lambda: any(said in d['message'] for d in fast.diagnoses('model')), said)
+
+
 def test_an_error_of_the_past_is_not_shown_when_nothing_can_be_judged(fast):
     reset(fast)
     judged(fast, blocks(4000), np.zeros(4000))
