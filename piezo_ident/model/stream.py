@@ -16,6 +16,7 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import cascade, STRETCH
+from piezo_ident.record.gaps import follows, played_before
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
@@ -92,9 +93,12 @@ class Stream:
         return y
 
     def bridge(self, one: Piece, other: Piece) -> None:
-        """Cross the gap between two pieces of one clock on a straight line of voltage."""
-        missing = round((other.start_time - one.start_time) * one.sample_rate) - one.n
-        if missing <= 0:
+        """Cross the gap between two pieces of one clock, over a straight line if it is unknown."""
+        if played := played_before(one, other):
+            self.follow(played)
+            return
+        missing = follows(one, other)
+        if not missing:
             return
         share = np.arange(1, missing + 1) / (missing + 1)
 

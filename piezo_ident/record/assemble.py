@@ -17,7 +17,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
@@ -47,6 +47,8 @@ VOLTAGE = (1e-12, 1e12)
 LOST = 1e-6
 #: share of samples without a number that can be cut out
 MAX_NOT_FINITE = 0.01
+#: the same of a displacement whose voltage is known
+MAX_NOT_MEASURED = 0.3
 #: later times [s] are counted in another unit than seconds
 MAX_TIME = 1e11
 
@@ -174,20 +176,34 @@ def _table(
 
 
 def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> OrderedRows:
+    """Drop rows without a number; where only y has none it is NaN, and the row stays."""
     finite = np.isfinite(table.t)
-    for x in table.columns.values():
-        finite &= np.isfinite(x)
+    for key, x in table.columns.items():
+        if key != 'y':
+            finite &= np.isfinite(x)
+    y = table.columns.get('y', table.t)
+    unmeasured = finite & ~np.isfinite(y)
     bad = finite.size - int(np.count_nonzero(finite))
-    if not bad:
+    alone = int(np.count_nonzero(unmeasured))
+    if not (bad or alone):
         return table
-    if bad > MAX_NOT_FINITE * finite.size:
-        raise DataError(
-            f'{name}: {bad} of {finite.size} samples are NaN or infinite, more than 1 %; '
-            'cut the bad stretch out of the file'
-        )
+    for count, most, what, cure in (
+        (bad, MAX_NOT_FINITE, 'samples', 'cut the bad stretch out of the file'),
+        (alone, MAX_NOT_MEASURED, 'displacements', 'leave out the rows without one'),
+    ):
+        if count > most * finite.size:
+            raise DataError(
+                f'{name}: {count} of {finite.size} {what} are NaN or infinite, more than '
+                f'{100 * most:g} %; {cure}'
+            )
+    missing = unmeasured | ~finite
+    where = at_times(table.t[missing & np.isfinite(table.t)])
+    action = 'cut out' if bad else 'left out, its voltage is kept'
+    met.append(Fault('not_finite', where, bad + alone, f'{action}, record split there'))
+    if alone:
+        columns = {**table.columns, 'y': np.where(unmeasured, np.nan, y)}
+        table = replace(table, columns=columns)
     rows = np.flatnonzero(finite)
-    where = at_times(table.t[~finite][np.isfinite(table.t[~finite])])
-    met.append(Fault('not_finite', where, bad, 'cut out, record split there'))
     torn = np.flatnonzero(np.diff(rows) > 1) + 1
     return replace(table.take(rows), torn=torn)
 
@@ -210,7 +226,7 @@ def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: 
 def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     """Refuse times, voltages and strokes that no piezo stage has."""
     ends = {'t': table.t, **table.columns}
-    ranges = {k: (float(x.min()), float(x.max())) for k, x in ends.items() if k in 'tvy'}
+    ranges = {k: (float(np.nanmin(x)), float(np.nanmax(x))) for k, x in ends.items() if k in 'tvy'}
     latest = max(map(abs, ranges['t']))
     if latest > MAX_TIME:
         raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
@@ -258,12 +274,16 @@ def _pieces(
         raise DataError(
             f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
         )
-    short = [p for p in parts if p[1] - p[0] < MIN_PIECE]
+    short = [p[0] for p in parts if p[1] - p[0] < MIN_PIECE]
     parts = [p for p in parts if p[1] - p[0] >= MIN_PIECE]
     if not parts:
         raise DataError(f'{name}: no two samples belong together; check the time column')
+    y = table.columns.get('y', t)
+    gone = np.isnan(y)
+    lone = gone[:-2] & ~gone[1:-1] & gone[2:]
+    short += (np.flatnonzero(lone) + 1).tolist()
     if short:
-        met.append(Fault('lone_sample', at_times(t[[p[0] for p in short]]), len(short), 'dropped'))
+        met.append(Fault('lone_sample', at_times(np.sort(t[short])), len(short), 'dropped'))
     clocks = _clocks(t, parts, resolution, name, sample_rate, met)
     rates: dict[bool, set[float]] = {True: set(), False: set()}
     for (start, stop), clock in zip(parts, clocks, strict=True):
@@ -271,7 +291,10 @@ def _pieces(
     if len(rates[True] - rates[False]) > MOST_RATES:
         raise _not_uniform(t, parts, name)
     _report_breaks(table, epochs, parts, clocks, met)
-    return tuple(_piece(table, p, c) for p, c in zip(parts, clocks, strict=True))
+    pieces = [_piece(table, p, c) for p, c in zip(parts, clocks, strict=True)]
+    if 'y' not in table.columns:
+        return tuple(pieces)
+    return tuple(part for piece in pieces for part in piece.without(true_runs(np.isnan(piece.y))))
 
 
 def _not_uniform(t: Array, parts: list[tuple[int, int]], name: str) -> DataError:

@@ -55,9 +55,9 @@ def without_faults(record: Record) -> Record:
     Return a record without readings that cannot be the stage's.
 
     Up to three wild or lost readings in a row, among quiet neighbours, are bridged by a straight
-    line.  Longer ones, where the sensor hangs or drops out, are cut out as samples without a
-    number are.  What is found is counted in the faults of the record; where nothing is, the same
-    record is returned.
+    line.  Longer ones, where the sensor hangs or drops out, are left out, and the voltage there is
+    kept as that of samples without a number is.  What is found is counted in the faults of the
+    record; where nothing is, the same record is returned.
     """
     stroke, span = record.stroke, float(np.ptp(record.voltage_range))
     if stroke == 0.0:
@@ -73,7 +73,7 @@ def without_faults(record: Record) -> Record:
                 name = 'stuck' if not is_lost else 'lost' if piece.y[a] == 0.0 else 'outliers'
                 counts[name] += b - a
                 met.setdefault(name, []).append(float(piece.time(a, a + 1)[0]))
-        pieces += _cut_out(_bridged_over(piece, wild, span), held)
+        pieces += _bridged_over(piece, wild, span).without(held)
     hangs = counts['stuck']
     is_way = hangs > MAX_HELD * record.n or counts.total() - hangs > MAX_WILD * record.n
     if not counts.total() or is_way or not pieces:
@@ -83,7 +83,9 @@ def without_faults(record: Record) -> Record:
             name,
             at_times(np.array(times)),
             counts[name],
-            'left out, record split there' if name == 'stuck' else 'left out, bridged',
+            'left out, its voltage is kept, record split there'
+            if name == 'stuck'
+            else 'left out, bridged',
         )
         for name, times in met.items()
     ]
@@ -178,7 +180,9 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
         drive = float(np.ptp(v[a:late])) / span if span else 0.0
         around = np.concatenate([v[max(0, a - AROUND) : a], v[b : b + AROUND]])
         outside = abs(float(np.median(v[a:b])) - float(np.median(around))) / span if span else 0.0
-        hangs = drive > MOVED and abs(leave) > max(least, 0.3 * drive * stroke)
+        # the voltage may be back where it was
+        net = abs(float(v[late - 1] - v[a])) / span if span else 0.0
+        hangs = drive > MOVED and abs(leave) > max(least, 0.3 * net * stroke)
         drops = (
             min(abs(entry), abs(leave)) > least
             and entry * leave < 0.0
@@ -209,12 +213,6 @@ def _bridged_over(piece: Piece, runs: Runs, span: float) -> Piece:
             if is_wild or np.abs(x[a:b] - line).min() > max(FAR * steps, 0.05 * span):
                 x[a:b] = line
     return replace(piece, v=v, y=y)
-
-
-def _cut_out(piece: Piece, runs: Runs) -> list[Piece]:
-    marks = [0, *(mark for run in runs for mark in run), piece.n]
-    kept = [(a, b) for a, b in zip(marks[::2], marks[1::2], strict=True) if b - a > 1]
-    return [piece] if not runs else [piece.cut(a, b) for a, b in kept]
 
 
 def line_error(pieces: Iterable[Piece]) -> float:

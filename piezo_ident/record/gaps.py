@@ -6,8 +6,9 @@ Short gaps in a record, bridged for fitting.
 
 Reading splits a record wherever samples are missing.  A stage does not forget there: over a short
 gap its voltage moved on from where it was to where it is next, and its plays with it.  So pieces
-of one clock are joined by straight lines, and what was not measured, with the moment after it, is
-kept from every fit and every error.
+of one clock are joined by straight lines, or by the voltage that was played where the displacement
+alone is missing, however long.  What was not measured, with the moment after it, is kept from
+every fit and every error.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.record.record import Piece, Record, Segment
 
-__all__ = ['LONGEST', 'Bridged', 'bridged', 'connected_pieces', 'follows']
+__all__ = ['LONGEST', 'Bridged', 'bridged', 'connected_pieces', 'follows', 'played_before']
 
-#: longest gap that is bridged [s]
+#: longest gap that is bridged by a straight line [s]
 LONGEST = 1.0
 #: time after a gap in which the dynamics may still answer to what was not measured [s]
 SETTLING = 0.01
@@ -33,7 +34,7 @@ class Bridged:
     A piece with its gaps filled.
 
     `sound` are the samples that were measured, and at which a gap before them has died away;
-    `gaps` and `filled` are the number of gaps, and of samples in them.
+    `gaps` and `filled` are the number of gaps without a voltage, and of samples in them.
     """
 
     piece: Piece
@@ -48,10 +49,17 @@ def follows(one: Piece, other: Piece) -> int | None:
         return None
     elapsed = (other.start_time - one.start_time) * one.sample_rate
     missing = round(elapsed) - one.n
+    longest = max(LONGEST * one.sample_rate, other.before.n if other.before else 0)
     # ticks of one clock, however it was rounded in the file
-    if abs(elapsed - round(elapsed)) > 0.1 or not 0 <= missing <= LONGEST * one.sample_rate:
+    if abs(elapsed - round(elapsed)) > 0.1 or not 0 <= missing <= longest:
         return None
     return missing
+
+
+def played_before(one: Piece, other: Piece) -> Piece | None:
+    """Return the samples between two pieces where all but their displacement is known."""
+    before = other.before
+    return before if before is not None and before.n == follows(one, other) else None
 
 
 def connected_pieces(record: Record) -> list[list[Piece]]:
@@ -79,31 +87,39 @@ def _joined(pieces: list[Piece]) -> Bridged:
     for one, other in itertools.pairwise(pieces):
         starts.append(starts[-1] + one.n + (follows(one, other) or 0))
     n = starts[-1] + pieces[-1].n
-    measured = np.zeros(n, dtype=bool)
-    for start, piece in zip(starts, pieces, strict=True):
-        measured[start : start + piece.n] = True
+    played: list[tuple[int, Piece]] = [(0, first)]
+    for (one, other), start in zip(itertools.pairwise(pieces), starts[1:], strict=True):
+        if before := played_before(one, other):
+            played.append((start - before.n, before))
+        played.append((start, other))
 
-    k, known = np.arange(n), np.flatnonzero(measured)
+    def fill(parts: list[tuple[int, Array]]) -> tuple[Array, Mask]:
+        known = np.zeros(n, dtype=bool)
+        for start, x in parts:
+            known[start : start + x.size] = True
+        values = np.concatenate([x for _, x in parts])
+        return np.interp(np.arange(n), np.flatnonzero(known), values), known
 
-    def fill(parts: list[Array]) -> Array:
-        return np.interp(k, known, np.concatenate(parts))
-
+    y, measured = fill([(start, p.y) for start, p in zip(starts, pieces, strict=True)])
+    v, driven = fill([(start, p.v) for start, p in played])
     sound = measured.copy()
     settle = max(1, round(SETTLING * first.sample_rate))
     for start in starts[1:]:
         sound[start : start + settle] = False
     return Bridged(
         piece=Piece(
-            v=fill([p.v for p in pieces]),
-            y=fill([p.y for p in pieces]),
+            v=v,
+            y=y,
             sample_rate=first.sample_rate,
             start_time=first.start_time,
             segments=_segments(pieces, starts),
-            channels={k: fill([p.channels[k] for p in pieces]) for k in first.channels},
+            channels={
+                k: fill([(start, p.channels[k]) for start, p in played])[0] for k in first.channels
+            },
         ),
         sound=sound,
-        gaps=len(pieces) - 1,
-        filled=int(n - measured.sum()),
+        gaps=len(true_runs(~driven)),
+        filled=int(n - driven.sum()),
     )
 
 

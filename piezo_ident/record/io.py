@@ -217,12 +217,16 @@ def write(
         raise DataError(f'{path}: unknown format {suffix}; give {_WRITTEN}')
     if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
+    rows = record
     if is_bag:
         write_bag(record, path, storage=storage, overwrite=overwrite, custom_data=custom_data)
     else:
-        write_columns(path, blocks_of(record), *labels_of(record), overwrite=overwrite)
+        # where the displacement alone is unknown, NaN keeps the voltage
+        every = (part for piece in record for part in (piece.before, piece) if part)
+        rows = replace(record, pieces=tuple(every))
+        write_columns(path, blocks_of(rows), *labels_of(rows), overwrite=overwrite)
     notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
-    return notes + _losses(record)
+    return notes + _losses(record, rows)
 
 
 def write_columns(
@@ -257,16 +261,16 @@ def _check_labels(record: Record, path: Path) -> None:
             raise DataError(f'{path}: channel name {name!r} cannot be read back')
 
 
-def _losses(record: Record) -> tuple[str, ...]:
-    """Read the columns as a reader would, and say what differs."""
+def _losses(record: Record, rows: Record) -> tuple[str, ...]:
+    """Read the columns of the rows as a reader would, and say what differs from the record."""
 
     def whole(parts: list[Array]) -> Array:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    t, v, y = (whole([getattr(p, name) for p in record]) for name in 'tvy')
-    channels = {k: whole([p.channels[k] for p in record]) for k in record.pieces[0].channels}
+    t, v, y = (whole([getattr(p, name) for p in rows]) for name in 'tvy')
+    channels = {k: whole([p.channels[k] for p in rows]) for k in rows.pieces[0].channels}
     try:
-        back = assemble(t, v, y, labels_of(record), channels, name='the file')
+        back = assemble(t, v, y, labels_of(rows), channels, name='the file')
     except DataError as error:
         return (f'reading refuses it: {error}',)
     losses = []

@@ -50,7 +50,7 @@ class OrderedRows:
 
 def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRows, list[int]]:
     """
-    Drop repeated rows of finite numbers, and return the rows at which the clock restarts, with 0.
+    Drop repeated rows, and return the rows at which the clock restarts, with 0.
 
     What is met is added to `met`.  DataError when time is unsorted, or has two samples at once.
     """
@@ -59,7 +59,7 @@ def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRo
     twin = table.t[1:] == table.t[:-1]
     if twin.any():
         for x in table.columns.values():
-            twin &= x[1:] == x[:-1]
+            twin &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
     kept = table
     repeated = table.t[1:][twin]
     if twin.any():
@@ -105,7 +105,8 @@ def _stretches(
             same_time = epoch[place] == t[start:overlap]
             old = begin + place if rows is None else rows[begin:size][place]
             again = bool(same_time.all()) and all(
-                np.array_equal(x[old], x[start:overlap]) for x in table.columns.values()
+                np.array_equal(x[old], x[start:overlap], equal_nan=True)
+                for x in table.columns.values()
             )
             from_start = t[start] <= epoch[0]
             if again and not (from_start and overlap - start > MAX_REPEAT):

@@ -51,7 +51,7 @@ def with_quiet_voltage(record: Record) -> Record:
     width = WIDTH * deviation
     if not 0.0 < width <= MOST * span:
         return record
-    pieces = tuple(replace(piece, v=_quiet(piece.v, width)) for piece in record)
+    pieces = tuple(_quieted(piece, width) for piece in record)
     gone = sum(_path(one) - _path(other) for one, other in zip(record, pieces, strict=True))
     if gone < SHORT * span:
         return record
@@ -77,6 +77,11 @@ def _deviation(v: Array) -> float:
     near = (two <= quiet) & (two > 0.5 * quiet)
     is_white = near.any() and np.median(two[near] / one[: two.size][near]) > WHITE
     return float(quiet / np.sqrt(6.0)) if is_white else 0.0
+
+
+def _quieted(piece: Piece, width: float) -> Piece:
+    before = piece.before and _quieted(piece.before, width)
+    return replace(piece, v=_quiet(piece.v, width), before=before)
 
 
 def _quiet(v: Array, width: float) -> Array:

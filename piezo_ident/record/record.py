@@ -5,7 +5,8 @@
 What was measured: voltage, displacement, time and named segments.
 
 A record is a list of uniformly sampled pieces.  Wherever time jumps, the rate changes or a
-sample is unusable, a new piece begins, because the stage's memory at its start is unknown.
+sample is unusable, a new piece begins, because the stage's memory at its start is unknown.  Where
+the displacement alone is unusable, the new piece keeps the voltage that was played meanwhile.
 """
 
 from __future__ import annotations
@@ -92,6 +93,8 @@ class Piece:
         In order and without overlap; empty for unlabelled data.
     channels : mapping of str to array_like, shape (n,)
         Further measured signals, for example temperature or another axis's voltage.
+    before : Piece, optional
+        The samples right before, of which everything but the displacement is known.
 
     Raises
     ------
@@ -105,6 +108,7 @@ class Piece:
     start_time: float = 0.0
     segments: tuple[Segment, ...] = ()
     channels: Mapping[str, Array] = field(default_factory=dict)
+    before: Piece | None = None
 
     def __post_init__(self) -> None:
         v, y = frozen_array(self.v), frozen_array(self.y)
@@ -176,7 +180,30 @@ class Piece:
             start_time=float(self.time(start, start + 1)[0]) if start else self.start_time,
             segments=segments,
             channels={k: x[start:stop] for k, x in self.channels.items()},
+            before=None if start else self.before,
         )
+
+    def without(self, runs: Iterable[tuple[int, int]]) -> list[Piece]:
+        """
+        Return what is left without the displacement of samples ``start`` to ``stop - 1`` of runs.
+
+        Each part behind a run keeps its voltage and channels; a lone sample is no part.
+        """
+        marks = [0, *(mark for run in runs for mark in run), self.n]
+        if len(marks) == 2:
+            return [self]
+        parts: list[Piece] = []
+        end = 0
+        for a, b in zip(marks[::2], marks[1::2], strict=True):
+            if b - a < 2:
+                continue
+            part = self.cut(a, b)
+            if parts:
+                gap = self.cut(end, a)
+                part = replace(part, before=replace(gap, y=np.full(gap.n, np.nan)))
+            parts.append(part)
+            end = b
+        return parts
 
 
 @dataclass(frozen=True, eq=False, repr=False)

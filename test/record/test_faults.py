@@ -115,6 +115,12 @@ def test_a_sensor_that_hangs_or_drops_out_is_cut_out():
     assert cleaned(y)[1] == {'stuck': 1999 + 300 + 16_999}
 
 
+def test_a_sensor_hangs_also_while_the_voltage_goes_round():
+    y = Y + 2e-9 * np.random.default_rng(1).normal(size=Y.size)
+    y[20_000:60_500] = y[20_000]
+    assert cleaned(y)[1] == {'stuck': 40_499}
+
+
 @pytest.mark.parametrize('bits', [6, 8, 12, 16])
 @pytest.mark.parametrize('noise', [0.0, 0.3, 2.0])
 def test_coarse_saturated_and_resting_readings_are_sound(bits, noise):

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.assemble import assemble, label_runs
 from piezo_ident.record.gaps import bridged, follows
+from piezo_ident.record.io import read, write
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
@@ -59,6 +61,16 @@ def test_pieces_join_on_the_clock_and_segments_go_on():
     assert joined.sound.sum() == 100 - 5
 
 
+def test_a_gap_with_a_voltage_may_be_long():
+    v = np.arange(1000.0) % 70
+    piece = Piece(v, 1e-6 * v, 100.0, 0.0, (), {'v_b': 2.0 * v})
+    parts = piece.without([(1, 2), (100, 500), (501, 600)])
+    assert [(p.start_time, p.n) for p in parts] == [(0.02, 98), (6.0, 400)]
+    (joined,) = bridged(Record(tuple(parts)))
+    assert_array_equal(joined.piece.v, v[2:])
+    assert_array_equal(joined.piece.channels['v_b'], 2.0 * v[2:])
+
+
 def test_gaps_are_straight_lines():
     rng = np.random.default_rng(5)
     piece = Piece(rng.standard_normal(4000), 1e-6 * rng.standard_normal(4000), 100.0)
@@ -102,3 +114,30 @@ def test_lost_samples_cost_next_to_nothing(whole, truth, lose):
     # the whole record gives 0.001 %; before gaps were bridged these gave 0.5 to 12 %
     assert max(e.percent for e in sine_errors(found.model, truth)) < 0.01
     assert found.error('selection') < 0.01
+
+
+@pytest.mark.parametrize(
+    'unmeasure',
+    [
+        pytest.param(lambda y: y[0], id='the sensor hangs'),
+        pytest.param(lambda y: np.nan, id='no number'),
+    ],
+)
+def test_the_voltage_goes_on_where_the_displacement_alone_is_bad(unmeasure, tmp_path):
+    t = np.arange(40_000) / 20e3
+    v = 3.0 * (1.0 - np.cos(5.0 * t)) + 2.0 * (1.0 - np.cos(37.0 * t))
+    y = STAGE.model.simulate(v) + np.random.default_rng(0).normal(0.0, 2e-9, v.size)
+    hole = slice(10_000, 21_000)
+    y[hole] = unmeasure(y[hole])
+    record = Record.from_arrays(v, y, sample_rate=20e3)
+    run = free_run(STAGE.model, record)
+    assert len(run.pieces) == 2
+    # by a straight line of voltage, this hole costs 0.3 %
+    assert run.errors.percent < 0.005
+    (joined,) = bridged(run.record)
+    assert_array_equal(joined.piece.v, v)
+    assert not joined.sound[hole][1:].any()
+    assert joined.gaps == 0
+    # a file keeps it
+    assert write(record, tmp_path / 'kept.csv') == ()
+    assert free_run(STAGE.model, read(tmp_path / 'kept.csv')).errors == run.errors
