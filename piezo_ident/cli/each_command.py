@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 import statistics
+import sys
 from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
@@ -79,6 +80,14 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
     check_bag_options(paths, args)
     folder: Path = args.each
     with console.progress() as progress:
+
+        def show(done: int, of: int, row: Row | None) -> None:
+            progress('records', done / of)
+            # a log shows no bar
+            if row and not sys.stderr.isatty():
+                console.say(f'{done} of {of}: {row.record}{"" if row.is_good else " failed"}')
+                sys.stdout.flush()
+
         rows = run_many(
             paths,
             folder,
@@ -86,7 +95,7 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             reports=args.reports,
             jobs=args.jobs,
             scheduler=args.scheduler,
-            progress=lambda done, of: progress('records', done / of),
+            progress=show,
         )
     table = folder / 'records.csv'
     write_text(table, csv_text(rows))

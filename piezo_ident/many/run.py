@@ -170,7 +170,7 @@ def run_many(
     reports: bool = False,
     jobs: int | None = None,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int, Row | None], None] = lambda done, of, row: None,
 ) -> list[Row]:
     """
     Identify or diagnose every record on its own.
@@ -192,7 +192,7 @@ def run_many(
     scheduler : str, optional
         Address of a dask scheduler whose workers see the same paths; `jobs` is then not used.
     progress : callable, optional
-        Called with the number of records done and of all.
+        Called with the number of records done and of all, and the row that is new, if any.
 
     Returns
     -------
@@ -210,7 +210,7 @@ def run_many(
     work = _prepare(records, folder, task, reports)
     rows = {job.name: row for job in work if (row := job.earlier()) is not None}
     todo = [job for job in work if job.name not in rows]
-    progress(len(rows), len(work))
+    progress(len(rows), len(work), None)
     if todo:
         count = min(jobs or _cores(), len(todo))
         with dask(scheduler) if scheduler else processes(count) as submit:
@@ -219,7 +219,7 @@ def run_many(
                 for future in as_completed(futures):
                     job, error = futures[future], future.exception()
                     rows[job.name] = future.result() if error is None else job.failed(error)
-                    progress(len(rows), len(work))
+                    progress(len(rows), len(work), rows[job.name])
             finally:
                 for future in futures:
                     future.cancel()

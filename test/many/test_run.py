@@ -198,7 +198,10 @@ def test_the_command_line(records, tmp_path, capsys):
     for name in ('records.csv', 'reports/stage_1/report.html'):
         assert (tmp_path / 'out' / name).stat().st_size > 0
     assert main(['identify', str(records[3]), '--each', str(tmp_path / 'bad')]) == 2
-    assert 'stage_3' in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert 'stage_3' in said.err
+    # a log, which shows no bar, has a line a record
+    assert said.out == '1 of 1: stage_3 failed\n'
 
 
 @pytest.mark.parametrize('options', [['--model', 'm.yaml'], ['--report', 'r'], ['--jobs', '0']])
