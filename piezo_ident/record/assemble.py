@@ -47,7 +47,7 @@ VOLTAGE = (1e-12, 1e12)
 LOST = 1e-6
 #: share of samples without a number that can be cut out
 MAX_NOT_FINITE = 0.01
-#: the same of a displacement whose voltage is known
+#: the same of displacements beside a voltage, in places that are no more than the above
 MAX_NOT_MEASURED = 0.3
 #: later times [s] are counted in another unit than seconds
 MAX_TIME = 1e11
@@ -187,15 +187,17 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
     alone = int(np.count_nonzero(unmeasured))
     if not (bad or alone):
         return table
-    for count, most, what, cure in (
-        (bad, MAX_NOT_FINITE, 'samples', 'cut the bad stretch out of the file'),
-        (alone, MAX_NOT_MEASURED, 'displacements', 'leave out the rows without one'),
-    ):
-        if count > most * finite.size:
-            raise DataError(
-                f'{name}: {count} of {finite.size} {what} are NaN or infinite, more than '
-                f'{100 * most:g} %; {cure}'
-            )
+    if bad > MAX_NOT_FINITE * finite.size:
+        raise DataError(
+            f'{name}: {bad} of {finite.size} samples are NaN or infinite, more than 1 %; '
+            'cut the bad stretch out of the file'
+        )
+    places = len(true_runs(unmeasured))
+    if alone > MAX_NOT_MEASURED * finite.size or places > MAX_NOT_FINITE * finite.size:
+        raise DataError(
+            f'{name}: {alone} of {finite.size} displacements are NaN or infinite, in {places} '
+            'places; cut the bad stretch out of the file, or all rows without a displacement'
+        )
     missing = unmeasured | ~finite
     where = at_times(table.t[missing & np.isfinite(table.t)])
     action = 'cut out' if bad else 'left out, its voltage is kept'

@@ -271,6 +271,14 @@ def scaled(*by: float) -> list[np.ndarray]:
             ],
             '6 of 500 samples are NaN or infinite, more than 1 %',
         ),
+        # a sensor that is read with every tenth voltage
+        (
+            [
+                np.where((np.arange(500) % 10 > 0) & (k == 2), np.nan, columns(500)[k])
+                for k in (0, 1, 2)
+            ],
+            '450 of 500 displacements .* in 50 places; .* all rows without a displacement',
+        ),
         *((scaled(1, 1, f), '--displacement-unit') for f in (1e6, 1e-6)),
         *((scaled(f, 1, 1), 'write t in seconds') for f in (1e15, 1e-9)),
         (
