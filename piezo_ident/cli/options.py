@@ -233,7 +233,7 @@ SIMULATE = [
         nargs=2,
         callback=_limits,
     ),
-    _flag('--voltage-only', 'Write the columns t and v, which drive a real stage.'),
+    _flag('--voltage-only', 'Write the columns t, v and segment, to drive a real stage.'),
 ]
 
 #: fields of `Settings`

@@ -22,6 +22,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.tables import labels_of
 
 PROGRAM_FILES = ('.yaml', '.yml')
 
@@ -73,9 +74,9 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     warnings: tuple[str, ...] = ()
     with deferred_interrupts():
         if args.voltage_only:
-            # no segments: they are those of the command, and the file is no record
             columns = {'t': piece.t, 'v': piece.v, **piece.channels}
-            record_io.write_columns(out, lambda: iter([columns]))
+            # who adds what was measured has a labelled record
+            record_io.write_columns(out, lambda: iter([columns]), *labels_of(record))
         else:
             losses = record_io.write(
                 record,

@@ -188,7 +188,7 @@ def _experiment(reason: str, program: str, model: StageModel, prompt: Prompt) ->
     ends = [f'{round(end, digits) + 0.0:.12g}' for end in (low, high)]
     return Step(
         f'{reason}; drive the stage with the voltage (columns t and v) that this command makes, '
-        'and record it',
+        'and record it with its labels (column segment)',
         prompt.command(
             *('simulate', '--program', program, '--sample-rate', f'{model.sample_rate:.12g}'),
             *('--limits', *ends, '--voltage-only', 'excitation.csv'),

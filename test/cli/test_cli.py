@@ -118,7 +118,7 @@ def test_the_voltage_that_is_asked_for_next_fits_the_model(capsys, tmp_path, mad
     (line,) = (x for x in text.splitlines() if 'excitation.csv' in x)
     succeed(capsys, *shlex.split(line)[1:])
     table = np.genfromtxt('excitation.csv', delimiter=',', names=True)
-    assert table.dtype.names == ('t', 'v')
+    assert table.dtype.names == ('t', 'v', 'segment')
     assert (table['v'].min(), table['v'].max()) == pytest.approx((-10.0, 90.0), abs=0.1)
     # neither another rate nor a voltage outside the range
     assert 'warning' not in succeed(capsys, 'predict', 'model.yaml', 'excitation.csv')
@@ -154,8 +154,20 @@ def test_voltages_of_several_axes_go_into_one_file(capsys, tmp_path):
     argv = ['simulate', '--config', 'two_axes', '--program', 'two_axes', '--voltage-only', out]
     data = json.loads(succeed(capsys, *argv, '--json'))
     table = np.load(out)
-    assert table.files == ['t', 'v', 'v_b']
+    assert table.files == ['t', 'v', 'v_b', 'segment_name', 'segment_start']
     assert table['v_b'].size == data['samples']
+
+
+def test_a_displacement_beside_the_voltages_makes_a_labelled_record(capsys, tmp_path):
+    argv = ['--program', 'identification', '--sample-rate', 10_000, '--limits', 0, 100]
+    succeed(capsys, 'simulate', *argv, '--voltage-only', tmp_path / 'drive.csv')
+    head, *rows = (tmp_path / 'drive.csv').read_text().splitlines()
+    measured = [f'{row},{7e-8 * float(row.split(",")[1])}' for row in rows]
+    (tmp_path / 'record.csv').write_text('\n'.join([f'{head},y', *measured]))
+    record = pi.read(tmp_path / 'record.csv')
+    assert (record.faults, record.voltage_range) == ((), (0.0, 100.0))
+    program = pi.Program.load('identification').build(10e3)
+    assert record.labels == tuple(dict.fromkeys(s.label for s in program.segments))
 
 
 def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made):
