@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 import csv
 from dataclasses import replace
+from datetime import datetime, timezone
+import functools
 import io
 import itertools
 from pathlib import Path
@@ -30,6 +32,12 @@ from piezo_ident.record.text_layout import COMMENT, find_layout, is_number, Layo
 HEAD = 1000
 #: what programs write where there is no number, in lower case
 MISSING = ('', 'na', 'n/a', '#na', '#n/a')
+#: a date, which may be absent, the time of day, its decimals, and a zone
+_STAMP = re.compile(
+    r'(?:(\d{4}-\d\d-\d\d)[T ])?(\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?'
+    r'\s*(?:Z|([-+])(\d\d):?(\d\d)?)?',
+    re.ASCII,
+)
 _POINTS = (
     'these look like decimal commas: save it with decimal points, or with semicolons between '
     'the columns'
@@ -104,6 +112,9 @@ def _rows(
     n, line = 0, layout.above
     # the slow ways last: cells without a number, decimal commas, comments between the rows
     ways: list[Any] = [None, *(dict.fromkeys(number, way) for way in (_with_point, _with_comma))]
+    if 't' in wanted:
+        stamp = _Stamps()
+        ways += [way | {wanted['t']: stamp} for way in ways[1:]]
     held: list[str] = []
     while chunk := _whole_rows(lines):
         # rows of empty cells below the last one are none
@@ -152,6 +163,30 @@ def _with_comma(text: str) -> float:
     return _with_point(text.replace(',', '.'))
 
 
+class _Stamps:
+    """Seconds from the first one of ISO 8601 stamps, of which a column may hold the time alone."""
+
+    def __init__(self) -> None:
+        self._first: int | None = None
+
+    def __call__(self, text: str) -> float:
+        found = _STAMP.fullmatch(text.strip())
+        if not found:
+            raise ValueError
+        day, clock, decimals, sign, hours, minutes = found.groups()
+        zone = 60 * int(f'{sign}1') * (60 * int(hours) + int(minutes or 0)) if sign else 0
+        # counted in ns: a float64 holds a tenth of a microsecond since 1970
+        at = (_second(day or '1970-01-01', clock) - zone) * 10**9 + int(f'{decimals or 0:0<9}')
+        if self._first is None:
+            self._first = at
+        return (at - self._first) / 1e9
+
+
+@functools.lru_cache(maxsize=16)
+def _second(day: str, clock: str) -> int:
+    return round(datetime.fromisoformat(f'{day} {clock}').replace(tzinfo=timezone.utc).timestamp())
+
+
 def _whole_rows(lines: Iterator[str]) -> list[str]:
     """Return the next lines, up to the end of a quoted cell; csv.Error where that never comes."""
     chunk = list(itertools.islice(lines, ROWS))
@@ -190,6 +225,8 @@ def _culprit(
             text = row[place].strip()
             title = layout.names[place] if layout.names else name
             if text.lower() in MISSING:
+                continue
+            if name == 't' and _STAMP.fullmatch(text):
                 continue
             if not is_number(text):
                 below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]

@@ -232,8 +232,12 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
         ('t,v,y\n0,1,2\n1,,3\n', ['1 of 2 samples are NaN']),
         ('t,v,y\n0,1,2\n1,NAN1,3\n', ['line 3, column v', "'NAN1'"]),
         (
-            'time,v,y\n' + ''.join(f'2024-04-13 10:00:00.00{k}000,{k},{k}\n' for k in range(9)),
-            ["column time holds text, '2024-04-13 10:00:00.000000'", 'as in --rate 20e3'],
+            'time,v,y\n' + ''.join(f'04/13/2024 10:00:00.00{k}000,{k},{k}\n' for k in range(9)),
+            ["column time holds text, '04/13/2024 10:00:00.000000'", 'as in --rate 20e3'],
+        ),
+        (
+            't,v,y\n2024-04-13T10:00:00Z,1,2\n2024-04-13T10:00:01Z,oops,3\n',
+            ['line 3, column v', "'oops'"],
         ),
         ('t,v,y\n0,low,2\n1,high,3\n', ["column v holds text, 'low'", '--columns v=NAME']),
         ('t,v,y\n0,1,2\n1,1_000,3\n', ['line 3, column v', "'1_000'"]),

@@ -3,6 +3,7 @@
 
 """A lab's own files are read as they are; what cannot be known is asked for in one line."""
 
+from datetime import datetime, timedelta
 from pathlib import Path
 import shlex
 import sys
@@ -162,6 +163,20 @@ def daq_tdms(path: Path) -> None:
             writer.write_segment([tdms.ChannelObject('Log', name, x, wave)])
 
 
+def iso_csv(path: Path) -> None:
+    # over midnight; one decimal more than milliseconds, as a period of 0.2 ms needs
+    start = datetime(2026, 11, 26, 23, 59, 59, 900_000)
+    when = [start + k * timedelta(microseconds=200) for k in range(N)]
+    when = [f'{x.isoformat(timespec="microseconds")[:-2]}Z' for x in when]
+    path.write_text('timestamp,voltage,position_um\n' + rows(np.array(when), V, UM))
+
+
+def iso_german_csv(path: Path) -> None:
+    when = np.array([f'10:00:{k / RATE:07.4f}' for k in range(N)])
+    table = rows(when, V, UM, separator=';', comma=True)
+    path.write_text(f'Zeit;Spannung [V];Weg [um]\n{table}')
+
+
 def daq_parquet(path: Path) -> None:
     arrow = pytest.importorskip('pyarrow')
     parquet = pytest.importorskip('pyarrow.parquet')
@@ -192,6 +207,8 @@ FILES = {
     daq_h5: '',
     daq_tdms: '',
     daq_parquet: '',
+    iso_csv: '',
+    iso_german_csv: '',
 }
 
 
