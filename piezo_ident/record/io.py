@@ -47,6 +47,8 @@ _READ = f'a bag folder, .mcap, .db3, {", ".join(READERS)}'
 SLOW, FAST = 50.0, 1e6
 #: strokes [m] and spans of a voltage [V] at which another unit is likelier
 LARGE_STROKE, HIGH_VOLTAGE = 1e-3, 2e3
+#: and gains [m/V], whatever unit is named
+LARGE_GAIN = 5e-4
 
 
 def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
@@ -142,9 +144,13 @@ def _factor(table: RecordTable, role: str) -> float:
 
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
     """Yield where another unit is likelier than the default, or than that of a header."""
-    if table.rate is None and options.time_unit is None:
+    rates = [piece.sample_rate for piece in record]
+    if table.rate is not None and not SLOW < table.rate <= FAST:
+        kind = 'slow' if table.rate <= SLOW else 'fast'
+        where = f'sampled at {table.rate:.6g} Hz, unusual for a stage'
+        yield Fault(f'{kind}_sampling', where, 1, 'is it in Hz? else give it as in --rate 20e3')
+    elif table.rate is None and options.time_unit is None:
         unit = table.units.get('t', 's')
-        rates = [piece.sample_rate for piece in record]
         finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
         for kind, rate, is_odd, other in (
             ('slow', min(rates), min(rates) <= SLOW, finer),
@@ -159,6 +165,10 @@ def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterato
         cure = 'if y counts micrometres, add --displacement-unit um'
         yield Fault('large_stroke', where, 1, cure)
     low, high = record.voltage_range
+    if 'y' in table.columns and record.stroke > LARGE_GAIN * (high - low) > 0.0:
+        where = f'a stroke of {1e6 * record.stroke:.3g} um from {low:.4g} to {high:.4g} V'
+        cure = 'are the units right? --voltage-unit and --displacement-unit name others'
+        yield Fault('large_gain', where, 1, cure)
     if high - low > HIGH_VOLTAGE and 'v' not in table.units:
         where = f'a voltage from {low:.4g} to {high:.4g} V'
         cure = 'if v counts millivolts, add --voltage-unit mV'

@@ -361,6 +361,22 @@ def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, 
     assert cure in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ('header', 'options', 'kind', 'cure'),
+    [
+        ('voltage,position_um', '--rate 5', 'slow_sampling', '--rate 20e3'),
+        ('voltage,position_um', '--rate 5e6', 'fast_sampling', '--rate 20e3'),
+        ('voltage_mV,position_um', '--rate 5e3', 'large_gain', '--voltage-unit'),
+    ],
+)
+def test_a_slip_of_a_thousand_is_said(tmp_path, capsys, header, options, kind, cure):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'{header}\n{rows(V, UM)}')
+    assert main(['convert', str(path), str(tmp_path / 'o.npz'), *options.split()]) == 0
+    assert cure in capsys.readouterr().err
+    assert kind in {f.name for f in pi.read(path, rate=float(options.split()[1])).faults}
+
+
 def test_time_that_is_rounded_is_not_guessed_where_two_rates_fit(tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text('t,v,y\n' + rows(np.round(K / 4967.3, 3), V, 1e-6 * UM))
