@@ -11,12 +11,13 @@ of numbers are looked at, and `piezo_ident.record.columns` tells which is which.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 import importlib
 from pathlib import Path
 import re
+from types import MappingProxyType
 from typing import Any
 import zipfile
 
@@ -30,6 +31,7 @@ from piezo_ident.record.options import ReadOptions
 
 _LABELS = ('segment_name', 'segment_start')
 _USED = '[tvy]|[vyx]_.+|segment_name|segment_start'
+_SLOWER = 'give one value a sample: of a slower sensor, the voltage at its times'
 _HDF5 = b'\x89HDF\r\n\x1a\n'
 
 
@@ -111,6 +113,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
     """Read a file of LabVIEW's TDMS."""
     tdms = _library('nptdms', path, 'npTDMS')
     arrays: dict[str, Any] = {}
+    periods: dict[str, float] = {}
     with (
         _damage(path, 'TDMS file', 'write it again'),
         tdms.TdmsFile.open(path) as file,
@@ -123,9 +126,10 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
             if counts[name] > 1:
                 name = f'{channel.group_name}.{name}'
             unit = str(channel.properties.get('unit_string', ''))
-            arrays[f'{name} [{unit}]' if unit else name] = channel[:]
+            name = f'{name} [{unit}]' if unit else name
+            arrays[name] = channel[:]
             if 'wf_increment' in channel.properties:
-                arrays['wf_increment'] = np.array([channel.properties['wf_increment']])
+                periods[name] = float(channel.properties['wf_increment'])
         cut = getattr(file.file_status, 'channel_statuses', None) or {}
     # where all end at one sample, nothing but the end is missing
     uneven = len({len(channel) for channel in channels}) > 1
@@ -136,7 +140,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
                 f'{path}: ends early, {name} has {part.read_length} of {part.expected_length} '
                 'samples in its last segment; copy or record it again'
             )
-    return _table(arrays, arrays, path, options)
+    return _table(arrays, arrays, path, options, periods)
 
 
 def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
@@ -175,16 +179,33 @@ def _check_size(size: int) -> None:
 
 
 def _table(
-    arrays: Mapping[str, Any], everything: Iterable[str], path: Path, options: ReadOptions
+    arrays: Mapping[str, Any],
+    everything: Iterable[str],
+    path: Path,
+    options: ReadOptions,
+    periods: Mapping[str, float] = MappingProxyType({}),
 ) -> RecordTable:
-    """Choose the columns among some arrays, and check them."""
+    """Choose the columns among some arrays, and check them; `periods` are their own [s]."""
     numbers = {k: np.asarray(x) for k, x in arrays.items() if k not in _LABELS}
     own = numbers.keys() >= {*options.needed}
     candidates = [k for k, x in numbers.items() if own or _may_be_column(k, x)]
     scalars = {
         k: float(x.ravel()[0]) for k, x in numbers.items() if x.size == 1 and x.dtype.kind in 'iuf'
     }
-    found, table = choose(candidates, options, path, scalars=scalars)
+
+    def chosen(period: Sequence[float]) -> tuple[dict[str, int], RecordTable]:
+        known = {**scalars, **dict(zip(['wf_increment'], period, strict=False))}
+        return choose(candidates, options, path, scalars=known)
+
+    found, table = chosen([*periods.values()])
+    if periods and table.rate is not None and options.rate is None:
+        # another channel may have been sampled at another rate
+        named = [candidates[found[role]] for role in 'vy' if role in found]
+        steps = sorted({periods[name] for name in named if name in periods})
+        if len(steps) > 1:
+            text = ' and '.join(f'{x:g} s' for x in steps)
+            raise DataError(f'{path}: v and y are sampled every {text}; {_SLOWER}')
+        found, table = chosen(steps)
     places = {role: candidates[place] for role, place in found.items()}
     columns = {}
     for role, name in places.items():
@@ -193,7 +214,7 @@ def _table(
     lengths = {places[role]: x.size for role, x in columns.items()}
     if len(set(lengths.values())) > 1:
         text = ', '.join(f'{k} {n}' for k, n in lengths.items())
-        raise DataError(f'{path}: columns differ in length ({text}); give one value a sample')
+        raise DataError(f'{path}: columns differ in length ({text}); {_SLOWER}')
     names: list[str] = []
     starts: Any = ()
     if 'segment' in places:

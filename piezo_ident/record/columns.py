@@ -201,10 +201,12 @@ def _add_channels(
 def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     """Return the place of a column that is given by name, by name without unit, or by number."""
     low = wanted.strip().casefold()
+    is_number = wanted.isdecimal() and 1 <= int(wanted) <= len(names)
     for ways, one in (
         ([*names], wanted),
         ([name.strip().casefold() for name in names], low),
-        ([_parts(name)[0].casefold() for name in names], low),
+        # channel 1 of an oscilloscope is called 1 [V], and is no first column
+        ([] if is_number else [_parts(name)[0].casefold() for name in names], low),
     ):
         here = [i for i, way in enumerate(ways) if way == one]
         if len(here) > 1:
@@ -214,7 +216,7 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
             )
         if here:
             return here[0]
-    if wanted.isdecimal() and 1 <= int(wanted) <= len(names):
+    if is_number:
         return int(wanted) - 1
     raise DataError(
         f'{path}: no column {listed([wanted])!r}; --columns {role}=NAME takes one of: '
@@ -333,7 +335,9 @@ def _said(role: str, place: int, names: Sequence[str], unit: str) -> str:
 
 
 def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> DataError:
-    ways = [names[i] or str(i + 1) for i in free]
+    # time is the example for nothing else
+    fit = [i for i in free if 't' in missing or _parts(names[i])[1] not in UNITS['t']] or free
+    ways = [names[i] or str(i + 1) for i in fit]
     found = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
     rate = '--rate 20e3'
     further = ''

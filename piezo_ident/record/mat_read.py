@@ -27,6 +27,8 @@ from piezo_ident.common.files import UNPACKED_SIZE
 #: columns of a matrix, and structs of an array of them, at most
 WIDTH = 32
 
+#: what dSPACE's ControlDesk and Simulink call the samples of a signal, whose name stands beside
+_TITLED = ('Data', 'values')
 #: name of the list of all variables in what the child writes; MATLAB allows no such name
 _ALL = '*'
 
@@ -79,14 +81,29 @@ def flat(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
         if part.dtype != object:
             yield from flat(f'{name}.{key}', part)
         elif part.size <= WIDTH:
-            for i, cell in enumerate(part.ravel(), 1):
-                yield from flat(f'{name}.{key}' if part.size == 1 else f'{name}.{i}.{key}', cell)
+            for i, cell in enumerate(part.ravel()):
+                plain = f'{name}.{key}' if part.size == 1 else f'{name}.{i + 1}.{key}'
+                title = _title(x.ravel()[i]) if key in _TITLED else ''
+                yield from flat(f'{name}.{title}' if title else plain, cell)
     if x.dtype.kind in 'biufM':
         if sum(size != 1 for size in x.shape) <= 1:
             yield name, x.ravel()
         elif x.ndim == 2 and min(x.shape) <= WIDTH:
             for i, column in enumerate(x if x.shape[0] < x.shape[1] else x.T, 1):
                 yield f'{name}.{i}', column
+
+
+def _title(struct: Any) -> str:
+    """Return the name and the unit that a struct has for its data, empty where it has none."""
+    texts = [
+        str(np.ravel(struct[key])[0])
+        for key in ('Name', 'label', 'Unit')
+        if key in struct.dtype.names and np.ravel(struct[key]).dtype.kind == 'U'
+        if np.size(struct[key])
+    ]
+    # of a path through a model, its end
+    name = re.sub(r'.*/|["{}.]', '', texts[0]) if texts else ''
+    return f'{name} [{texts[1]}]' if name and len(texts) > 1 else name
 
 
 def _main(path: str, wanted: str, asked: str, target: str) -> None:

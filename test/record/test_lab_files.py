@@ -396,12 +396,70 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
         monkeypatch.undo()
 
 
+def test_a_tdms_file_may_hold_channels_of_other_rates(tmp_path):
+    tdms = pytest.importorskip('nptdms')
+
+    def written(name, period_of_y, *slow):
+        path = tmp_path / name
+        every = [('Command', V, 1 / RATE), ('Position', UM * 1e-6, period_of_y), *slow]
+        with tdms.TdmsWriter(path) as writer:
+            for i, (title, x, period) in enumerate(every):
+                wave = {'wf_increment': period} if period else {}
+                writer.write_segment([tdms.ChannelObject(f'G{i}', title, x, wave)])
+        return path
+
+    slow = ('Temperature', V[:20], 100 / RATE)
+    for name, order in (('last.tdms', [slow]), ('alone.tdms', [])):
+        assert pi.read(written(name, 1 / RATE, *order)).pieces[0].sample_rate == RATE
+    with pytest.raises(DataError, match=r'v and y are sampled every 0\.0002 s and 0\.002 s'):
+        pi.read(written('two.tdms', 10 / RATE))
+
+
 def test_a_tdms_file_that_ends_early_says_so(tmp_path):
     path = tmp_path / 'scan.tdms'
     daq_tdms(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r'ends early, .* samples in its last segment'):
         pi.read(path)
+
+
+def test_signals_with_a_name_beside_their_samples(tmp_path):
+    # as of dSPACE's ControlDesk, and as Simulink's structure with time
+    def struct(**fields):
+        found = np.empty((1, 1), dtype=[(name, object) for name in fields])
+        found[0, 0] = tuple(fields.values())
+        return found
+
+    def signal(name, unit, x):
+        return struct(Name=f'{{"Model Root"/"IO"/"{name}"}}', Unit=unit, Data=x[None, :])
+
+    signals = [signal('pos', 'um', UM), signal('u_cmd', 'V', V), signal('trigger', '-', 0 * V)]
+    time = struct(Name='Time', Unit='s', Data=K[None, :] / RATE)
+    scipy.io.savemat(tmp_path / 'd.mat', {'e1': struct(X=time, Y=np.hstack(signals))})
+    labelled = [struct(values=x[:, None], label=name) for name, x in (('pos_um', UM), ('u', V))]
+    simulink = struct(time=K[:, None] / RATE, signals=np.hstack(labelled))
+    scipy.io.savemat(tmp_path / 's.mat', {'out': simulink})
+    for name in ('d.mat', 's.mat'):
+        (piece,) = pi.read(tmp_path / name).pieces
+        assert piece.sample_rate == RATE
+        np.testing.assert_array_equal(piece.v, V)
+        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
+def test_an_oscilloscope_whose_channels_are_called_by_numbers(tmp_path, capsys):
+    path, out = tmp_path / 'scope.csv', str(tmp_path / 'o.npz')
+    table = rows(K / RATE, V, K / RATE, UM / 10)
+    path.write_text(f'x-axis,1,x-axis,2\nsecond,Volt,second,Volt\n{table}')
+    given = []
+    for said in ('--columns t=1 or', "--columns 'v=1 [Volt]' or", "--columns 'y=2 [Volt]'"):
+        assert main(['convert', str(path), out, *given]) == 2
+        assert said in capsys.readouterr().err
+        given += shlex.split(said.removesuffix(' or'))
+    assert main(['convert', str(path), out, *given, '--displacement-unit', '10um']) == 0
+    by_number = pi.read(path, columns='t=1,v=2,y=4', displacement_unit='10um').pieces[0]
+    for piece in (by_number, pi.read(out).pieces[0]):
+        np.testing.assert_array_equal(piece.v, V)
+        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
 
 
 @pytest.mark.parametrize('suffix', ['txt', 'lvm', 'h5', 'tdms', 'parquet'])
