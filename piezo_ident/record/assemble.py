@@ -242,6 +242,13 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
         raise DataError(f'{name}: the displacement never changes; is the sensor connected?')
     if stroke is not None and (stroke > STROKE[1] or (stroke < STROKE[0] and not idle)):
         read = unit_factor('y', unit)
+        for end in ranges['y']:
+            rest = table.columns['y'][table.columns['y'] != end]
+            if rest.size < table.t.size - 1 and np.ptp(rest) <= STROKE[1] < stroke:
+                raise DataError(
+                    f'{name}: y is {end * read:.6g} in {table.t.size - rest.size} samples, far '
+                    'from all others; if it stands for no reading, leave these cells empty'
+                )
         others = {u: stroke * read / factor for u, factor in UNITS['y'].items()}
         fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
         raise DataError(

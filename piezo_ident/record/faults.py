@@ -48,6 +48,8 @@ ROUNDED = 0.07
 #: where more of a record than this looks wrong, single readings and ones that are held, it is the
 #: way of the data
 MAX_WILD, MAX_HELD = 0.05, 0.3
+#: changes of a displacement, at least, that tell the rate of its sensor
+CHANGES = 100
 
 
 def without_faults(record: Record) -> Record:
@@ -68,6 +70,9 @@ def without_faults(record: Record) -> Record:
     for piece in record:
         wild = _wild(piece, stroke, span)
         held = [run for run in _held(piece, stroke, span) if not _overlaps(run, wild)]
+        # a slow sensor holds every reading
+        period = _period(piece.y)
+        held = [(a, b) for a, b in held if b - a >= HELD * period or period == 1]
         for runs, is_lost in ((wild, True), (held, False)):
             for a, b in runs:
                 name = 'stuck' if not is_lost else 'lost' if piece.y[a] == 0.0 else 'outliers'
@@ -175,8 +180,7 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
         usual = max(float(x.max(initial=0.0)) for x in (steps, behind))
         entry, leave = float(y[a] - y[a - 1]), float(y[b] - y[b - 1])
         least = max(floor, FAR * usual)
-        # a delay lets the end of a rest look as if v had moved
-        late = b - min((b - a) // 4, round(0.002 * piece.sample_rate))
+        late = _late(piece, a, b)
         drive = float(np.ptp(v[a:late])) / span if span else 0.0
         around = np.concatenate([v[max(0, a - AROUND) : a], v[b : b + AROUND]])
         outside = abs(float(np.median(v[a:b])) - float(np.median(around))) / span if span else 0.0
@@ -192,6 +196,17 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
             # what hangs repeats the last good reading
             found.append((a if drops else a + 1, b))
     return found
+
+
+def _late(piece: Piece, a: int, b: int) -> int:
+    """Return where a rest of the displacement ends for the voltage, which is ahead by a delay."""
+    return b - min((b - a) // 4, round(0.002 * piece.sample_rate))
+
+
+def _period(y: Array) -> int:
+    """Return every how many samples a displacement, shape (n,), has a new reading."""
+    changes = np.flatnonzero(np.diff(y))
+    return int(np.gcd.reduce(np.diff(changes))) if changes.size > CHANGES else 1
 
 
 def _floor(piece: Piece, stroke: float) -> float:
@@ -241,7 +256,7 @@ def misspelt(labels: Sequence[str]) -> list[str]:
 
 def suspicions(record: Record) -> list[str]:
     """Return what a record makes one suspect: a first rise, a sensor at its stop, and the like."""
-    return [*_first_rise(record), *_stopped(record)]
+    return [*_first_rise(record), *_stopped(record), *_slow(record)]
 
 
 def _first_rise(record: Record) -> list[str]:
@@ -255,13 +270,25 @@ def _first_rise(record: Record) -> list[str]:
     ]
 
 
+def _slow(record: Record) -> list[str]:
+    periods = [(_period(piece.y), _period(piece.v)) for piece in record]
+    m = max((y for y, v in periods if v < y), default=1)
+    if m == 1:
+        return []
+    return [
+        f'{record.name}: one reading of the displacement stands in {m} samples each: its sensor '
+        'is slower than the voltage, and neither delay nor fast motion are those of the stage. '
+        f'Record both at one rate, or keep one row in {m}, that with the new reading'
+    ]
+
+
 def _stopped(record: Record) -> list[str]:
     span = float(np.ptp(record.voltage_range))
     levels: list[float] = []
     stuck = noisy = 0
     for piece in record:
         for start, stop in _constant(piece.y):
-            v = piece.v[start:stop]
+            v = piece.v[start : _late(piece, start, stop)]
             if np.ptp(v) > MOVED * span:
                 levels.append(float(piece.y[start]))
                 stuck += stop - start

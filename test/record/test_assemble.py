@@ -271,6 +271,14 @@ def scaled(*by: float) -> list[np.ndarray]:
             ],
             '6 of 500 samples are NaN or infinite, more than 1 %',
         ),
+        # what some loggers write where there is no reading
+        (
+            [
+                np.where((np.arange(500) // 9 == 12) & (k == 2), 9.9e37, columns(500)[k])
+                for k in range(3)
+            ],
+            r'y is 9\.9e\+37 in 9 samples, .* leave these cells empty',
+        ),
         # a sensor that is read with every tenth voltage
         (
             [

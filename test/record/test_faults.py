@@ -39,6 +39,23 @@ def test_sensor_at_its_stop():
     assert '5e-07' in said
 
 
+def test_a_step_after_a_rest_is_no_stop():
+    v = np.repeat(np.tile([4.0, 6.0], 10), 2000)
+    y = np.roll(np.round(1e-6 * v / 24e-9) * 24e-9, 5)
+    assert suspicions(Record((Piece(v, y, 10e3),))) == []
+
+
+def test_a_sensor_that_is_slower_than_the_voltage():
+    v, y = triangle()
+    for m in (2, 25):
+        record = Record((Piece(v, np.repeat(y[::m], m), 1000.0),))
+        (said,) = suspicions(record)
+        assert f'one row in {m},' in said
+        # each of its readings lasts, and none hangs
+        assert without_faults(record) is record
+    assert suspicions(Record((Piece(np.repeat(v[::4], 4), np.repeat(y[::4], 4), 1000.0),))) == []
+
+
 def test_swapped_columns():
     v, _y = triangle()
     hold = np.repeat([2.0, 4.0, 6.0, 3.0], 3000)
