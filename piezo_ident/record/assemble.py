@@ -231,7 +231,8 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
     ranges = {k: (float(np.nanmin(x)), float(np.nanmax(x))) for k, x in ends.items() if k in 'tvy'}
     latest = max(map(abs, ranges['t']))
     if latest > MAX_TIME:
-        raise DataError(f'{name}: t reaches {latest:.3g}; write t in seconds')
+        cure = 'name its unit, as in --time-unit ms, or write t in seconds'
+        raise DataError(f'{name}: t reaches {latest:.3g} s; {cure}', options='--time-unit ms')
     moved = {k: high - low for k, (low, high) in ranges.items() if k != 't'}
     span = moved.get('v', 0.0)
     idle = span == 0.0  # a stage at rest has no stroke, whatever the unit

@@ -307,7 +307,8 @@ def _stopped(record: Record) -> list[str]:
     return [
         f'{record.name}: the displacement stays at exactly {levels[0]:.9g} m'
         f'{f" and {others} other values" if others else ""} for {stuck} samples while the voltage '
-        'moves: the sensor is at its stop, or hangs'
+        'moves: the sensor is at its stop, or hangs. Where these cells are empty (NaN), the '
+        'model follows the voltage, and is fitted to the rest'
     ]
 
 

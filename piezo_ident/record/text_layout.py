@@ -87,6 +87,9 @@ def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
         cells = cells_of(lines[first], separator)
         # between blanks, prose has a lone v too
         if {'t', 'v', 'y'}.intersection(cells) and (separator or {'t', 'v'}.issubset(cells)):
+            below = cells_of(next((lines[i] for i in filled if i > first), ''), separator)
+            if any(below) and all(map(_is_unit, below)):
+                return None  # a second line of it
             return Layout(separator, tuple(cells), first + 1)
     return None
 

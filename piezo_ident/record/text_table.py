@@ -232,9 +232,13 @@ def _culprit(
                 below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]
                 if number == layout.above + 1 and below and not any(map(is_number, below)):
                     return _all_text(f'{path}: column {title}', text, name)
-                return DataError(
-                    f'{at}, column {title}: {text[:40]!r} is no number; mend or delete the line'
+                grouped = re.fullmatch(r'[-+]?\d{1,3}([.,]\d{3})+([.,]\d*)?', text)
+                cure = (
+                    'save it without marks between thousands'
+                    if grouped
+                    else ('mend it, or leave the cell empty where there is no reading')
                 )
+                return DataError(f'{at}, column {title}: {text[:40]!r} is no number; {cure}')
             marks |= {*text} & {',', '.'}
             if len(marks) > 1:
                 return DataError(

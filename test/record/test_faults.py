@@ -37,6 +37,7 @@ def test_sensor_at_its_stop():
     (said,) = suspicions(Record((Piece(v, np.clip(y, 0.5e-6, None), 1000.0),), 'clipped'))
     assert 'stop' in said
     assert '5e-07' in said
+    assert 'NaN' in said
 
 
 def test_a_step_after_a_rest_is_no_stop():

@@ -107,6 +107,10 @@ def scope_csv(path: Path) -> None:
     path.write_text(f'Time,Drive,Position\n(ms),(V),(\u00b5m)\n\n{rows(K / 5, V, UM)}')
 
 
+def two_lines_txt(path: Path) -> None:
+    path.write_text(f'y\tv\tt\num\tV\tms\n\n{rows(UM, V, K / 5, separator=chr(9))}')
+
+
 def microseconds_csv(path: Path) -> None:
     path.write_text('t_us,u,pos_nm\n' + rows(K * 200, V, np.round(1e3 * UM)))
 
@@ -196,6 +200,7 @@ FILES = {
     without_time_lvm: '',
     without_time_txt: '--rate 5e3',
     scope_csv: '',
+    two_lines_txt: '',
     microseconds_csv: '',
     rounded_csv: '',
     blanks_dat: '',
