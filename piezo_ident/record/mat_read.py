@@ -81,10 +81,12 @@ def flat(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
         if part.dtype != object:
             yield from flat(f'{name}.{key}', part)
         elif part.size <= WIDTH:
-            for i, cell in enumerate(part.ravel()):
-                plain = f'{name}.{key}' if part.size == 1 else f'{name}.{i + 1}.{key}'
-                title = _title(x.ravel()[i]) if key in _TITLED else ''
-                yield from flat(f'{name}.{title}' if title else plain, cell)
+            titles = [_title(struct) if key in _TITLED else '' for struct in x.ravel()]
+            for i, (title, cell) in enumerate(zip(titles, part.ravel(), strict=True), 1):
+                plain = key if part.size == 1 else f'{i}.{key}'
+                # two may be called alike
+                title = title if titles.count(title) == 1 else ''
+                yield from flat(f'{name}.{title or plain}', cell)
     if x.dtype.kind in 'biufM':
         if sum(size != 1 for size in x.shape) <= 1:
             yield name, x.ravel()

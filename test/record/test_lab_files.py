@@ -438,7 +438,8 @@ def test_signals_with_a_name_beside_their_samples(tmp_path):
     def signal(name, unit, x):
         return struct(Name=f'{{"Model Root"/"IO"/"{name}"}}', Unit=unit, Data=x[None, :])
 
-    signals = [signal('pos', 'um', UM), signal('u_cmd', 'V', V), signal('trigger', '-', 0 * V)]
+    signals = [signal('pos', 'um', UM), signal('u_cmd', 'V', V)]
+    signals += [signal('Out1', '-', 0 * V), signal('Out1', '-', V)]
     time = struct(Name='Time', Unit='s', Data=K[None, :] / RATE)
     scipy.io.savemat(tmp_path / 'd.mat', {'e1': struct(X=time, Y=np.hstack(signals))})
     labelled = [struct(values=x[:, None], label=name) for name, x in (('pos_um', UM), ('u', V))]
@@ -449,6 +450,9 @@ def test_signals_with_a_name_beside_their_samples(tmp_path):
         assert piece.sample_rate == RATE
         np.testing.assert_array_equal(piece.v, V)
         np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+    # two of one name keep their numbers
+    other = pi.read(tmp_path / 'd.mat', columns='v=e1.Y.4.Data')
+    np.testing.assert_array_equal(other.pieces[0].v, V)
 
 
 def test_an_oscilloscope_whose_channels_are_called_by_numbers(tmp_path, capsys):
