@@ -39,6 +39,11 @@ MOVED = 0.01
 #: a wild reading is off by this share of the stroke at least, and by so many of the steps that
 #: the readings around it take; so many of them are looked at on either side
 LEAST, FAR, AROUND = 2e-3, 8.0, 8
+#: share of the stroke to either end that is not the middle, of the range of the voltage that moves
+#: any stage there
+MIDDLE, FIRM = 0.02, 0.03
+#: samples in which noise is looked for
+WINDOW = 100
 #: readings of one value in a row that may be a sensor that hangs
 HELD = 10
 #: samples in which the step of a converter is looked for, in rows of so many
@@ -168,9 +173,13 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
     Return where the reading stays at one value, and jumps at the end to make up for it.
 
     A stage at rest, at the end of its range, or behind a saturated amplifier has no such jump.
+    Readings that tremble do not stay in the middle of the range while the voltage moves far; else
+    a backlash may hold them.
     """
     y, v = piece.y, piece.v
     floor = _floor(piece, stroke)
+    ends = float(y.min()), float(y.max())
+    trembles = _trembles(y)
     found: Runs = []
     for a, b in _constant(y, HELD):
         if a == 0 or b == piece.n:
@@ -184,9 +193,11 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
         drive = float(np.ptp(v[a:late])) / span if span else 0.0
         around = np.concatenate([v[max(0, a - AROUND) : a], v[b : b + AROUND]])
         outside = abs(float(np.median(v[a:b])) - float(np.median(around))) / span if span else 0.0
-        # the voltage may be back where it was
-        net = abs(float(v[late - 1] - v[a])) / span if span else 0.0
-        hangs = drive > MOVED and abs(leave) > max(least, 0.3 * net * stroke)
+        hangs = drive > MOVED and abs(leave) > max(least, 0.3 * drive * stroke)
+        if trembles and drive > FIRM and min(abs(y[a] - end) for end in ends) > MIDDLE * stroke:
+            # for most of the time, as a delay may be long
+            reach = float(np.ptp(np.quantile(v[a:b], (0.1, 0.9)))) / span
+            hangs |= b - a >= STUCK and reach > FIRM and 0.3 * reach * stroke > floor
         drops = (
             min(abs(entry), abs(leave)) > least
             and entry * leave < 0.0
@@ -196,6 +207,14 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
             # what hangs repeats the last good reading
             found.append((a if drops else a + 1, b))
     return found
+
+
+def _trembles(y: Array) -> bool:
+    """Return whether noise turns the readings, shape (n,), back and forth where they rest."""
+    steps = np.diff(y[:_CHUNK])
+    turns = steps[1:] * steps[:-1] < 0.0
+    rows = turns[: turns.size // WINDOW * WINDOW].reshape(-1, WINDOW)
+    return float(np.mean(rows.mean(axis=1) > 0.3)) > 0.02 if rows.size else False
 
 
 def _late(piece: Piece, a: int, b: int) -> int:

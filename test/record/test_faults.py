@@ -137,6 +137,14 @@ def test_a_sensor_hangs_also_while_the_voltage_goes_round():
     y = Y + 2e-9 * np.random.default_rng(1).normal(size=Y.size)
     y[20_000:60_500] = y[20_000]
     assert cleaned(y)[1] == {'stuck': 40_499}
+    # and comes back to the very place
+    y[20_000:60_500] = Y[20_000:60_500]
+    y[100_000:120_000] = y[100_000]
+    assert cleaned(y)[1] == {'stuck': 19_999}
+    # a rest before a step that the stage answers late is none
+    v = np.repeat(np.tile([4.0, 6.0, 2.0, 8.0], 5), 10_000)
+    late = np.round(np.roll(7.5e-6 * v, 400) / 1e-8) * 1e-8
+    assert cleaned(late, v)[1] == {}
 
 
 @pytest.mark.parametrize('bits', [6, 8, 12, 16])
