@@ -22,8 +22,6 @@ from piezo_ident.model.metrics import worst_error
 from piezo_ident.model.stage_model import StageModel
 from scipy.signal import butter, sosfiltfilt
 
-__all__ = ['Expectation', 'expect', 'known_rms']
-
 #: time of a way to the beginning of a motion, and of a wait there [s]
 RISE, HOLD = 0.2, 1.0
 #: what is left to creep that is worth a warning where nothing is known of the model [of its span]

@@ -15,21 +15,6 @@ from piezo_ident.common.arrays import Array, robust_range
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
 
-__all__ = [
-    'FORMULA',
-    'KINDS',
-    'REVERSED',
-    'doubts',
-    'expected_error',
-    'fit_percent',
-    'nrmse_fit',
-    'percent',
-    'percent_of_stroke',
-    'runs_against',
-    'strokes',
-    'worst_error',
-]
-
 #: times that a displacement moves as much, or as little, from which its unit is in doubt
 UNIT = 30.0
 #: how `percent_of_stroke` is defined, for tables and files

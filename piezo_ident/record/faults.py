@@ -17,17 +17,6 @@ from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, KINDS, Piece, Record
 
-__all__ = [
-    'AROUND',
-    'MAX_WILD',
-    'line_error',
-    'misspelt',
-    'quantum_of',
-    'suspicions',
-    'wild_readings',
-    'without_faults',
-]
-
 Runs = list[tuple[int, int]]
 
 #: samples in a row with one and the same displacement that are no chance

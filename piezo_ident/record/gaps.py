@@ -20,8 +20,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.record.record import Piece, Record, Segment
 
-__all__ = ['LONGEST', 'Bridged', 'bridged', 'connected_pieces', 'follows', 'played_before']
-
 #: longest gap that is bridged by a straight line [s]
 LONGEST = 1.0
 #: time after a gap in which the dynamics may still answer to what was not measured [s]
