@@ -47,11 +47,13 @@ COUNT, COUNT_OF_MANY = 40, 20
 #: from a wrong one Gauss-Newton ends at another, worse memory
 TURNED = np.linspace(0.0, 1.0, 11)
 #: shares, the same for all plays, of a stage that stands between
-BETWEEN = (0.25, 0.5, 0.75)
+BETWEEN = (0.5, 0.25, 0.75)
 #: shares of plays that were pushed to an end: from the very end none would move
 ENDS = (0.1, 0.9)
 #: best guesses from which Gauss-Newton starts
 STARTS = 5
+#: share by which they must err less than the plain one: a record of steps alone tells nothing
+CLEARLY = 0.02
 #: weight of the first guess of the shares, per row and threshold
 PULL = 1e-3
 #: most turns
@@ -92,11 +94,15 @@ class _Thinned:
 
 
 def _guesses(r: Array, swing: float) -> list[Array]:
-    """Return shares of a stage that last went up, or down, by some voltage, or stands between."""
+    """
+    Return shares of a stage that last went up, or down, by some voltage, or stands between.
+
+    The first, in the middle, is the plain one.
+    """
     low, high = ENDS
     up = [np.where(r < share * swing, high, low) for share in TURNED]
     down = [low + high - shares for shares in up[1:-1]]
-    return [*up, *down, *(np.full(r.size, share) for share in BETWEEN)]
+    return [*(np.full(r.size, share) for share in BETWEEN), *up, *down]
 
 
 class _Starts:
@@ -142,7 +148,7 @@ class _Starts:
         return block, still
 
     def guessed(self) -> list[tuple[Shares, Array]]:
-        """Return the best first guesses, and the weights that go with each."""
+        """Return the plain guess and the best others, and the weights that go with each."""
         guesses = _guesses(self.r, self.swing)
         factors = [
             [
@@ -161,12 +167,13 @@ class _Starts:
             return fit(places)[1]
 
         numbers = range(len(guesses))
-        alike = [[g if i in self.places else 0 for i in range(len(factors))] for g in numbers]
+        plain, *others = [
+            [g if i in self.places else 0 for i in range(len(factors))] for g in numbers
+        ]
         found = []
-        for places in sorted(alike, key=loss)[:STARTS]:
+        for places in [plain, *sorted(others, key=loss)[:STARTS]]:
             for i in self.sought if len(self.sought) > 1 else ():
-                others = [[*places[:i], g, *places[i + 1 :]] for g in numbers]
-                places = min(others, key=loss)
+                places = min(([*places[:i], g, *places[i + 1 :]] for g in numbers), key=loss)
             found.append(({i: guesses[places[i]] for i in self.sought}, fit(places)[0]))
         return found
 
@@ -245,7 +252,10 @@ def fit_starts(
     if not sought:
         return rules
     starts = _Starts(excerpts, thinned, sought)
-    best = min(map(starts.fit, starts.guessed()), key=lambda one: one[1])[0]
+    plain, *others = map(starts.fit, starts.guessed())
+    best, loss = min(others, key=lambda one: one[1])
+    if loss > (1.0 - CLEARLY) * plain[1]:
+        best = plain[0]
     for i in sought:
         rules[i] = _rule(float(excerpts[i].u[0]), starts.r, starts.memory(i, best))
     return rules
