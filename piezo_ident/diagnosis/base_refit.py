@@ -183,11 +183,22 @@ def with_refit(
 
 
 def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
-    """Return the gain that takes most of what a refit takes, if one does: no other loop is one."""
+    """
+    Return the gain that takes most of what a refit takes, if one does: no other loop is one.
+
+    It is another loop where the refit predicts other kinds of excitation better than the gain:
+    without labels a gain that drifts looks like one.
+    """
     rows, x = simulator.rows, simulator.run(given)
     e = centred(rows.x - x, rows.of_record)
     gain, taken = fitted_gain(rows, x, e)
-    return gain if taken > criteria.ADDED * (float(e @ e) - float(refit.errors.sum())) else None
+    whole = float(e @ e) - float(refit.errors.sum())
+    if taken <= criteria.ADDED * whole:
+        return None
+    is_large = rows.percent((whole - taken) / rows.n) >= criteria.REFIT_FINDING
+    with_gain = e - (gain - 1.0) * centred(x, rows.of_record)
+    is_loop = bool(rows.kinds) and is_large and refit_holds(rows, with_gain, refit.transfer)
+    return None if is_loop else gain
 
 
 def _hidden(simulator: Simulator, given: State, selected: Selected) -> tuple[str, ...]:

@@ -331,6 +331,16 @@ def test_another_gain_is_no_other_hysteresis():
     assert result.model is model and result.after.overall == result.before.overall > 0.3
 
 
+def test_another_loop_is_not_taken_for_another_gain():
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+    bent = Record((replace(piece, y=piece.y * (1.06 - 0.04 * piece.y / piece.y.max())),), 'bent')
+    result = diagnose(model, bent, FEW)
+    # a gain of 1.02 takes most of it, and H as it is now nearly all
+    assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
+    assert result.after.overall < 0.1 * result.before.overall
+
+
 def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
     # H with another gain is the same model, so that the first could be any: it was -0.57 here
     model, record, _ = measured(None, 0.0, 2)
