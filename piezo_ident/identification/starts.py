@@ -147,6 +147,21 @@ class _Starts:
         block[:, -1] = part.x
         return block, still
 
+    def again(self) -> list[tuple[Shares, Array]]:
+        """Return the memories that were found before with another G, if there are, as guesses."""
+        before = {i: rule for i in self.sought if (rule := self.excerpts[i].memory) is not None}
+        if len(before) < len(self.sought):
+            return []
+        shares = {
+            i: np.clip(
+                -np.diff(rule(self.r), prepend=self.excerpts[i].u[0]) / self.steps, 0.0, 1.0
+            )
+            for i, rule in before.items()
+        }
+        blocks = [self.rows(i, shares)[0] for i in range(len(self.thinned))]
+        R = triangular_factor(blocks, self.known + 1)
+        return [(shares, bounded_least_squares(R, self.lower, self.upper)[0])]
+
     def guessed(self) -> list[tuple[Shares, Array]]:
         """Return the plain guess and the best others, and the weights that go with each."""
         guesses = _guesses(self.r, self.swing)
@@ -233,7 +248,8 @@ def fit_starts(
     Parameters
     ----------
     excerpts : sequence of Excerpt
-        Runs with the samples to use, at best slow ones; each gets an offset.
+        Runs with the samples to use, at best slow ones; each gets an offset.  A memory that was
+        found before is the first guess.
     unknown : sequence of bool
         Whose memory is sought; the others keep theirs.
     lag : float, optional
@@ -252,8 +268,8 @@ def fit_starts(
     if not sought:
         return rules
     starts = _Starts(excerpts, thinned, sought)
-    plain, *others = map(starts.fit, starts.guessed())
-    best, loss = min(others, key=lambda one: one[1])
+    plain, *others = map(starts.fit, starts.again() or starts.guessed())
+    best, loss = min([plain, *others], key=lambda one: one[1])
     if loss > (1.0 - CLEARLY) * plain[1]:
         best = plain[0]
     for i in sought:
