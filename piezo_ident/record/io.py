@@ -227,13 +227,12 @@ def write(
         raise DataError(f'{path}: unknown format {suffix}; give {_WRITTEN}')
     if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
-    rows = record
+    # where the displacement alone is unknown, NaN keeps the voltage
+    every = (part for piece in record for part in (piece.before, piece) if part)
+    rows = replace(record, pieces=tuple(every))
     if is_bag:
-        write_bag(record, path, storage=storage, overwrite=overwrite, custom_data=custom_data)
+        write_bag(rows, path, storage=storage, overwrite=overwrite, custom_data=custom_data)
     else:
-        # where the displacement alone is unknown, NaN keeps the voltage
-        every = (part for piece in record for part in (piece.before, piece) if part)
-        rows = replace(record, pieces=tuple(every))
         write_columns(path, blocks_of(rows), *labels_of(rows), overwrite=overwrite)
     notes = ('custom data are kept by bags only',) if custom_data and not is_bag else ()
     return notes + _losses(record, rows)

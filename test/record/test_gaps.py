@@ -138,6 +138,7 @@ def test_the_voltage_goes_on_where_the_displacement_alone_is_bad(unmeasure, tmp_
     assert_array_equal(joined.piece.v, v)
     assert not joined.sound[hole][1:].any()
     assert joined.gaps == 0
-    # a file keeps it
-    assert write(record, tmp_path / 'kept.csv') == ()
-    assert free_run(STAGE.model, read(tmp_path / 'kept.csv')).errors == run.errors
+    # a file of any format keeps it
+    for name in ('kept.csv', 'kept.npz', 'kept.mat', 'kept.mcap', 'kept.db3', 'kept'):
+        assert write(record, tmp_path / name) == ()
+        assert free_run(STAGE.model, read(tmp_path / name)).errors == run.errors
