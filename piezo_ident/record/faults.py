@@ -201,9 +201,13 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
 def _trembles(y: Array) -> bool:
     """Return whether noise turns the readings, shape (n,), back and forth where they rest."""
     steps = np.diff(y[:_CHUNK])
+    # noise below the step of a converter turns two codes at their limit, and holds one between
+    far = np.abs(steps[1:]) > 1.5 * quantum_of(y)
     turns = steps[1:] * steps[:-1] < 0.0
-    rows = turns[: turns.size // WINDOW * WINDOW].reshape(-1, WINDOW)
-    return float(np.mean(rows.mean(axis=1) > 0.3)) > 0.02 if rows.size else False
+    turn, goes_far = (
+        x[: x.size // WINDOW * WINDOW].reshape(-1, WINDOW).mean(axis=1) for x in (turns, far)
+    )
+    return float(np.mean((turn > 0.3) & (goes_far > 0.03))) > 0.02 if turn.size else False
 
 
 def _late(piece: Piece, a: int, b: int) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.identify import identify
+from piezo_ident.operators.play import play_columns
 from piezo_ident.record.faults import line_error, misspelt, suspicions, without_faults
 from piezo_ident.record.record import Piece, Record
 import pytest
@@ -145,6 +146,16 @@ def test_a_sensor_hangs_also_while_the_voltage_goes_round():
     v = np.repeat(np.tile([4.0, 6.0, 2.0, 8.0], 5), 10_000)
     late = np.round(np.roll(7.5e-6 * v, 400) / 1e-8) * 1e-8
     assert cleaned(late, v)[1] == {}
+
+
+@pytest.mark.parametrize('bits', [8, 10, 12])
+@pytest.mark.parametrize('noise', [0.1, 0.15, 0.2])
+def test_two_codes_that_take_turns_tell_no_noise_that_a_backlash_lacks(bits, noise):
+    v = 5.0 + sum(0.4 * np.sin(2.0 * np.pi * f * T + f) for f in (1, 3, 7, 13, 29, 61))
+    y = 7.5e-6 * play_columns(v, np.array([2.0]), v[:1])[0]
+    q = 75e-6 / 2**bits
+    read = q * np.round(y / q + noise * np.random.default_rng(4).normal(size=y.size))
+    assert cleaned(read, v)[1] == {}
 
 
 @pytest.mark.parametrize('bits', [6, 8, 12, 16])
