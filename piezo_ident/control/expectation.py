@@ -11,6 +11,7 @@ what still creeps, which a model with creep knows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -66,6 +67,12 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
                 'stage rings: corners or jumps. The model may miss all of that, which is in what '
                 'is expected; round the corners, or let the scan learn'
             )
+        if _is_slow(model):
+            warnings.append(
+                'the record of the identification did not tell how the stage follows fast motion: '
+                'what is expected holds for motion as slow as that alone; identify it with steps '
+                'or noise'
+            )
     if late.size and abs(late[0]) >= limit:
         low = model.scaling.range[0]
         warnings.append(
@@ -79,6 +86,14 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
         float(late.mean()) if late.size else None,
         tuple(warnings),
     )
+
+
+def _is_slow(model: StageModel) -> bool:
+    """Return whether a model has no dynamics, and no diagnosis told what it misses thereby."""
+    missing = model.identification.get('not_identified')
+    if 'diagnosis' in model.identification or not isinstance(missing, Sequence):
+        return False
+    return any(str(what).startswith('dynamics:') for what in missing)
 
 
 def _above_mode(model: StageModel, y: Array) -> float:

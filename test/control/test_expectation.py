@@ -32,6 +32,16 @@ def scan(start, size, frequency=5.0, seconds=1.0):
     return start + 0.5 * size * (1.0 - np.cos(2.0 * np.pi * frequency * t))
 
 
+def test_a_record_of_slow_motion_promises_nothing_of_fast_motion():
+    v = np.tile(np.concatenate([np.linspace(0, 8, 20_000), np.linspace(8, 0, 20_000)]), 4)
+    y = PAPER.simulate(v) + np.random.default_rng(0).normal(0.0, 2e-9, v.size)
+    model = pi.identify(pi.Record.from_arrays(v, y, sample_rate=FS)).model
+    wanted = scan(10e-6, 30e-6, frequency=50.0)
+    drive = pi.invert(model, wanted)
+    assert np.std(PAPER.simulate(drive.v)[drive.lead :] - wanted) > 100.0 * drive.expected_rms
+    assert any('fast motion' in text for text in drive.warnings)
+
+
 @pytest.mark.parametrize(('start', 'size'), [(40e-6, 1e-6), (10e-6, 40e-6), (2e-6, 10e-6)])
 def test_where_a_stage_is_that_creeps_is_promised_beside_its_shape(start, size):
     wanted = scan(start, size)
