@@ -31,7 +31,7 @@ from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.faults import MAX_WILD, wild_readings
+from piezo_ident.record.faults import least_step, MAX_WILD, wild_readings
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95
@@ -188,7 +188,7 @@ class Learning:
                 f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '
                 'finite number each'
             )
-        e = _bridged(self._wanted - y[drive.lead :], self._model_span)
+        e = _bridged(self._wanted - y[drive.lead :], self._model_span, least_step(y))
         if np.abs(e).max() > FAR * self._model_span:
             raise DataError(
                 f'learning: the stage is {1e6 * np.abs(e).max():.4g} um off the wanted motion; is '
@@ -235,9 +235,9 @@ class Learning:
             yield REVERSED
 
 
-def _bridged(e: Array, stroke: float) -> Array:
+def _bridged(e: Array, stroke: float, step: float) -> Array:
     """Return an error without wild readings: what is learned of one would be played."""
-    wild = wild_readings(e, stroke)
+    wild = wild_readings(e, stroke, step)
     if not wild.any() or wild.mean() > MAX_WILD:
         return e
     k = np.arange(e.size)

@@ -15,7 +15,7 @@ from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.faults import AROUND, MAX_WILD, wild_readings
+from piezo_ident.record.faults import AROUND, least_step, MAX_WILD, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
@@ -241,11 +241,11 @@ class TrackingError:
         return percent(self.live.rms, self._high - self._low) if self.live.seconds else None
 
     def _errors(self, pairs: list[Matched]) -> list[Samples]:
-        errors = [
-            Samples(pair.t, pair.y_hat - pair.y, pair.segment, 'tracking_error') for pair in pairs
-        ]
-        for error in errors:
-            self.live.add(error.t, error.values, self._high - self._low)
+        errors = []
+        for pair in pairs:
+            e = pair.y_hat - pair.y
+            errors.append(Samples(pair.t, e, pair.segment, 'tracking_error'))
+            self.live.add(pair.t, e, self._high - self._low, pair.y)
         return errors
 
 
@@ -265,14 +265,21 @@ class LiveError:
         """Forget all samples."""
         # begin and end of each stretch; number, sum and sum of squares of what is kept, and wild
         self._parts: deque[tuple[float, float, Array, Array]] = deque()
+        self._step = np.inf
         self._forget_last()
 
     def _forget_last(self) -> None:
         # samples that came last, and how many of them are judged
         self._last, self._judged = np.empty(0), 0
 
-    def add(self, t: Array, residual: Array, stroke: float = np.inf) -> None:
-        """Take the residual [m] of the next samples, of a stage of some stroke [m]."""
+    def add(
+        self, t: Array, residual: Array, stroke: float = np.inf, measured: Array | None = None
+    ) -> None:
+        """
+        Take the residual [m] of the next samples, of a stage of some stroke [m].
+
+        What was `measured` [m] tells the codes of a coarse sensor.
+        """
         e = residual[np.isfinite(residual)]
         if not e.size:
             return
@@ -283,6 +290,8 @@ class LiveError:
             self.clear()
         elif kind is Kind.GAP:
             self._forget_last()
+        if measured is not None:
+            self._step = min(self._step, least_step(measured))
         self._parts.append((float(t[0]), float(t[-1]), *self._sorted(e, stroke)))
         while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
             self._parts.popleft()
@@ -293,7 +302,7 @@ class LiveError:
         if np.isfinite(stroke):
             x = np.concatenate([self._last, e])
             begin, end = self._judged, max(self._judged, x.size - EDGE)
-            e, wild = x[begin:end], wild_readings(x, stroke)[begin:end]
+            e, wild = x[begin:end], wild_readings(x, stroke, self._step)[begin:end]
             first = max(0, end - EDGE)
             self._last, self._judged = x[first:], end - first
         kept, out = (np.array([x.size, x.sum(), x @ x]) for x in (e[~wild], e[wild]))

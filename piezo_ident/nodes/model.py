@@ -158,7 +158,7 @@ class ModelNode(LabNode):
             self._residual.publish(to_message(residual))
             self._publish_preview(self._preview.add('residual', residual.t, residual.values))
             if self._predictor.memory_known:
-                self._error.add(residual.t, residual.values, stroke)
+                self._error.add(residual.t, residual.values, stroke, pair.y)
 
     def _publish_preview(self, bins: list[PreviewBin]) -> None:
         for b in bins:

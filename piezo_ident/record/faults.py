@@ -28,6 +28,8 @@ MOVED = 0.01
 #: a wild reading is off by this share of the stroke at least, and by so many of the steps that
 #: the readings around it take; so many of them are looked at on either side
 LEAST, FAR, AROUND = 2e-3, 8.0, 8
+#: and by so many codes of a converter, of which noise turns two
+CODES = 3.0
 #: share of the stroke to either end that is not the middle, of the range of the voltage that moves
 #: any stage there
 MIDDLE, FIRM = 0.02, 0.03
@@ -91,18 +93,25 @@ def without_faults(record: Record) -> Record:
     return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
 
 
-def wild_readings(error: Array, stroke: float) -> NDArray[np.bool_]:
+def least_step(y: Array) -> float:
+    """Return the least step from one reading [m] to the next, infinite where none moves."""
+    steps = np.abs(np.diff(y))
+    return float(steps[steps > 0.0].min(initial=np.inf))
+
+
+def wild_readings(error: Array, stroke: float, step: float = np.inf) -> NDArray[np.bool_]:
     """
     Return which readings are wild, of measured minus predicted displacement [m].
 
-    What the voltage does is in the prediction.
+    What the voltage does is in the prediction; `step` is the `least_step` of what was measured.
 
     >>> wild_readings(np.array([0.0] * 9 + [1.0] + [0.0] * 9), stroke=10.0).nonzero()[0]
     array([9])
     """
     wild = np.zeros(error.size, dtype=bool)
-    if error.size > 1 and np.abs(np.diff(error)).max() > LEAST * stroke:
-        for a, b in _alone(error, LEAST * stroke):
+    floor = max(LEAST * stroke, CODES * step if np.isfinite(step) else 0.0)
+    if error.size > 1 and np.abs(np.diff(error)).max() > floor:
+        for a, b in _alone(error, floor):
             wild[a:b] = True
     return wild
 

@@ -7,7 +7,7 @@
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import TurningPoints
-from piezo_ident.live.monitor import LiveError, Matcher, Preview
+from piezo_ident.live.monitor import LiveError, Matcher, Preview, TrackingError
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
@@ -382,6 +382,24 @@ def test_live_error_leaves_out_what_is_wild(size):
     for k in range(0, n, size):
         often.add(block(k, size).t, e[k : k + size], 75e-6)
     assert often.outliers == 0 and often.rms > 0.2
+
+
+@pytest.mark.parametrize('noise', [0.1, 0.2, 0.3])
+def test_codes_of_a_coarse_sensor_are_not_wild(noise):
+    rng, q = np.random.default_rng(2), 75e-6 / 2**8
+    y_hat = 4e-5 + 3e-5 * np.sin(2.0 * np.pi * 2.0 * block(0, 8000).t)
+    y_hat[5000:] = y_hat[5000]
+    y = q * np.round(y_hat / q + noise * rng.normal(size=y_hat.size))
+    y[[900, 6000]] = 0.0
+    live, tracking = LiveError(1.0), TrackingError(1.0)
+    for k in range(0, 8000, 100):
+        t, part = block(k, 100).t, slice(k, k + 100)
+        live.add(t, y[part] - y_hat[part], 75e-6, y[part])
+        tracking.wanted(Samples(t, y_hat[part]))
+        tracking.measured(Samples(t, y[part]))
+    assert live.outliers == tracking.live.outliers == 2
+    e = np.delete(y - y_hat, [900, 6000])
+    assert live.rms == pytest.approx(np.sqrt(np.mean(e**2)), rel=0.01)
 
 
 def test_live_error_starts_afresh_behind_a_gap():
