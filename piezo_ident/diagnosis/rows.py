@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers, Mask
+from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
@@ -28,7 +28,7 @@ from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.record import Record
-from piezo_ident.residual.stretches import block_means, without_spikes
+from piezo_ident.residual.stretches import block_means, SPIKE, without_spikes
 
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
@@ -258,12 +258,10 @@ def make_rows(
         )
     names = tuple(dict.fromkeys(run.record for run in runs))
     bad = bad or [None] * len(runs)
-    # a single wild reading would be noise of all readings
-    runs = [
-        run if out is None else replace(run, x=without_spikes(run.x, out))
-        for run, out in zip(runs, bad, strict=True)
+    runs = [_cleaned(run, out) for run, out in zip(runs, bad, strict=True)]
+    use = [
+        run.known if out is None else run.known & ~out for run, out in zip(runs, bad, strict=True)
     ]
-    use = [_without(run.known, out) for run, out in zip(runs, bad, strict=True)]
     samples = sum(int(known.sum()) for known in use)
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
     keep = tuple(np.all(known[: known.size // m * m].reshape(-1, m), axis=1) for known in use)
@@ -315,13 +313,7 @@ def make_rows(
         group=group,
         label=tuple(labels),
         labels=group_labels,
-        # of a record, its faults left out
-        stroke=max(
-            strokes(
-                (run.record, run.x[_without(run.use, out)])
-                for run, out in zip(runs, bad, strict=True)
-            ).values()
-        ),
+        stroke=max(strokes((run.record, run.x[run.use]) for run in runs).values()),
     )
 
 
@@ -331,8 +323,15 @@ def _has_clock(model: StageModel) -> bool:
     return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
-def _without(mask: Mask, out: Mask | None) -> Mask:
-    return mask if out is None else mask & ~out
+def _cleaned(run: Run, out: Mask | None) -> Run:
+    """Return a run whose bad samples are no noise: a few are bridged, more say nothing."""
+    if out is None:
+        return run
+    long = np.zeros(out.size, dtype=bool)
+    for a, b in true_runs(out):
+        long[a:b] = b - a > SPIKE
+    use, known = run.use & ~long, run.known & ~long
+    return replace(run, x=without_spikes(run.x, out), use=use, known=known)
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:

@@ -231,6 +231,21 @@ def test_single_wild_readings_are_no_noise():
     assert [e.name for e in other.effects] == [e.name for e in one.effects] == ['creep']
 
 
+@pytest.mark.parametrize(('start', 'stop'), [(19_000, 21_000), (20_200, 22_100)])
+def test_a_sensor_that_hangs_is_no_noise(start, stop):
+    record = example_record()
+    (piece,) = record.pieces
+    floors = []
+    for bad in (np.nan, piece.y[start]):
+        y = piece.y.copy()
+        y[start:stop] = bad
+        few = DiagnosisSettings(effects=('creep',))
+        broken = Record.from_arrays(piece.v, y, sample_rate=piece.sample_rate)
+        floors.append(diagnose(slow_model(), broken, few).noise_floor)
+    # where it hung for some periods, the residual repeats exactly; where it begins to, not at all
+    assert floors[1] == pytest.approx(floors[0], rel=0.02)
+
+
 def test_the_rest_of_another_axis_is_where_it_stood_at_first():
     filtered = {'rate_gain': 0.0, 'frequency': 100.0, 'damping': 0.7}
     truth = with_effects(cross_coupling={'channel': 'v_b', 'gain': 4e-4, **filtered})
