@@ -6,7 +6,8 @@ Raw columns to a record: every fault of measured data is met here, the same way 
 
 What can be met without guessing is met and reported as a `Fault`: gaps, restarts and changes of
 the sampling rate split the record, repeated rows are dropped, samples without a number are cut
-out.  What would need a guess is refused, and the message says what to do.
+out, but for their voltage where only the displacement has none.  What would need a guess is
+refused, and the message says what to do.
 """
 
 from __future__ import annotations
