@@ -38,6 +38,7 @@ _STAMP = re.compile(
     r'\s*(?:Z|([-+])(\d\d):?(\d\d)?)?',
     re.ASCII,
 )
+_DAY = 86_400 * 10**9
 _POINTS = (
     'these look like decimal commas: save it with decimal points, or with semicolons between '
     'the columns'
@@ -168,6 +169,7 @@ class _Stamps:
 
     def __init__(self) -> None:
         self._first: int | None = None
+        self._last = 0
 
     def __call__(self, text: str) -> float:
         found = _STAMP.fullmatch(text.strip())
@@ -178,7 +180,11 @@ class _Stamps:
         # counted in ns: a float64 holds a tenth of a microsecond since 1970
         at = (_second(day or '1970-01-01', clock) - zone) * 10**9 + int(f'{decimals or 0:0<9}')
         if self._first is None:
-            self._first = at
+            self._first = self._last = at
+        if not day:
+            # midnight may lie between
+            at += _DAY * round((self._last - at) / _DAY)
+        self._last = at
         return (at - self._first) / 1e9
 
 

@@ -176,7 +176,9 @@ def iso_csv(path: Path) -> None:
 
 
 def iso_german_csv(path: Path) -> None:
-    when = np.array([f'10:00:{k / RATE:07.4f}' for k in range(N)])
+    # over midnight, too
+    when = [f'23:59:{59.9 + k / RATE:07.4f}' for k in range(500)]
+    when = np.array(when + [f'00:00:{k / RATE:07.4f}' for k in range(N - 500)])
     table = rows(when, V, UM, separator=';', comma=True)
     path.write_text(f'Zeit;Spannung [V];Weg [um]\n{table}')
 
