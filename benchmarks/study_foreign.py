@@ -372,6 +372,7 @@ NOTE = (
     'noise or a converter of 10 or 12 bits. Two thirds of the cases are labelled and follow the '
     "package's own program; the others are one stretch each that starts anywhere. Each is "
     'identified from one record, diagnosed on another, and judged on a third of other motion. '
+    'What G or H would be identified with sets in behind the identification. '
     'The misfit of a core is the unseen error of the same stage without its effects, by forty '
     'plays with the true linear part. The size of an effect is the rms of what it changes on the '
     'diagnosis record, behind an offset and a gain, % of stroke. Lines, channels and faults of '

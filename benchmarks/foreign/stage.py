@@ -22,6 +22,17 @@ from .cores import Array, Core, core_of, Rng, WIDTHS
 from .families import LAWS
 from .speed import spent_on_speed
 
+#: what sets in behind the identification: G would have swallowed it, or H, as it follows the path
+SETS_IN = (
+    *LATER,
+    'backlash',
+    'even_nonlinearity',
+    'noncongruent_minor_loops',
+    'preload_loss',
+    'saturation',
+    'sensor_nonlinearity',
+)
+
 #: forms of each effect's law
 VARIANTS = {
     'thermal_drift': 3,
@@ -141,8 +152,8 @@ class Stage:
         v : ndarray, shape (n,)
             Command held between samples [V].
         name : {'identification', 'diagnosis', 'unseen'}
-            Of the record: its own noise, phases and past.  What is in `LATER` sets in behind the
-            identification.
+            Of the record: its own noise, phases and past.  What is in `SETS_IN` sets in behind
+            the identification.
         gains : mapping, optional
             Instead of the stage's own.
         other : ndarray, shape (n,), optional
@@ -152,7 +163,7 @@ class Stage:
         """
         gains = dict(self.gains if gains is None else gains)
         if name == 'identification':
-            gains = {k: x for k, x in gains.items() if k not in LATER}
+            gains = {k: x for k, x in gains.items() if k not in SETS_IN}
         low, high = self.limits
         u = (v - low) / (high - low)
         before = self.before(float(u[0]), name)
