@@ -179,7 +179,7 @@ def with_refit(
         findings = findings.refitted(rows.percent(refit.mean_square - noise))
     elif misfit < criteria.REFIT_FINDING and not selected.linear:
         return findings
-    return findings.hiding(_hidden(simulator, given, selected))
+    return findings.hiding(_hidden(simulator, given, selected, findings.verdict == 'refitted'))
 
 
 def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
@@ -201,21 +201,25 @@ def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
     return None if is_loop else gain
 
 
-def _hidden(simulator: Simulator, given: State, selected: Selected) -> tuple[str, ...]:
+def _hidden(
+    simulator: Simulator, given: State, selected: Selected, is_found: bool
+) -> tuple[str, ...]:
     """
     Return the effects that G or H may hide, the likeliest first: none, or two and more.
 
     Those of H gain something beside plays, or, added to the model as it was given, take half of
-    what a refit takes.
+    what a refit takes.  Where a refit is the finding, `is_found`, the latter come first: what they
+    leave is the whole change since the identification, what plays leave is a small part of it.
     """
     refit, imitated = selected.fitted, selected.imitated
-    names = list[str]()
+    beside = list[str]()
     if imitated is not None:
         before = imitated.before.mean_square
         most = sorted(imitated.contenders, key=lambda c: c.mean_square)
-        names = [c.name for c in most if before - c.mean_square > criteria.LEAST_GAIN * before]
-    names = [*selected.linear, *names, *_instead(simulator, given, refit)]
-    names = list(dict.fromkeys(names))
+        beside = [c.name for c in most if before - c.mean_square > criteria.LEAST_GAIN * before]
+    instead = _instead(simulator, given, refit)
+    names = [*instead, *beside] if is_found else [*beside, *instead]
+    names = list(dict.fromkeys([*selected.linear, *names]))
     if len(names) == 1:
         names += [n for n in look_alikes(names[0]) if find_effect(n).rate_independent][:1]
     return tuple(names[: criteria.CLASS_SIZE]) if len(names) > 1 else ()

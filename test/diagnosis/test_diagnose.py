@@ -334,6 +334,18 @@ def test_a_refit_that_knows_only_where_loops_were_is_not_kept(monkeypatch, takes
     assert ('where loops were' in result.sentence) != takes
 
 
+@pytest.mark.parametrize('is_found', [True, False])
+def test_what_does_as_much_as_a_refit_comes_first_where_it_is_a_finding(monkeypatch, is_found):
+    # friction that sets in later leaves nothing beside plays, and is all of the change
+    sensor = SimpleNamespace(name='sensor_nonlinearity', mean_square=0.4)
+    imitated = SimpleNamespace(before=SimpleNamespace(mean_square=1.0), contenders=[sensor])
+    selected = SimpleNamespace(fitted=None, linear=(), imitated=imitated)
+    monkeypatch.setattr(base_refit, '_instead', lambda *_: ['backlash', 'saturation'])
+    names = base_refit._hidden(None, None, selected, is_found)
+    instead, beside = ('backlash', 'saturation'), ('sensor_nonlinearity',)
+    assert names == ((*instead, *beside) if is_found else (*beside, *instead))
+
+
 def test_another_gain_is_no_other_hysteresis():
     model, record, _ = measured(None, 0.0, 2)
     (piece,) = record.pieces
