@@ -60,13 +60,16 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
         missing[kind] = max(missing[kind], (sent or {}).get(kind, 0.0) - present[kind])
         whole = present[kind] + missing[kind]
         if missing[kind] > MAX_MISSING * whole:
-            guarded = [f.where for f in record.faults if f.name == 'guarded_voltage']
-            cure = (
-                f'the stage did not apply what was commanded, {guarded[0]}; look at its limits '
-                'and its slew'
-                if guarded
-                else 'find what loses samples, and run the program again'
-            )
+            causes = {f.name: f.where for f in record.faults}
+            cure = 'find what loses samples, and run the program again'
+            if 'guarded_voltage' in causes:
+                cure = (
+                    'the stage did not apply what was commanded, '
+                    f'{causes["guarded_voltage"]}; look at its limits and its slew'
+                )
+            elif 'not_finite' in causes:
+                where = causes['not_finite']
+                cure = f'NaN or infinite {where}; look at the sensor, and run the program again'
             raise DataError(
                 f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
                 f'are missing or not usable; {cure}'
