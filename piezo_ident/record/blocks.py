@@ -27,9 +27,9 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Segment
 
 #: samples in a block by default
+BLOCK_SIZE = 100
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5
-BLOCK_SIZE = 100
 
 
 class Dimension(NamedTuple):
