@@ -147,6 +147,11 @@ class _Starts:
         block[:, -1] = part.x
         return block, still
 
+    def weighted(self, blocks: Sequence[Array]) -> tuple[Array, float]:
+        """Return offsets and weights for rows of all runs, or their factors, and the loss."""
+        R = triangular_factor(blocks, self.known + 1)
+        return bounded_least_squares(R, self.lower, self.upper)
+
     def again(self) -> list[tuple[Shares, Array]]:
         """Return the memories that were found before with another G, if there are, as guesses."""
         before = {i: rule for i in self.sought if (rule := self.excerpts[i].memory) is not None}
@@ -159,8 +164,7 @@ class _Starts:
             for i, rule in before.items()
         }
         blocks = [self.rows(i, shares)[0] for i in range(len(self.thinned))]
-        R = triangular_factor(blocks, self.known + 1)
-        return [(shares, bounded_least_squares(R, self.lower, self.upper)[0])]
+        return [(shares, self.weighted(blocks)[0])]
 
     def guessed(self) -> list[tuple[Shares, Array]]:
         """Return the plain guess and the best others, and the weights that go with each."""
@@ -174,9 +178,7 @@ class _Starts:
         ]
 
         def fit(places: Sequence[int]) -> tuple[Array, float]:
-            chosen = [R[place] for R, place in zip(factors, places, strict=True)]
-            R = triangular_factor(chosen, self.known + 1)
-            return bounded_least_squares(R, self.lower, self.upper)
+            return self.weighted([R[place] for R, place in zip(factors, places, strict=True)])
 
         def loss(places: Sequence[int]) -> float:
             return fit(places)[1]
