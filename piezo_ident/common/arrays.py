@@ -38,6 +38,23 @@ def true_runs(mask: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
+    """
+    Return numbers with straight lines between usable good ones in place of the bad ones.
+
+    Where none are bad, or none good, they are returned as they are.
+
+    >>> interpolated(np.array([0.0, 9.0, 2.0]), np.array([False, True, False]))
+    array([0., 1., 2.])
+    """
+    good = ~bad if usable is None else ~bad & usable
+    if not bad.any() or not good.any():
+        return x
+    new = x.copy()
+    new[bad] = np.interp(np.flatnonzero(bad), np.flatnonzero(good), x[good])
+    return new
+
+
 def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
     Return the smallest and largest of measured numbers, but for wild ones.

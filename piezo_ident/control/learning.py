@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, interpolated
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
@@ -238,7 +238,4 @@ class Learning:
 def _bridged(e: Array, stroke: float, step: float) -> Array:
     """Return an error without wild readings: what is learned of one would be played."""
     wild = wild_readings(e, stroke, step)
-    if not wild.any() or wild.mean() > MAX_WILD:
-        return e
-    k = np.arange(e.size)
-    return np.where(wild, np.interp(k, k[~wild], e[~wild]), e)
+    return e if wild.mean() > MAX_WILD else interpolated(e, wild)

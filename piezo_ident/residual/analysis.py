@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from piezo_ident.common.arrays import Mask
+from piezo_ident.common.arrays import interpolated, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.dependence import Curve, curves_of
@@ -58,9 +57,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
 
 def _repaired(part: ResidualPart, bad: Mask, out: Mask) -> ResidualPart:
     """Return a part with bad samples bridged, and without those that are to be left out."""
-    good = ~bad & part.mask
-    if not bad.any() or not good.any():
+    e = interpolated(part.e, bad, part.mask)
+    if e is part.e:
         return part
-    e = part.e.copy()
-    e[bad] = np.interp(np.flatnonzero(bad), np.flatnonzero(good), e[good])
     return ResidualPart(part.record, part.piece, e, part.mask & ~out)

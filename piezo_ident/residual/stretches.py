@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask, true_runs
+from piezo_ident.common.arrays import Array, interpolated, Mask, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
 from piezo_ident.record.record import Piece, Segment
@@ -124,13 +124,10 @@ class Stretch:
 
 def without_spikes(e: Array, bad: Mask) -> Array:
     """Return a signal with a straight line over up to `SPIKE` bad samples in a row."""
-    at = [k for a, b in true_runs(bad) if b - a <= SPIKE for k in range(a, b)]
-    if not at or len(at) == e.size:
-        return e
-    good = np.delete(np.arange(e.size), at)
-    new = e.copy()
-    new[at] = np.interp(at, good, e[good])
-    return new
+    spikes = np.zeros(e.size, dtype=bool)
+    for a, b in true_runs(bad):
+        spikes[a:b] = b - a <= SPIKE
+    return interpolated(e, spikes)
 
 
 def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, interpolated, Mask
 from piezo_ident.residual.reversals import TURN, turns_of
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, stretches_of
 from scipy import stats
@@ -49,10 +49,7 @@ def transients_in(part: ResidualPart, known: Mask, least: float) -> Transients:
     what is smaller than `least` [m].
     """
     found: list[tuple[float, float, float]] = []
-    e = part.e.copy()
-    good = ~known & part.mask
-    if known.any() and good.any():
-        e[known] = np.interp(np.flatnonzero(known), np.flatnonzero(good), e[good])
+    e = interpolated(part.e, known, part.mask)
     for s in stretches_of(part):
         found += _in_stretch(part, e, s, least)
     if len(found) < FEWEST:
