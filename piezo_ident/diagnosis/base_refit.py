@@ -44,7 +44,7 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
     """
     if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
-    return _refit(simulator, given, 'plays'), _refit(simulator, given, LAWS[-1])
+    return refit_of(simulator, given, 'plays'), refit_of(simulator, given, LAWS[-1])
 
 
 def base_thresholds(swing: float) -> Array:
@@ -80,7 +80,8 @@ def _is_loose(simulator: Simulator, given: State, fitted: Fitted) -> bool:
     return float(np.mean((model.dynamics.gain * off) ** 2)) > LOOSE**2 * float(np.mean(e * e))
 
 
-def _refit(simulator: Simulator, state: State, name: LawName) -> Fitted:
+def refit_of(simulator: Simulator, state: State, name: LawName) -> Fitted:
+    """Return H refitted as one of a family, effects and G as they are."""
     low, high = simulator.rows.reach
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
@@ -105,7 +106,7 @@ def _selected(
     found = search.run(wide)
     beside, widest = plays, wide
     if found.taken:
-        beside, widest = _refit(simulator, found.fitted.state, 'plays'), found.fitted
+        beside, widest = refit_of(simulator, found.fitted.state, 'plays'), found.fitted
     known = found.fitted.state
     start = replace(given, effects=known.effects, fading=known.fading, earlier=known.earlier)
     if simulator.is_fast:
@@ -130,14 +131,29 @@ def _selected(
     # without effects the whole weight of the given H holds a refit, and what the widest law takes
     # is no sign of one
     if found.taken and _is_loose(simulator, given, fitted):
-        fitted = _refit(simulator, fitted.state, 'preisach')
+        fitted = refit_of(simulator, fitted.state, 'preisach')
     for narrower in _NARROWER:
         is_known = narrower == 'plays' and bool(found.taken)
-        other = beside if is_known else _refit(simulator, fitted.state, narrower)
+        other = beside if is_known else refit_of(simulator, fitted.state, narrower)
         if not _is_better(fitted, other):
             fitted = other
             break
     return wide, replace(both, fitted=fitted)
+
+
+def refit_is_large(
+    simulator: Simulator, given: State, refit: Fitted, noise: float, single: float
+) -> bool:
+    """
+    Return whether a refit of H takes the larger part of what the given model misses.
+
+    `noise` and `single` are the mean squares of the noise of a row and of a sample.
+    """
+    rows = simulator.rows
+    gain = float(np.mean((rows.x - simulator.run(given)) ** 2)) - refit.mean_square
+    # noise moved the weights when they were identified, too
+    is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
+    return is_large and gain >= refit.mean_square - noise
 
 
 def with_refit(
@@ -163,10 +179,7 @@ def with_refit(
         selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
     before = float(np.mean(e * e))
-    gain = before - refit.mean_square
-    # noise moved the weights when they were identified, too
-    is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
-    if is_large and gain >= refit.mean_square - noise:
+    if refit_is_large(simulator, given, refit, noise, single):
         unsettled = findings.unsettled(rows.percent(before - noise))
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs

@@ -20,7 +20,8 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.base_refit import effects_beside, refits, with_refit
+from piezo_ident.diagnosis.base_refit import effects_beside, refits
+from piezo_ident.diagnosis.conclusion import conclude
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.found_effects import found_effects
@@ -41,11 +42,9 @@ from piezo_ident.diagnosis.results import (
 from piezo_ident.diagnosis.rows import centred, make_rows, means
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
-from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
     errors_of_laws,
-    judge,
     set_aside,
     smallest_detectable,
     untestable_of,
@@ -243,13 +242,13 @@ def _diagnosed(
     base, selected = effects_beside(simulator, given, search, plays, wide)
     # 5. the verdict, and what holds
     progress('verdict', 0.0)
-    findings = judge(rows, base, selected, noise)
-    if not findings.effects:
-        whole = noise if single is None else single
-        findings = with_refit(simulator, given, base, findings, selected, noise, whole, misfit)
-    last = selected.fitted
-    if not findings.keeps_given:
-        last = toward_given(simulator, given, last, lambda: progress('verdict', 0.5))
+    squares = noise, noise if single is None else single
+
+    def tick() -> None:
+        progress('verdict', 0.5)
+
+    found = conclude(simulator, given, search, base, selected, squares, misfit, tick)
+    findings, selected, last = found.findings, found.selected, found.last
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
     before, refit, after = (
@@ -279,7 +278,7 @@ def _diagnosed(
         sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
         given=model,
         model=refined.model,
-        effects=found_effects(rows, base, selected, explainable, last),
+        effects=found_effects(rows, found.before, selected, found.explainable, last),
         group=findings.group,
         unexplained=rest,
         candidates=candidates_of(rows, selected.rounds, findings, noise, aside),
@@ -300,8 +299,8 @@ def _diagnosed(
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,
-        law=law.name if (law := selected.fitted.state.law) else '',
-        errors_of_laws=errors_of_laws(rows, (selected.fitted, plays, wide)),
+        law=law.name if (law := last.state.law) else '',
+        errors_of_laws=errors_of_laws(rows, (last, plays, wide)),
         kinds=rows.kinds,
     )
 

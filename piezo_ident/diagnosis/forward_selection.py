@@ -257,6 +257,12 @@ class ForwardSelection:
         taken = [one for i, one in enumerate(found.taken) if i not in dropped]
         return replace(found, taken=(*taken, this), fitted=fitted)
 
+    def of_path(self, fitted: Fitted) -> Round:
+        """Return the round of what follows the path of the command, or may look like that."""
+        like = ('creep', 'gain_drift')
+        some = [e for e in self._candidates if e.rate_independent or e.name in like]
+        return self._round(fitted, some)
+
     def retuned(self, fitted: Fitted) -> Fitted:
         """Return a fit with G retuned, too, where the data could show it."""
         if fitted.state.retuning or not self._simulator.is_fast:

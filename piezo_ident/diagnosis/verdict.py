@@ -56,6 +56,8 @@ class Findings:
         Whether the model stays as it was given, whatever a refit would bring.
     gain : float
         Of the stage over that of the model, where that is most of what the model misses.
+    is_of_refit : bool
+        Whether the share is of what a refit of H takes, beside the H as given.
     """
 
     verdict: str
@@ -65,6 +67,7 @@ class Findings:
     left: float
     keeps_given: bool = False
     gain: float = 1.0
+    is_of_refit: bool = False
 
     def unsettled(self, left: float) -> Findings:
         """Return that what a refit of H would take need not last, or hold on other motion."""
@@ -79,6 +82,13 @@ class Findings:
         if not names:
             return self
         return replace(self, group=Class(names, f'record {separating_experiment(names)}'))
+
+    def either(self, names: Iterable[str]) -> Findings:
+        """Return that one of several effects was found, and these data do not tell which."""
+        known = self.group.names if self.group else self.effects
+        some = tuple(dict.fromkeys([*known, *names]))[: criteria.CLASS_SIZE]
+        verdict = 'class' if self.verdict == 'named' else self.verdict
+        return replace(self, verdict=verdict, group=_class(some, ()))
 
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""
@@ -327,7 +337,7 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
         return 'explains next to nothing'
     if findings.verdict == 'none':
         return f'there is only {findings.left:.2g} % of stroke to explain'
-    follows_path = find_effect(name).rate_independent
+    follows_path = find_effect(name).rate_independent and not findings.is_of_refit
     if not findings.effects or follows_path:
         of = 'what a sum of plays leaves' if follows_path else 'what could be explained'
         explains = f'explains {100.0 * share:.0f} % of {of}'

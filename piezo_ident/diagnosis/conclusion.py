@@ -1,0 +1,137 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What is concluded: effects beside a refitted H, one that set in since, or a refit of H alone.
+
+A wide H imitates what follows the path of the command.  But the H of the identification is known:
+where such an effect has set in since, that H and the effect do what a refit of H does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.base_refit import refit_is_large, refit_of, with_refit
+from piezo_ident.diagnosis.cross_validation import fitted_gain
+from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.search import gains_of, takes
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.toward_given import toward_given
+from piezo_ident.diagnosis.verdict import Findings, judge
+from piezo_ident.effects import find_effect
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """
+    What was found, and the fit that the refined model comes from.
+
+    Attributes
+    ----------
+    findings : Findings
+    selected : Selected
+    before : Fitted
+        What the effects were added to: H refitted, or the model as given.
+    explainable : float
+        Mean square that shares are of.
+    last : Fitted
+    """
+
+    findings: Findings
+    selected: Selected
+    before: Fitted
+    explainable: float
+    last: Fitted
+
+
+def conclude(
+    simulator: Simulator,
+    given: State,
+    search: ForwardSelection,
+    base: Fitted,
+    selected: Selected,
+    squares: tuple[float, float],
+    misfit: float,
+    tick: Callable[[], None],
+) -> Conclusion:
+    """
+    Return what is concluded from the effects `selected` beside a refitted H, the `base`.
+
+    `squares` are the mean squares of the noise of a row and of a sample, `misfit` what a wider H
+    takes, rms in % of stroke.
+    """
+    noise, single = squares
+    findings, last = judge(simulator.rows, base, selected, noise), selected.fitted
+    if not findings.effects:
+        if refit_is_large(simulator, given, last, noise, single):
+            set_in = _set_in(simulator, given, search, selected, noise)
+            if set_in is not None:
+                return set_in
+        findings = with_refit(simulator, given, base, findings, selected, noise, single, misfit)
+    if not findings.keeps_given:
+        last = toward_given(simulator, given, last, tick)
+    return Conclusion(findings, selected, base, max(base.mean_square - noise, 1e-300), last)
+
+
+def _set_in(
+    simulator: Simulator,
+    given: State,
+    search: ForwardSelection,
+    selected: Selected,
+    noise: float,
+) -> Conclusion | None:
+    """
+    Return the effect that does, beside the H as given, what a refit of H does.
+
+    Without kinds of motion to hold out, the noncongruence that H missed of the loops when it was
+    identified looks like that effect.
+    """
+    rows, law = simulator.rows, selected.fitted.state.law
+    if law is None:
+        return None
+    before = fit_jointly(simulator, given, base_at(simulator, given))
+    this = search.of_path(before)
+    known, least = before.mean_square, max(noise, selected.fitted.mean_square)
+    whole = known - least
+    if not this.contenders or not takes(
+        rows, this, known, least, whole, criteria.REFIT_FINDING, first=True
+    ):
+        return None
+    best, gains = this.contenders[0], gains_of(rows, this)
+    follow = [name for name in gains if find_effect(name).rate_independent]
+    alike = [name for name in follow if gains[name] >= criteria.SET_IN * whole]
+    alike.sort(key=lambda name: -gains[name])
+    if best.name not in alike or _may_be_a_gain(simulator, given, gains, whole):
+        return None
+    if not rows.kinds and alike == ['noncongruent_minor_loops']:
+        return None
+    found = replace(
+        selected, rounds=(*selected.rounds, this), taken=(this,), fitted=best, linear=()
+    )
+    findings = judge(rows, before, found, least)
+    # no law is so sure that another one that would do, were it alone, is not the cause
+    if len(alike) > 1:
+        findings = findings.either(alike)
+    both = toward_given(simulator, given, refit_of(simulator, best.state, law.name))
+    last = both if both.transfer.sum() < best.transfer.sum() else best
+    left = rows.percent(max(last.mean_square - noise, 0.0))
+    findings = replace(findings, left=left, is_of_refit=True)
+    return Conclusion(findings, found, before, whole, last)
+
+
+def _may_be_a_gain(
+    simulator: Simulator, given: State, gains: dict[str, float], whole: float
+) -> bool:
+    """Return whether another gain, one that wanders, or creep does nearly as much as the best."""
+    rows, x = simulator.rows, simulator.run(given)
+    others = [gain for name, gain in gains.items() if not find_effect(name).rate_independent]
+    others.append(fitted_gain(rows, x, rows.x - x)[1] / rows.n)
+    best = max(gain for name, gain in gains.items() if find_effect(name).rate_independent)
+    floor = rows.square(criteria.INDISTINCT)
+    left, other = (max(whole - gain, 0.0) + floor for gain in (best, max(others)))
+    return other <= criteria.FORM_RATIO * left

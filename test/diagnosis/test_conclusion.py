@@ -1,0 +1,83 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Effects that set in behind the identification, on a stage whose H is no sum of plays."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from piezo_ident import DiagnosisSettings, Record, SimulatedStage
+from piezo_ident.diagnosis import diagnose
+from piezo_ident.model.free_run import free_run
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.record.record import Piece, Segment
+import pytest
+import truths
+
+RATE = 20_000.0
+PATH = DiagnosisSettings(
+    effects=(
+        'saturation',
+        'backlash',
+        'even_nonlinearity',
+        'preload_loss',
+        'noncongruent_minor_loops',
+        'gain_drift',
+    )
+)
+
+
+@cache
+def stage():
+    """Return the model of a stage whose loops change along the bias."""
+    model = SimulatedStage.load('paper').model
+    plays = model.hysteresis
+    law = HysteresisLaw('preisach', plays.thresholds, (0.0, 1.0))
+    coefficients = np.zeros(law.size)
+    coefficients[: law.thresholds.size] = 0.5 * plays.weights
+    more = slice(law.thresholds.size, law.densities)
+    coefficients[more] = np.random.default_rng(0).uniform(0.0, 0.03, coefficients[more].size)
+    coefficients[-3] = 0.7
+    return replace(model, hysteresis=law.hysteresis(coefficients))
+
+
+def record(real, kind='diagnosis', *, labelled=True, factor=1.0):
+    """Return what a stage does in a program of the truths, with some noise."""
+    _, v, labels = truths.program(kind, 2)
+    v = v * stage().scaling.range[1] / v.max()
+    y = factor * real.simulate(v)
+    y = y + np.random.default_rng(len(kind)).normal(0.0, 2e-4 * np.ptp(y), y.size)
+    segments = tuple(Segment(*label) for label in labels) if labelled else ()
+    return Record((Piece(v, y, RATE, segments=segments),), kind)
+
+
+@pytest.mark.parametrize('labelled', [True, False])
+def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
+    changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
+    result = diagnose(stage(), record(changed, labelled=labelled), PATH)
+    assert [e.name for e in result.effects] == ['saturation'], result.sentence
+    assert result.effects[0].parameters['high'].value == pytest.approx(0.93, abs=0.01)
+    assert 'of what a refit of the hysteresis takes' in result.sentence
+    unseen = record(changed, 'unseen')
+    before, after = (free_run(m, unseen).errors.percent for m in (result.given, result.model))
+    assert after < 0.1 * before
+    assert after < 2.0 * result.after.overall
+
+
+def test_another_gain_is_no_effect_of_the_path():
+    result = diagnose(stage(), record(stage(), factor=1.02), PATH)
+    assert (result.verdict, result.effects) == ('unexplained', ()), result.sentence
+    assert 'a gain that is 1.02 times what it was' in result.sentence
+
+
+@pytest.mark.parametrize('labelled', [True, False])
+def test_without_labels_noncongruent_loops_are_no_name(labelled):
+    # the H of a material that is no sum of plays misses them, too
+    values = {'threshold': (0.1, 0.3), 'slope': (0.06, 0.06), 'bend': (0.0, 0.0)}
+    changed = replace(stage(), effects=(EffectSetting('noncongruent_minor_loops', values),))
+    alone = DiagnosisSettings(effects=('noncongruent_minor_loops', 'gain_drift'))
+    result = diagnose(stage(), record(changed, labelled=labelled), alone)
+    names = [e.name for e in result.effects]
+    assert names == (['noncongruent_minor_loops'] if labelled else []), result.sentence
