@@ -117,7 +117,9 @@ def _set_in(
     # no law is so sure that another one that would do, were it alone, is not the cause
     if len(alike) > 1:
         findings = findings.either(alike)
-    both = toward_given(simulator, given, refit_of(simulator, best.state, law.name))
+    # lags along the path may grow where no other kind of motion holds them
+    both = refit_of(simulator, best.state, law.name if rows.kinds else 'preisach')
+    both = toward_given(simulator, given, both, set_in=True)
     last = both if both.transfer.sum() < best.transfer.sum() else best
     left = rows.percent(max(last.mean_square - noise, 0.0))
     findings = replace(findings, left=left, is_of_refit=True)

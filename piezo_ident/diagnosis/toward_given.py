@@ -59,10 +59,16 @@ def toward_given(
     given: State,
     fitted: Fitted,
     tick: Callable[[], None] = lambda: None,
+    *,
+    set_in: bool = False,
 ) -> Fitted:
-    """Return a fit of rows without kinds of motion, drawn towards the H as given."""
+    """
+    Return a fit of rows without kinds of motion, drawn towards the H as given.
+
+    Effects that `set_in` behind the identification have not bent that H.
+    """
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
-    is_bent = any(
+    is_bent = not set_in and any(
         not added.effect.time_driven and added.name not in TESTED for added in fitted.state.effects
     )
     if law is None or rows.kinds or not rows.covers(scaling.range):
