@@ -358,7 +358,11 @@ def quantum_of(y: Array) -> float:
         ratio = jumps / usual
         if np.all(np.abs(ratio - np.rint(ratio)) < 1e-3):
             return usual
-    jumps = np.unique(np.round(jumps, 18))
+    jumps, counts = np.unique(np.round(jumps, 18), return_counts=True)
+    # a wild reading, which need not be a code, jumps twice
+    often = counts > 2
+    if counts[often].sum() > max(20, 0.9 * counts.sum()):
+        jumps = jumps[often] if often.sum() > 1 else np.repeat(jumps[often], 2)
     if jumps.size < 2 or jumps.size > y.size // 4 + 50:
         return 0.0
     small = jumps[: max(20, jumps.size // 10)]

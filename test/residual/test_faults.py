@@ -209,6 +209,14 @@ def test_quantum_of_numbers_that_were_rounded_again(decimals):
     assert quantum_of(read) == pytest.approx(step, rel=1e-2)
 
 
+def test_wild_readings_between_the_codes_hide_no_step():
+    rng = np.random.default_rng(5)
+    read = 2e-8 * np.rint(400.0 * np.sin(np.arange(20_000) / 500.0))
+    wild = rng.choice(read.size, 60, replace=False)
+    read[wild] += 1e-6 * rng.uniform(-1.0, 1.0, wild.size)
+    assert quantum_of(read) == pytest.approx(2e-8)
+
+
 def test_quantum_of_plain_numbers_and_of_nothing():
     rng = np.random.default_rng(8)
     assert quantum_of(rng.standard_normal(10_000)) == 0.0
