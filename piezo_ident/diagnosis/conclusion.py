@@ -92,7 +92,11 @@ def _set_in(
     identified looks like that effect.
     """
     rows, law = simulator.rows, selected.fitted.state.law
-    if law is None:
+    # a branch passed once has no second half, as for any effect
+    if law is None or rows.passes < criteria.PASSES:
+        return None
+    # that one of these has changed since may look like another one
+    if any(find_effect(known.name).rate_independent for known in simulator.model.effects):
         return None
     before = fit_jointly(simulator, given, base_at(simulator, given))
     this = search.of_path(before)

@@ -66,6 +66,22 @@ def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     assert after < 2.0 * result.after.overall
 
 
+def test_nothing_set_in_where_the_range_is_passed_twice():
+    changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
+    v = 5.0 - 5.0 * np.cos(2.0 * np.pi * 0.5 * np.arange(2 * RATE) / RATE)
+    result = diagnose(stage(), Record.from_arrays(v, changed.simulate(v), sample_rate=RATE), PATH)
+    assert (result.smallest_detectable, result.effects) == (None, ()), result.sentence
+
+
+def test_a_known_effect_of_the_path_that_has_changed_is_no_other_one():
+    known, changed = (
+        replace(stage(), effects=(EffectSetting('saturation', {'high': high}),))
+        for high in (0.98, 0.93)
+    )
+    result = diagnose(known, record(changed), PATH)
+    assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
+
+
 def test_another_gain_is_no_effect_of_the_path():
     result = diagnose(stage(), record(stage(), factor=1.02), PATH)
     assert (result.verdict, result.effects) == ('unexplained', ()), result.sentence
