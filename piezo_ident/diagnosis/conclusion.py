@@ -69,7 +69,7 @@ def conclude(
     findings, last = judge(simulator.rows, base, selected, noise), selected.fitted
     if not findings.effects:
         if refit_is_large(simulator, given, last, noise, single):
-            set_in = _set_in(simulator, given, search, selected, noise)
+            set_in = _set_in(simulator, given, search, selected, noise, tick)
             if set_in is not None:
                 return set_in
         findings = with_refit(simulator, given, base, findings, selected, noise, single, misfit)
@@ -84,6 +84,7 @@ def _set_in(
     search: ForwardSelection,
     selected: Selected,
     noise: float,
+    tick: Callable[[], None],
 ) -> Conclusion | None:
     """
     Return the effect that does, beside the H as given, what a refit of H does.
@@ -121,7 +122,7 @@ def _set_in(
     # no law is so sure that another one that would do, were it alone, is not the cause
     if len(alike) > 1:
         findings = findings.either(alike)
-    both = toward_given(simulator, given, refit_of(simulator, best.state, law.name))
+    both = toward_given(simulator, given, refit_of(simulator, best.state, law.name), tick)
     last = both if both.transfer.sum() < best.transfer.sum() else best
     left = rows.percent(max(last.mean_square - noise, 0.0))
     findings = replace(findings, left=left, is_of_refit=True)

@@ -241,13 +241,14 @@ def _diagnosed(
     )
     base, selected = effects_beside(simulator, given, search, plays, wide)
     # 5. the verdict, and what holds
-    progress('verdict', 0.0)
     squares = noise, noise if single is None else single
 
     def tick() -> None:
         progress('verdict', 0.5)
 
+    # which may search for one more effect
     found = conclude(simulator, given, search, base, selected, squares, misfit, tick)
+    tick()
     findings, selected, last = found.findings, found.selected, found.last
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)

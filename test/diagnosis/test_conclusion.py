@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import groupby
 
 import numpy as np
 from piezo_ident import DiagnosisSettings, Record, SimulatedStage
@@ -56,7 +57,11 @@ def record(real, kind='diagnosis', *, labelled=True, factor=1.0):
 @pytest.mark.parametrize('labelled', [True, False])
 def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
-    result = diagnose(stage(), record(changed, labelled=labelled), PATH)
+    steps = []
+    result = diagnose(
+        stage(), record(changed, labelled=labelled), PATH, progress=lambda *at: steps.append(at[0])
+    )
+    assert [step for step, _ in groupby(steps)] == ['residual', 'candidates', 'verdict']
     assert [e.name for e in result.effects] == ['saturation'], result.sentence
     assert result.effects[0].parameters['high'].value == pytest.approx(0.93, abs=0.01)
     assert 'of what a refit of the hysteresis takes' in result.sentence
