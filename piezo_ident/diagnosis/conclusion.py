@@ -118,10 +118,8 @@ def _set_in(
     found = replace(
         selected, rounds=(*selected.rounds, this), taken=(this,), fitted=best, linear=()
     )
-    findings = judge(rows, before, found, least)
     # no law is so sure that another one that would do, were it alone, is not the cause
-    if len(alike) > 1:
-        findings = findings.either(alike)
+    findings = judge(rows, before, found, least, alike)
     both = toward_given(simulator, given, refit_of(simulator, best.state, law.name), tick)
     last = both if both.transfer.sum() < best.transfer.sum() else best
     left = rows.percent(max(last.mean_square - noise, 0.0))

@@ -83,13 +83,6 @@ class Findings:
             return self
         return replace(self, group=Class(names, f'record {separating_experiment(names)}'))
 
-    def either(self, names: Iterable[str]) -> Findings:
-        """Return that one of several effects was found, and these data do not tell which."""
-        known = self.group.names if self.group else self.effects
-        some = tuple(dict.fromkeys([*known, *names]))[: criteria.CLASS_SIZE]
-        verdict = 'class' if self.verdict == 'named' else self.verdict
-        return replace(self, verdict=verdict, group=_class(some, ()))
-
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""
         share = 1.0 - self.share if self.effects or self.left else 0.0
@@ -99,12 +92,14 @@ class Findings:
 # -- which effect is it? -------------------------------------------------------------------------
 
 
-def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Findings:
+def judge(
+    rows: Rows, base: Fitted, selected: Selected, noise: float, alike: Sequence[str] = ()
+) -> Findings:
     """
     Return the verdict on what was added to a base.
 
     `noise` is the mean square of the noise of a row.  What could have bent G at the identification
-    is a rival of the first effect that was added.
+    is a rival of the first effect that was added, and so is what is known to be `alike`.
     """
     fitted, taken = selected.fitted, selected.taken
     explainable = max(base.mean_square - noise, 0.0)
@@ -121,13 +116,15 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / max(explainable, 1e-300), 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
-    rest, group = rows.percent(left), _alike(rows, base, selected, noise)
+    rest, group = rows.percent(left), _alike(rows, base, selected, noise, alike)
     if share < criteria.NAMED:
         return Findings('partly_explained', share, effects, group, rest)
     return Findings('class' if group else 'named', share, effects, group, rest)
 
 
-def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class | None:
+def _alike(
+    rows: Rows, base: Fitted, selected: Selected, noise: float, known: Sequence[str]
+) -> Class | None:
     """Return the first of the effects added that others explain as well, with those."""
     law = selected.fitted.state.law
     plays = law is None or law.name == 'plays'
@@ -148,6 +145,7 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         # of a G that changed none of the laws need be the cause
         like = selected.linear if contenders[0].name in selected.linear else ()
         like = (*changes, *like) if contenders[0].name in changes else like
+        like = (*like, *known) if i == 0 else like
         names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:

@@ -71,6 +71,14 @@ def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     assert after < 2.0 * result.after.overall
 
 
+def test_a_look_alike_that_was_not_tried_is_asked_for_beside_those_that_do_as_much():
+    changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
+    some = DiagnosisSettings(effects=('saturation', 'sensor_nonlinearity'))
+    group = diagnose(stage(), record(changed), some).group
+    assert group.names == ('saturation', 'sensor_nonlinearity', 'backlash')
+    assert group.separating_experiment.startswith('diagnose again with backlash among the')
+
+
 def test_nothing_set_in_where_the_range_is_passed_twice():
     changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
     v = 5.0 - 5.0 * np.cos(2.0 * np.pi * 0.5 * np.arange(2 * RATE) / RATE)
