@@ -240,6 +240,9 @@ def _diagnosed(
         given=left,
     )
     base, selected = effects_beside(simulator, given, search, plays, wide)
+    refitted = selected.fitted
+    # what set in since is sought beside the given H, and all else beside a refitted one
+    smallest = smallest_detectable(rows, base, selected, noise)
     # 5. the verdict, and what holds
     squares = noise, noise if single is None else single
 
@@ -263,7 +266,6 @@ def _diagnosed(
     refined = refine(simulator, given, last, findings, noise, (before, after))
     if refined.is_given:
         after = before
-    smallest = smallest_detectable(rows, base, selected, noise)
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
     # where no line stands out, and no channel, there is nothing to fit
     tested = {HUM} if lines.searched else set()
@@ -301,7 +303,7 @@ def _diagnosed(
         ),
         settings=settings,
         law=law.name if (law := last.state.law) else '',
-        errors_of_laws=errors_of_laws(rows, (last, plays, wide)),
+        errors_of_laws=errors_of_laws(rows, (refitted, last, plays, wide)),
         kinds=rows.kinds,
     )
 

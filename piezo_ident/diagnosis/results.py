@@ -226,7 +226,8 @@ class Diagnosis(Showable):
     unseen : tuple of Unseen
         Errors on records that took no part.
     law : str
-        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`.
+        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`; empty where it
+        stays as it was given.
     errors_of_laws : mapping of str to float
         Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
     kinds : tuple of str

@@ -14,6 +14,7 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Segment
+from piezo_ident.report.diagnosis import diagnosis_text
 import pytest
 import truths
 
@@ -65,6 +66,11 @@ def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     assert [e.name for e in result.effects] == ['saturation'], result.sentence
     assert result.effects[0].parameters['high'].value == pytest.approx(0.93, abs=0.01)
     assert 'of what a refit of the hysteresis takes' in result.sentence
+    words = ' '.join(diagnosis_text(result).split())
+    assert 'hysteresis as it was given; refitted with nothing added' in words
+    assert 'preisach' in result.errors_of_laws
+    # all else was sought beside the refit
+    assert result.smallest_detectable < result.refit.overall
     unseen = record(changed, 'unseen')
     before, after = (free_run(m, unseen).errors.percent for m in (result.given, result.model))
     assert after < 0.1 * before
