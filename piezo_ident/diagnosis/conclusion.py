@@ -123,7 +123,7 @@ def _set_in(
     both = toward_given(simulator, given, refit_of(simulator, best.state, law.name), tick)
     last = both if both.transfer.sum() < best.transfer.sum() else best
     left = rows.percent(max(last.mean_square - noise, 0.0))
-    findings = replace(findings, left=left, is_of_refit=True)
+    findings = replace(findings, left=left, of_refit=whole)
     return Conclusion(findings, found, before, whole, last)
 
 

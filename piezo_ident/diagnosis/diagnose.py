@@ -305,6 +305,7 @@ def _diagnosed(
         law=law.name if (law := last.state.law) else '',
         errors_of_laws=errors_of_laws(rows, (refitted, last, plays, wide)),
         kinds=rows.kinds,
+        is_of_refit=findings.of_refit > 0.0,
     )
 
 

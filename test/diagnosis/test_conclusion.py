@@ -15,6 +15,7 @@ from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report.diagnosis import diagnosis_text
+from piezo_ident.report.to_json import to_json
 import pytest
 import truths
 
@@ -69,6 +70,9 @@ def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     words = ' '.join(diagnosis_text(result).split())
     assert 'hysteresis as it was given; refitted with nothing added' in words
     assert 'preisach' in result.errors_of_laws
+    assert 'saturation (slot: input), 100 % of what a refit of the hysteresis takes' in words
+    assert '100 % of its square go with saturation.' in words
+    assert to_json(result)['shares_are_of_refit']
     # all else was sought beside the refit
     assert result.smallest_detectable < result.refit.overall
     unseen = record(changed, 'unseen')
