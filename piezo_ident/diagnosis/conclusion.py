@@ -69,7 +69,7 @@ def conclude(
     findings, last = judge(simulator.rows, base, selected, noise), selected.fitted
     if not findings.effects:
         if refit_is_large(simulator, given, last, noise, single):
-            set_in = _set_in(simulator, given, search, selected, noise)
+            set_in = _set_in(simulator, given, search, selected, noise, tick)
             if set_in is not None:
                 return set_in
         findings = with_refit(simulator, given, base, findings, selected, noise, single, misfit)
@@ -84,6 +84,7 @@ def _set_in(
     search: ForwardSelection,
     selected: Selected,
     noise: float,
+    tick: Callable[[], None],
 ) -> Conclusion | None:
     """
     Return the effect that does, beside the H as given, what a refit of H does.
@@ -92,7 +93,11 @@ def _set_in(
     identified looks like that effect.
     """
     rows, law = simulator.rows, selected.fitted.state.law
-    if law is None:
+    # a branch passed once has no second half, as for any effect
+    if law is None or rows.passes < criteria.PASSES:
+        return None
+    # that one of these has changed since may look like another one
+    if any(find_effect(known.name).rate_independent for known in simulator.model.effects):
         return None
     before = fit_jointly(simulator, given, base_at(simulator, given))
     this = search.of_path(before)
@@ -113,16 +118,14 @@ def _set_in(
     found = replace(
         selected, rounds=(*selected.rounds, this), taken=(this,), fitted=best, linear=()
     )
-    findings = judge(rows, before, found, least)
     # no law is so sure that another one that would do, were it alone, is not the cause
-    if len(alike) > 1:
-        findings = findings.either(alike)
+    findings = judge(rows, before, found, least, alike)
     # lags along the path may grow where no other kind of motion holds them
     both = refit_of(simulator, best.state, law.name if rows.kinds else 'preisach')
-    both = toward_given(simulator, given, both, set_in=True)
+    both = toward_given(simulator, given, both, tick, set_in=True)
     last = both if both.transfer.sum() < best.transfer.sum() else best
     left = rows.percent(max(last.mean_square - noise, 0.0))
-    findings = replace(findings, left=left, is_of_refit=True)
+    findings = replace(findings, left=left, of_refit=whole)
     return Conclusion(findings, found, before, whole, last)
 
 

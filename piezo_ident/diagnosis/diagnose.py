@@ -240,14 +240,18 @@ def _diagnosed(
         given=left,
     )
     base, selected = effects_beside(simulator, given, search, plays, wide)
+    refitted = selected.fitted
+    # what set in since is sought beside the given H, and all else beside a refitted one
+    smallest = smallest_detectable(rows, base, selected, noise)
     # 5. the verdict, and what holds
-    progress('verdict', 0.0)
     squares = noise, noise if single is None else single
 
     def tick() -> None:
         progress('verdict', 0.5)
 
+    # which may search for one more effect
     found = conclude(simulator, given, search, base, selected, squares, misfit, tick)
+    tick()
     findings, selected, last = found.findings, found.selected, found.last
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
@@ -262,7 +266,6 @@ def _diagnosed(
     refined = refine(simulator, given, last, findings, noise, (before, after))
     if refined.is_given:
         after = before
-    smallest = smallest_detectable(rows, base, selected, noise)
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
     # where no line stands out, and no channel, there is nothing to fit
     tested = {HUM} if lines.searched else set()
@@ -300,8 +303,9 @@ def _diagnosed(
         ),
         settings=settings,
         law=law.name if (law := last.state.law) else '',
-        errors_of_laws=errors_of_laws(rows, (last, plays, wide)),
+        errors_of_laws=errors_of_laws(rows, (refitted, last, plays, wide)),
         kinds=rows.kinds,
+        is_of_refit=findings.of_refit > 0.0,
     )
 
 

@@ -149,7 +149,7 @@ def sentence(
             f'other motion gains nothing, so the model stays as given ({before:.3g} % of stroke)'
         )
     missed = 'what the model missed'
-    if findings.is_of_refit:
+    if findings.of_refit:
         missed = 'what a refit of the hysteresis takes'
     elif findings.effects and refit < 0.5 * before:
         # shares are of what a refit leaves: a sensor set to zero again is no effect

@@ -226,11 +226,15 @@ class Diagnosis(Showable):
     unseen : tuple of Unseen
         Errors on records that took no part.
     law : str
-        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`.
+        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`; empty where it
+        stays as it was given.
     errors_of_laws : mapping of str to float
         Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
     kinds : tuple of str
         Kinds of motion held out in turn; empty where parts of the data stood for them.
+    is_of_refit : bool
+        Whether shares, but of candidates that follow time or rate, are of what a refit of H takes,
+        since the effect does that beside the H as given.
 
     Examples
     --------
@@ -269,3 +273,4 @@ class Diagnosis(Showable):
     law: str = ''
     errors_of_laws: Mapping[str, float] = field(default_factory=dict)
     kinds: tuple[str, ...] = ()
+    is_of_refit: bool = False

@@ -56,8 +56,9 @@ class Findings:
         Whether the model stays as it was given, whatever a refit would bring.
     gain : float
         Of the stage over that of the model, where that is most of what the model misses.
-    is_of_refit : bool
-        Whether the share is of what a refit of H takes, beside the H as given.
+    of_refit : float
+        Mean square that a refit of H takes, where an effect does that beside the H as given and
+        shares are of it; else 0.
     """
 
     verdict: str
@@ -67,7 +68,7 @@ class Findings:
     left: float
     keeps_given: bool = False
     gain: float = 1.0
-    is_of_refit: bool = False
+    of_refit: float = 0.0
 
     def unsettled(self, left: float) -> Findings:
         """Return that what a refit of H would take need not last, or hold on other motion."""
@@ -83,13 +84,6 @@ class Findings:
             return self
         return replace(self, group=Class(names, f'record {separating_experiment(names)}'))
 
-    def either(self, names: Iterable[str]) -> Findings:
-        """Return that one of several effects was found, and these data do not tell which."""
-        known = self.group.names if self.group else self.effects
-        some = tuple(dict.fromkeys([*known, *names]))[: criteria.CLASS_SIZE]
-        verdict = 'class' if self.verdict == 'named' else self.verdict
-        return replace(self, verdict=verdict, group=_class(some, ()))
-
     def unexplained(self, description: str) -> Unexplained:
         """Return what is left beyond the noise."""
         share = 1.0 - self.share if self.effects or self.left else 0.0
@@ -99,12 +93,14 @@ class Findings:
 # -- which effect is it? -------------------------------------------------------------------------
 
 
-def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Findings:
+def judge(
+    rows: Rows, base: Fitted, selected: Selected, noise: float, alike: Sequence[str] = ()
+) -> Findings:
     """
     Return the verdict on what was added to a base.
 
     `noise` is the mean square of the noise of a row.  What could have bent G at the identification
-    is a rival of the first effect that was added.
+    is a rival of the first effect that was added, and so is what is known to be `alike`.
     """
     fitted, taken = selected.fitted, selected.taken
     explainable = max(base.mean_square - noise, 0.0)
@@ -121,13 +117,15 @@ def judge(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Finding
         return Findings('none' if small else 'unexplained', 0.0, (), None, size)
     share = float(np.clip(1.0 - left / max(explainable, 1e-300), 0.0, 1.0))
     effects = tuple(this.contenders[0].name for this in taken)
-    rest, group = rows.percent(left), _alike(rows, base, selected, noise)
+    rest, group = rows.percent(left), _alike(rows, base, selected, noise, alike)
     if share < criteria.NAMED:
         return Findings('partly_explained', share, effects, group, rest)
     return Findings('class' if group else 'named', share, effects, group, rest)
 
 
-def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class | None:
+def _alike(
+    rows: Rows, base: Fitted, selected: Selected, noise: float, known: Sequence[str]
+) -> Class | None:
     """Return the first of the effects added that others explain as well, with those."""
     law = selected.fitted.state.law
     plays = law is None or law.name == 'plays'
@@ -148,6 +146,7 @@ def _alike(rows: Rows, base: Fitted, selected: Selected, noise: float) -> Class 
         # of a G that changed none of the laws need be the cause
         like = selected.linear if contenders[0].name in selected.linear else ()
         like = (*changes, *like) if contenders[0].name in changes else like
+        like = (*like, *known) if i == 0 else like
         names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
@@ -240,6 +239,8 @@ def candidates_of(
     last: dict[str, Round] = {}
     for one in rounds:
         left = max(one.before.mean_square - noise, 1e-300)
+        if one is rounds[-1]:
+            left = findings.of_refit or left
         shares |= {
             name: gain / left
             for name, gain in gains_of(rows, one).items()
@@ -254,7 +255,7 @@ def candidates_of(
             continue
         value = float(np.clip(share, 0.0, 1.0))
         why = _why_not(name, value, findings, last[name], rows.passes)
-        is_partly = findings.verdict == 'partly_explained'
+        is_partly = findings.verdict == 'partly_explained' and not _is_beside(name, findings)
         if is_partly and value >= shares.get(findings.effects[0], 1.0):
             why = f'explains no less than {findings.effects[0]}, which is as simple or simpler'
         found.append(Candidate(name, value, why))
@@ -264,6 +265,11 @@ def candidates_of(
         if share >= criteria.SWALLOWED and name not in possible
     ]
     return (*found, *(Candidate(name, 0.0, why) for name, why in aside.items()))
+
+
+def _is_beside(name: str, findings: Findings) -> bool:
+    """Return whether an effect was tried beside a refit of H that was then not needed."""
+    return findings.of_refit > 0.0 and not find_effect(name).rate_independent
 
 
 def _visible(rounds: Sequence[Round]) -> dict[str, float]:
@@ -332,14 +338,18 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
     if findings.group and name in findings.group.names:
         if not findings.effects:
             return 'may hide in the base model'
-        return f'explains as much as {findings.effects[0]}: these data do not tell them apart'
+        does = 'does nearly what a refit of the hysteresis does, like'
+        does = does if findings.of_refit else 'explains as much as'
+        return f'{does} {findings.effects[0]}: these data do not tell them apart'
     if share < criteria.LEAST_GAIN:
         return 'explains next to nothing'
     if findings.verdict == 'none':
         return f'there is only {findings.left:.2g} % of stroke to explain'
-    follows_path = find_effect(name).rate_independent and not findings.is_of_refit
-    if not findings.effects or follows_path:
+    follows_path = find_effect(name).rate_independent and not findings.of_refit
+    if not findings.effects or follows_path or _is_beside(name, findings):
         of = 'what a sum of plays leaves' if follows_path else 'what could be explained'
+        if findings.of_refit:
+            of = 'what a refit of the hysteresis leaves'
         explains = f'explains {100.0 * share:.0f} % of {of}'
         if passes < criteria.PASSES:
             return f'{explains}; the range was passed too rarely to test that'
@@ -348,7 +358,8 @@ def _why_not(name: str, share: float, findings: Findings, last: Round, passes: f
         if follows_path:
             return f'{explains}; a wider hysteresis may explain as much'
         return f'{explains}: as chance might, at a price elsewhere, or not where it alone acts'
-    if name in last.best and last.before.mean_square > 0.0:
+    # behind what set in since nothing was tried
+    if name in last.best and last.before.mean_square > 0.0 and not findings.of_refit:
         more = 1.0 - last.best[name].errors.sum() / last.before.errors.sum()
         if more < criteria.LEAST_GAIN:
             return f'{best} explains more; nothing is left for it after that'

@@ -12,7 +12,13 @@ from platform import python_version
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.diagnosis.results import Diagnosis, FORMULA, FoundParameter
+from piezo_ident.diagnosis.results import (
+    Diagnosis,
+    FORMULA,
+    FoundEffect,
+    FoundParameter,
+    Unexplained,
+)
 from piezo_ident.effects import find_effect
 from piezo_ident.model import metrics
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
@@ -177,7 +183,7 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
     size = f'{number(left.rms_percent)} % of stroke'
     rows = [
         # nothing was added that could have a share
-        ('unexplained', (_left(left.share, left.rms_percent) if result.effects else size) + rest),
+        ('unexplained', (_left(result, left) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
         *(('hysteresis', text) for text in law_told(result)),
         ('noise floor', f'{noise} ({source})'),
@@ -195,8 +201,9 @@ def _stands_for(result: Diagnosis) -> str:
     return f'for motion of the kinds in these data, each predicted from the others: {kinds}'
 
 
-def _left(share: float, rms_percent: float) -> str:
-    return f'{share_text(share)} of the explainable part, {number(rms_percent)} % of stroke'
+def _left(result: Diagnosis, part: FoundEffect | Unexplained) -> str:
+    of = 'what a refit of the hysteresis takes' if result.is_of_refit else 'the explainable part'
+    return f'{share_text(part.share)} of {of}, {number(part.rms_percent)} % of stroke'
 
 
 def ways_of(result: Diagnosis) -> tuple[Way, ...]:
@@ -237,12 +244,18 @@ def reversal_text(result: Diagnosis, found: Sequence[Way]) -> str:
     text = (
         f'Near the reversals (the first {share_text(NEAR)} of the range behind a turn) the model '
         f'as given misses {number(given)} % of stroke, elsewhere {number(elsewhere[0])} %. '
-        f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
-        'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
     )
-    if result.effects and refined < refitted:
-        names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
-        text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
+    names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
+    if result.is_of_refit:
+        # a refit does the same
+        text += f'{share_text(1.0 - (refined / given) ** 2)} of its square go with {names}'
+    else:
+        text += (
+            f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
+            'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
+        )
+        if result.effects and refined < refitted:
+            text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
     last, there = (refined, elsewhere[2]) if result.effects else (refitted, elsewhere[1])
     return f'{text}. {number(last)} % stay, elsewhere {number(there)} %.'
 
@@ -255,7 +268,7 @@ def _rms(some: Sequence[Way]) -> tuple[float, ...]:
 
 def _added(result: Diagnosis) -> list[str]:
     return [
-        f'{effect.name} (slot: {effect.slot}), {_left(effect.share, effect.rms_percent)}'
+        f'{effect.name} (slot: {effect.slot}), {_left(result, effect)}'
         for effect in result.effects
     ]
 
@@ -274,9 +287,10 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     title, n = 'Candidates that were not added', len(rows)
     if most is not None and n > most:
         title, rows = f'{title}, the first {most} of {n}', rows[:most]
+    of = 'a refit of the hysteresis takes' if result.is_of_refit else 'a sum of plays leaves'
     note = (
         'Share of the explainable part of the residual that each explains when it is added alone; '
-        'for effects that follow the path of the voltage alone, of what a sum of plays leaves.'
+        f'for effects that follow the path of the voltage alone, of what {of}.'
     )
     return table(title, ('effect', 'share', 'why not'), rows, note)
 

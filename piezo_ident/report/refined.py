@@ -76,7 +76,8 @@ def law_told(result: Diagnosis) -> list[str]:
     compared = ', '.join(
         f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
     )
-    if result.verdict != 'refitted' and not changes(result.given, result.model):
+    is_kept = result.verdict != 'refitted' and not changes(result.given, result.model)
+    if is_kept or not result.law:
         about = 'as it was given'
     elif result.law not in LAW_WORDS:
         about = 'a sum of plays'

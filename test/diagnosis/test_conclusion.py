@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import groupby
 
 import numpy as np
 from piezo_ident import DiagnosisSettings, Record, SimulatedStage
@@ -13,6 +14,8 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Segment
+from piezo_ident.report.diagnosis import diagnosis_text
+from piezo_ident.report.to_json import to_json
 import pytest
 import truths
 
@@ -56,14 +59,50 @@ def record(real, kind='diagnosis', *, labelled=True, factor=1.0):
 @pytest.mark.parametrize('labelled', [True, False])
 def test_what_set_in_since_is_named_though_a_refit_does_as_much(labelled):
     changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
-    result = diagnose(stage(), record(changed, labelled=labelled), PATH)
+    steps = []
+    result = diagnose(
+        stage(), record(changed, labelled=labelled), PATH, progress=lambda *at: steps.append(at[0])
+    )
+    assert [step for step, _ in groupby(steps)] == ['residual', 'candidates', 'verdict']
     assert [e.name for e in result.effects] == ['saturation'], result.sentence
     assert result.effects[0].parameters['high'].value == pytest.approx(0.93, abs=0.01)
     assert 'of what a refit of the hysteresis takes' in result.sentence
+    words = ' '.join(diagnosis_text(result).split())
+    assert 'hysteresis as it was given; refitted with nothing added' in words
+    assert 'preisach' in result.errors_of_laws
+    assert 'saturation (slot: input), 100 % of what a refit of the hysteresis takes' in words
+    assert '100 % of its square go with saturation.' in words
+    assert to_json(result)['shares_are_of_refit']
+    # all else was sought beside the refit
+    assert result.smallest_detectable < result.refit.overall
     unseen = record(changed, 'unseen')
     before, after = (free_run(m, unseen).errors.percent for m in (result.given, result.model))
     assert after < 0.1 * before
     assert after < 2.0 * result.after.overall
+
+
+def test_a_look_alike_that_was_not_tried_is_asked_for_beside_those_that_do_as_much():
+    changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
+    some = DiagnosisSettings(effects=('saturation', 'sensor_nonlinearity'))
+    group = diagnose(stage(), record(changed), some).group
+    assert group.names == ('saturation', 'sensor_nonlinearity', 'backlash')
+    assert group.separating_experiment.startswith('diagnose again with backlash among the')
+
+
+def test_nothing_set_in_where_the_range_is_passed_twice():
+    changed = replace(stage(), effects=(EffectSetting('saturation', {'high': 0.93}),))
+    v = 5.0 - 5.0 * np.cos(2.0 * np.pi * 0.5 * np.arange(2 * RATE) / RATE)
+    result = diagnose(stage(), Record.from_arrays(v, changed.simulate(v), sample_rate=RATE), PATH)
+    assert (result.smallest_detectable, result.effects) == (None, ()), result.sentence
+
+
+def test_a_known_effect_of_the_path_that_has_changed_is_no_other_one():
+    known, changed = (
+        replace(stage(), effects=(EffectSetting('saturation', {'high': high}),))
+        for high in (0.98, 0.93)
+    )
+    result = diagnose(known, record(changed), PATH)
+    assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
 
 
 def test_another_gain_is_no_effect_of_the_path():

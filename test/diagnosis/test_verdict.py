@@ -11,7 +11,7 @@ from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors, takes_shape
 from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
-from piezo_ident.diagnosis.results import Errors, Unexplained
+from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.search import stands_out, takes
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, rivals_of
@@ -362,6 +362,33 @@ def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
     found = Findings('unexplained', 0.0, (), None, 0.9).hiding(('gain_drift', 'saturation'))
     names = [c.name for c in candidates_of(rows, [this], found, 0.0, {})]
     assert sorted(names) == ['gain_drift', 'saturation']
+
+
+def test_beside_what_set_in_shares_and_reasons_are_of_a_refit(rows):
+    shares = {'creep': 0.3, 'sensor_nonlinearity': 0.6, 'backlash': 0.3, 'preload_loss': 0.06}
+    beside, this = (
+        a_round(contender('saturation', 0.1), before=before) for before in (0.5 * WHOLE, WHOLE)
+    )
+    beside.best = {'creep': SimpleNamespace(error=0.7 * beside.before.errors.sum())}
+    this.best = {
+        name: SimpleNamespace(error=(1.0 - share) * this.before.errors.sum())
+        for name, share in shares.items()
+    }
+    for one in (beside, this):
+        one.visible = dict.fromkeys((*shares, 'saturation'), 0.5)
+    group = Class(('saturation', 'sensor_nonlinearity'), 'record that')
+    found = Findings('class', 1.0, ('saturation',), group, 0.1, of_refit=0.5 * WHOLE)
+    said = {c.name: c for c in candidates_of(rows, [beside, this], found, 0.0, {})}
+    # half of what there was goes with a refit
+    assert said['sensor_nonlinearity'].share == 1.0
+    assert 'does nearly what a refit' in said['sensor_nonlinearity'].why_not
+    assert said['backlash'].share == pytest.approx(0.6)
+    # nothing was tried behind the effect
+    assert said['preload_loss'].share == pytest.approx(0.12)
+    assert {said[x].why_not for x in ('backlash', 'preload_loss')} == {'saturation explains more'}
+    # what goes with time was tried beside the refit
+    assert said['creep'].share == pytest.approx(0.3)
+    assert 'of what a refit of the hysteresis leaves, too little' in said['creep'].why_not
 
 
 @pytest.mark.parametrize(
