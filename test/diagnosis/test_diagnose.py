@@ -10,6 +10,7 @@ The stages come from benchmarks/truths: their laws are not those of the candidat
 from dataclasses import replace
 from functools import cache
 import importlib
+from itertools import starmap
 import os
 from types import SimpleNamespace
 
@@ -50,9 +51,9 @@ RATE = 20_000.0
 IDENTIFICATION = identification_program(noise=2, slope=12)
 
 
-def record_of(v, y, labels, name) -> Record:
-    segments = tuple(Segment(*label) for label in labels)
-    return Record((Piece(v, y, RATE, segments=segments),), name)
+def record_of(v, y, segments, name, channels=None) -> Record:
+    piece = Piece(v, y, RATE, segments=tuple(segments), channels=channels or {})
+    return Record((piece,), name)
 
 
 @cache
@@ -67,16 +68,15 @@ def measured(effect, size, seed):
     stage = truths.make_stage(effect, size, seed)
     sequence = parse_program(IDENTIFICATION).build()
     t = np.arange(sequence.n) / RATE
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
     y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
-    model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
+    record = record_of(sequence.v, y, sequence.segments, 'identification')
+    model = identify(record, Settings(order=(10, 10)))
     records = []
     for kind in ('diagnosis', 'unseen'):
         t, v, labels = truths.program(kind, seed)
         channels = other(t, len(kind))
-        record = record_of(v, stage.respond(t, v, channels=channels), labels, kind)
-        (piece,) = record.pieces
-        records.append(Record((replace(piece, channels=channels or {}),), kind))
+        y, segments = stage.respond(t, v, channels=channels), starmap(Segment, labels)
+        records.append(record_of(v, y, segments, kind, channels))
     return model.model, *records
 
 
@@ -193,8 +193,7 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone():
     sequence = parse_program(NARROW).build(RATE)
     stage = truths.make_stage('creep', 0.3, 1)
     t = np.arange(sequence.n) / RATE
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    narrow = record_of(sequence.v, stage.respond(t, sequence.v), labels, 'narrow')
+    narrow = record_of(sequence.v, stage.respond(t, sequence.v), sequence.segments, 'narrow')
     few = DiagnosisSettings(effects=('creep', 'saturation'))
     result = diagnose(model, narrow, few)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
