@@ -692,10 +692,7 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them():
     ('errors', 'missed'),
     [
         ({'unit': '%', 'fitted': 0.1, 'selection': 0.2, 'fast_motion': 0.05}, 0.05),
-        (
-            {'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'fast_motion': 0.05},
-            0.05,
-        ),
+        ({'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'fast_motion': 0.05}, 0.05),
         # of records without labels
         ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2, 'fast_motion': 0.05}, 0.05),
         # an older file
