@@ -49,10 +49,7 @@ void drive_NAME(const double *x, double *out, long n)
 }
 """
 #: shipped stages by the names of their headers
-STAGES = {
-    'paper': "the paper's stage",
-    'effects': 'the same with creep and rate dependence',
-}
+STAGES = {'paper': "the paper's stage", 'effects': 'the same with creep and rate dependence'}
 VECTOR = np.ctypeslib.ndpointer(np.float64, flags='C')
 
 
