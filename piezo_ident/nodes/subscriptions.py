@@ -118,9 +118,7 @@ class BlockSubscriptions:
     """
 
     def __init__(
-        self,
-        node: Node,
-        take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None],
+        self, node: Node, take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None]
     ) -> None:
         self._node, self._take = node, take
         self._group = _NotSpun()
