@@ -49,6 +49,7 @@ import truths
 diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 RATE = 20_000.0
 IDENTIFICATION = identification_program(noise=2, slope=12)
+ONLY_CREEP = DiagnosisSettings(effects=('creep',))
 
 
 def record_of(v, y, segments, name, channels=None) -> Record:
@@ -222,8 +223,7 @@ def test_single_wild_readings_are_no_noise():
     y = piece.y.copy()
     y[at] += 0.5 * record.stroke
     wild = Record((replace(piece, y=y),), record.name)
-    few = DiagnosisSettings(effects=('creep',))
-    one, other = (diagnose(slow_model(), r, few) for r in (record, wild))
+    one, other = (diagnose(slow_model(), r, ONLY_CREEP) for r in (record, wild))
     assert [fault.count for fault in other.faults if fault.name == 'outliers'] == [30]
     assert other.noise_floor == pytest.approx(one.noise_floor, rel=0.05)
     assert other.before.overall == pytest.approx(one.before.overall, rel=0.02)
@@ -238,9 +238,8 @@ def test_a_sensor_that_hangs_is_no_noise(start, stop):
     for bad in (np.nan, piece.y[start]):
         y = piece.y.copy()
         y[start:stop] = bad
-        few = DiagnosisSettings(effects=('creep',))
         broken = Record.from_arrays(piece.v, y, sample_rate=piece.sample_rate)
-        floors.append(diagnose(slow_model(), broken, few).noise_floor)
+        floors.append(diagnose(slow_model(), broken, ONLY_CREEP).noise_floor)
     # where it hung for some periods, the residual repeats exactly; where it begins to, not at all
     assert floors[1] == pytest.approx(floors[0], rel=0.02)
 
@@ -421,8 +420,7 @@ def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
     moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
-    few = DiagnosisSettings(effects=('creep',))
-    result, still = diagnose(model, moved, few), diagnose(model, record, few)
+    result, still = diagnose(model, moved, ONLY_CREEP), diagnose(model, record, ONLY_CREEP)
     assert result.before.overall == pytest.approx(still.before.overall)
     assert result.after.overall == pytest.approx(still.after.overall)
     assert any('zero of the displacement' in warning for warning in result.warnings)
@@ -450,7 +448,7 @@ def test_slow_motion_does_not_retune_g():
     assert not Simulator(slow_model(), make_rows(slow_model(), [slow])).is_fast
     fast = example_record()
     assert Simulator(slow_model(), make_rows(slow_model(), [fast])).is_fast
-    result = diagnose(slow_model(), slow, DiagnosisSettings(effects=('creep',)))
+    result = diagnose(slow_model(), slow, ONLY_CREEP)
     assert [effect.name for effect in result.effects] == ['creep'], result.sentence
     assert result.after.overall < 0.01 < 0.5 < result.before.overall
     assert result.model.dynamics == slow_model().dynamics
@@ -512,7 +510,7 @@ def test_a_candidate_that_is_left_out_is_not_named():
 
 def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried():
     model, record, _ = measured('creep', 0.3, 1)
-    result = diagnose(model, record, DiagnosisSettings(effects=('creep',)))
+    result = diagnose(model, record, ONLY_CREEP)
     assert [e.name for e in result.effects] == ['creep']
     assert result.verdict == 'class' and result.group.names[0] == 'creep'
     assert 'thermal_drift' in result.group.names
@@ -557,7 +555,7 @@ def test_a_singular_fit_is_an_error_of_ours(scale):
     (piece,) = example_record()
     huge = Record((replace(piece, y=scale * piece.y),), 'huge')
     with pytest.raises(IdentificationError, match='singular'):
-        diagnose(slow_model(), huge, DiagnosisSettings(effects=('creep',)))
+        diagnose(slow_model(), huge, ONLY_CREEP)
 
 
 def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatch):
@@ -581,7 +579,7 @@ def test_displacement_that_does_not_follow_the_voltage_is_no_stage():
     noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
     unplugged = Record((replace(piece, y=noise),), 'unplugged')
     with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
-        diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
+        diagnose(model, unplugged, ONLY_CREEP)
 
 
 def test_displacement_that_runs_against_the_model_is_refused():
@@ -611,7 +609,7 @@ def test_voltages_that_the_model_does_not_know_are_said(scale, said):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
-    found = diagnose(model, scaled, DiagnosisSettings(effects=('creep',)))
+    found = diagnose(model, scaled, ONLY_CREEP)
     heard = [w for w in found.warnings if w.startswith('scaled: ')]
     assert len(heard) == len(said)
     assert all(part in line for part, line in zip(said, heard, strict=True))
