@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The exported C header beside Python: ns a sample of prediction and feed-forward.
 

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 Identification of 17 s at 20 kHz, as a whole and step by step.
 

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A model beside a running stage, and what is made of its residual."""
 
 import numpy as np

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What a block is to the stream that is followed, and whose it is."""
 
 import math
