@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The exported C header beside Python: ns a sample of prediction and feed-forward.
 
@@ -49,10 +48,7 @@ void drive_NAME(const double *x, double *out, long n)
 }
 """
 #: shipped stages by the names of their headers
-STAGES = {
-    'paper': "the paper's stage",
-    'effects': 'the same with creep and rate dependence',
-}
+STAGES = {'paper': "the paper's stage", 'effects': 'the same with creep and rate dependence'}
 VECTOR = np.ctypeslib.ndpointer(np.float64, flags='C')
 
 

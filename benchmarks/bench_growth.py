@@ -25,16 +25,7 @@ import shutil
 import sys
 import tempfile
 
-from growth_measures import (
-    base_model,
-    EFFECT,
-    labelled,
-    MEASURES,
-    paper,
-    RATE,
-    sine,
-    to_diagnose,
-)
+from growth_measures import base_model, EFFECT, labelled, MEASURES, paper, RATE, sine, to_diagnose
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import catalogue
@@ -53,19 +44,11 @@ BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
 HOUR = 3600.0
 #: title, lengths [s], and those of a quick run, of each measure
 PLANS: dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]] = {
-    'stream': (
-        'Prediction second by second: constant memory',
-        (10, 60, 600, HOUR),
-        (10, 60),
-    ),
+    'stream': ('Prediction second by second: constant memory', (10, 60, 600, HOUR), (10, 60)),
     'predict': ('Prediction of a record in memory', (10, 30, 60, 120, 300, 600), (10, 60)),
     'write': ('Writing a bag', (10, 60, 600, HOUR), (10, 60)),
     'read': ('Reading a bag into a record', (10, 60, 600, HOUR), (10, 60)),
-    'convert': (
-        'Converting a bag to npz, its samples in memory maps',
-        (10, 60, 600, HOUR),
-        (10,),
-    ),
+    'convert': ('Converting a bag to npz, its samples in memory maps', (10, 60, 600, HOUR), (10,)),
     'predict_bag': (
         'Predicting a bag to npz, its samples in memory maps',
         (10, 60, 600, HOUR),

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 Identification of 17 s at 20 kHz, as a whole and step by step.
 
@@ -29,10 +28,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.results import Settings, silent
 from piezo_ident.identification.spectra import excited_band, prefilter
-from piezo_ident.identification.step2_dynamics import (
-    arx_factor,
-    scan_orders,
-)
+from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders
 from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.identification.three_steps import first_step, second_step, triangle_excerpts
 from piezo_ident.model.simulated_stage import SimulatedStage

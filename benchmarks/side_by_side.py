@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 Works timed side by side in one run, and what is written about them.
 
@@ -12,6 +11,7 @@ of it alike.  Figures are medians over the turns; only their ratios travel to ot
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 import os
@@ -131,18 +131,13 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return '\n'.join(lines)
 
 
-def version_of(name: str) -> str | None:
-    """Return the version of an installed distribution, None when it is not there."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
 def versions(*names: str) -> str:
     """Return the names with the versions of those that are installed."""
-    found = [(name, version_of(name)) for name in names]
-    return ', '.join(f'{name} {number}' for name, number in found if number)
+    found = []
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found.append(f'{name} {version(name)}')
+    return ', '.join(found)
 
 
 def machine() -> str:

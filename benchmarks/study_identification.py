@@ -46,12 +46,6 @@ def record_of(stage: SimulatedStage, program: str, seed: int = 0) -> Record:
     return stage.play(sequence, np.random.default_rng(seed))
 
 
-def with_noise(stage: SimulatedStage, share: float) -> SimulatedStage:
-    """Return the stage with sensor noise of a share of its stroke."""
-    sensor = replace(stage.sensor, noise_rms=share * abs(stage.model.scaling.Y))
-    return replace(stage, sensor=sensor)
-
-
 def minor_loop_error(model: StageModel, truth: Record) -> float:
     """Return the error over all minor loops and decaying triangles."""
     y = np.concatenate([p.y for p in truth])
@@ -67,7 +61,9 @@ def seeds_table(stage: SimulatedStage) -> list[str]:
         '|---|---|---|---|---|---|---|---|',
     ]
     for noise in NOISES:
-        noisy = with_noise(stage, noise)
+        # a share of the stroke
+        rms = noise * abs(stage.model.scaling.Y)
+        noisy = replace(stage, sensor=replace(stage.sensor, noise_rms=rms))
         found: list[tuple[Identification, float]] = []
         for seed in tqdm(range(SEEDS), desc=f'noise {noise:g}', disable=not sys.stderr.isatty()):
             record = record_of(noisy, 'identification', seed)

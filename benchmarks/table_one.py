@@ -15,6 +15,8 @@ doi:10.1109/TMECH.2015.2465868
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
+from itertools import starmap
 import os
 from pathlib import Path
 import sys
@@ -32,11 +34,9 @@ from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from truths import table_one_sines
-from truths.table_one import table_one_stage
+from truths.table_one import PUBLISHED, table_one_stage
 
 RATE = 20_000.0
-#: % of stroke, Table I: f [Hz], model with dynamics
-PAPER = {1: 1.03, 10: 1.75, 50: 2.73, 80: 3.15, 100: 3.23, 120: 3.59}
 DIAGNOSIS = """
 limits: [0, 10]
 sample_rate: 20000
@@ -74,12 +74,10 @@ segments:
 """
 
 
-def record_of(v: Array, labels: list[tuple[str, int, int]], name: str, seed: int) -> Record:
+def record_of(v: Array, segments: Iterable[Segment], name: str, seed: int) -> Record:
     """Return what the stage answers, as a record."""
-    t = np.arange(v.size) / RATE
-    y = table_one_stage(seed).respond(t, v)
-    segments = tuple(Segment(*label) for label in labels)
-    return Record((Piece(v, y, RATE, segments=segments),), name)
+    y = table_one_stage(seed).respond(np.arange(v.size) / RATE, v)
+    return Record((Piece(v, y, RATE, segments=tuple(segments)),), name)
 
 
 def by_segment(model: StageModel, record: Record) -> dict[str, float]:
@@ -102,20 +100,18 @@ def main() -> None:
     parser.add_argument('out', type=Path)
     out = parser.parse_args().out
     sequence = Program.load('program_identification').build(sample_rate=RATE)
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    record = record_of(sequence.v, labels, 'identification', 1)
+    record = record_of(sequence.v, sequence.segments, 'identification', 1)
     model = identify(record, Settings(thresholds=10)).model
     drive = parse_program(DIAGNOSIS).build(sample_rate=RATE)
-    labels = [(s.label, s.start, s.stop) for s in drive.segments]
-    result = diagnose(model, record_of(drive.v, labels, 'diagnosis', 2))
+    result = diagnose(model, record_of(drive.v, drive.segments, 'diagnosis', 2))
     _, v, labels = table_one_sines()
-    sines = record_of(v, labels, 'sines', 3)
+    sines = record_of(v, starmap(Segment, labels), 'sines', 3)
     before, after = (
         {round(row.frequency): row.percent for row in sine_errors(m, sines)}
         for m in (model, result.model)
     )
     other = parse_program(OTHER).build(sample_rate=RATE)
-    held = record_of(other.v, [(s.label, s.start, s.stop) for s in other.segments], 'other', 4)
+    held = record_of(other.v, other.segments, 'other', 4)
     others = [by_segment(m, held) for m in (model, result.model)]
     text = [
         '# Table I, with a third row',
@@ -125,11 +121,11 @@ def main() -> None:
         'the model of the paper lacks; no record declares them, and their laws are not those of '
         'the candidates (benchmarks/truths/table_one.py).',
         '',
-        f'| | {" | ".join(f"{f} Hz" for f in PAPER)} |',
-        f'|---|{"---|" * len(PAPER)}',
-        f'| Table I, measured stage | {" | ".join(f"{x:.2f}" for x in PAPER.values())} |',
-        f'| this stage, three steps | {" | ".join(f"{before[f]:.2f}" for f in PAPER)} |',
-        f'| after the diagnosis | {" | ".join(f"{after[f]:.2f}" for f in PAPER)} |',
+        f'| | {" | ".join(f"{f} Hz" for f in PUBLISHED)} |',
+        f'|---|{"---|" * len(PUBLISHED)}',
+        f'| Table I, measured stage | {" | ".join(f"{x:.2f}" for x in PUBLISHED.values())} |',
+        f'| this stage, three steps | {" | ".join(f"{before[f]:.2f}" for f in PUBLISHED)} |',
+        f'| after the diagnosis | {" | ".join(f"{after[f]:.2f}" for f in PUBLISHED)} |',
         '',
         f'> {result.sentence}',
         '',

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A DAQ card in the place of the node `stage`, with all that a driver of an amplifier must do."""
 
 import time

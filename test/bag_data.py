@@ -11,6 +11,7 @@ from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.bags.write import BagWriter
 from piezo_ident.record.blocks import encode, Samples
 from rosbags.rosbag2 import StoragePlugin, Writer
+import yaml
 
 
 def blocks(n: int = 1000, size: int = 100, seed: int = 0) -> list[tuple[Samples, Samples]]:
@@ -28,7 +29,6 @@ def blocks(n: int = 1000, size: int = 100, seed: int = 0) -> list[tuple[Samples,
 def write(path: Path, messages: Iterable[tuple[str, Samples]], edit=None) -> Path:
     """Write messages in the order given, one a millisecond, as a recorder would."""
     store = typestore()
-    types = store.types
     connections = {}
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for i, (topic, samples) in enumerate(messages):
@@ -37,19 +37,24 @@ def write(path: Path, messages: Iterable[tuple[str, Samples]], edit=None) -> Pat
             data, dims = encode(samples)
             if edit is not None:
                 data, dims = edit(i, data, dims)
-            dimension = types['std_msgs/msg/MultiArrayDimension']
-            layout = types['std_msgs/msg/MultiArrayLayout']([dimension(*d) for d in dims], 0)
-            raw = store.serialize_cdr(types[MESSAGE_TYPE](layout, data), MESSAGE_TYPE)
-            writer.write(connections[topic], 10**9 + i * 10**6, raw)
+            writer.write(connections[topic], 10**9 + i * 10**6, serialized(data, dims))
     return path
 
 
+def metadata(path: Path) -> dict:
+    """Return what the metadata.yaml of a bag says."""
+    return yaml.safe_load((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+
+
+def serialized(data, dims) -> bytes:
+    types = typestore().types
+    dimension = types['std_msgs/msg/MultiArrayDimension']
+    layout = types['std_msgs/msg/MultiArrayLayout']([dimension(*d) for d in dims], 0)
+    return bytes(typestore().serialize_cdr(types[MESSAGE_TYPE](layout, data), MESSAGE_TYPE))
+
+
 def raw(samples: Samples) -> bytes:
-    data, dims = encode(samples)
-    dimension = typestore().types['std_msgs/msg/MultiArrayDimension']
-    layout = typestore().types['std_msgs/msg/MultiArrayLayout']([dimension(*d) for d in dims], 0)
-    message = typestore().types[MESSAGE_TYPE](layout, data)
-    return bytes(typestore().serialize_cdr(message, MESSAGE_TYPE))
+    return serialized(*encode(samples))
 
 
 def raw_blocks(n: int = 10**9) -> Iterator[tuple[bytes, bytes]]:

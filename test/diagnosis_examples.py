@@ -23,7 +23,7 @@ from piezo_ident.diagnosis.results import (
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import EffectSetting, StageModel
-from piezo_ident.record.record import Fault, Piece, Record, Segment
+from piezo_ident.record.record import Fault, Piece, Record
 from programs import SLOW, slow_model
 
 #: what a name in somebody's file may hold
@@ -57,10 +57,9 @@ def with_effects(**effects: dict[str, object]) -> StageModel:
 def played(model: StageModel, name: str, earlier: ArrayLike = ()) -> Record:
     """Return what is measured of a stage that played the program, behind an earlier voltage."""
     sequence = parse_program(PROGRAM, 'program').build(SLOW)
-    segments = tuple(Segment(s.label, s.start, s.stop) for s in sequence.segments)
     y = model.simulate(np.concatenate([earlier, sequence.v]))[-sequence.n :]
     noise = NOISE * np.random.default_rng(3).standard_normal(y.size)
-    return Record((Piece(sequence.v, y + noise, SLOW, segments=segments),), name)
+    return Record((Piece(sequence.v, y + noise, SLOW, segments=sequence.segments),), name)
 
 
 @cache

@@ -8,15 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-from foreign import (
-    case,
-    cores,
-    families,
-    make_stage,
-    record_motion,
-    references,
-    sealed_cores,
-)
+from foreign import case, cores, families, make_stage, record_motion, references, sealed_cores
 from foreign.sizes import size_of
 from foreign.stage import Linear, make_core
 import numpy as np
@@ -308,11 +300,7 @@ def test_blocks_of_cases_hold_every_kind():
         ({'verdict': 'named', 'effects': ('backlash',)}, {'backlash': 0.1}, 'small'),
         ({'verdict': 'named', 'effects': ('backlash',)}, {}, 'false'),
         ({'verdict': 'none'}, {}, 'none'),
-        (
-            {'verdict': 'named', 'effects': ('creep',)},
-            {'creep': 1.0, 'backlash': 1.0},
-            'part',
-        ),
+        ({'verdict': 'named', 'effects': ('creep',)}, {'creep': 1.0, 'backlash': 1.0}, 'part'),
     ],
 )
 def test_outcome_of_a_row(said, truth, expected):

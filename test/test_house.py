@@ -188,10 +188,7 @@ def test_everything_but_the_nodes_imports_without_ros():
     names = [module_name(path) for path in python_files('piezo_ident')]
     names = [name for name in names if not is_node(name) and not name.endswith('.__main__')]
     done = subprocess.run(
-        [sys.executable, '-c', BLOCKED_IMPORTS, *names],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
+        [sys.executable, '-c', BLOCKED_IMPORTS, *names], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == []

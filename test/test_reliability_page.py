@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The page of all that was tried is made of the rows, and every row can be run again."""
 
 import json

@@ -104,11 +104,7 @@ def frequency_response(
 
 
 def neighbours(
-    u: NDArray[np.complex128],
-    lines: NDArray[np.intp],
-    at: int,
-    half_width: int,
-    degree: int,
+    u: NDArray[np.complex128], lines: NDArray[np.intp], at: int, half_width: int, degree: int
 ) -> tuple[NDArray[np.complex128], slice]:
     """
     Return the columns of a local polynomial, inputs first, and the lines that it is fitted to.

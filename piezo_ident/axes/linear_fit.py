@@ -91,10 +91,7 @@ def linear_error(model: Modal, record: PeriodicRecord) -> float:
 
 
 def choose_order(
-    records: Sequence[PeriodicRecord],
-    held_out: Sequence[PeriodicRecord],
-    *,
-    orders: Sequence[int],
+    records: Sequence[PeriodicRecord], held_out: Sequence[PeriodicRecord], *, orders: Sequence[int]
 ) -> tuple[Modal, dict[int, float]]:
     """
     Fit models of rising order, and choose by the error on records held out.

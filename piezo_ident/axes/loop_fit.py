@@ -56,11 +56,7 @@ class Parameters:
 
     @classmethod
     def of(
-        cls,
-        model: LoopModel,
-        *,
-        hold: Collection[str] = (),
-        still: Collection[int] = (),
+        cls, model: LoopModel, *, hold: Collection[str] = (), still: Collection[int] = ()
     ) -> Parameters:
         """
         Choose the parameters of a model.
@@ -128,11 +124,7 @@ class Parameters:
 
 
 def output_sensitivities(
-    model: LoopModel,
-    parameters: Parameters,
-    u: NDArray[np.float64],
-    run: Passage,
-    skip: int = 0,
+    model: LoopModel, parameters: Parameters, u: NDArray[np.float64], run: Passage, skip: int = 0
 ) -> NDArray[np.float32]:
     """
     Return dy/dtheta of `parameters`, shape (samples - skip, outputs, parameters).

@@ -111,10 +111,7 @@ def resolved(blocks: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
 
 
 def to_modal(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    c: NDArray[np.float64],
-    d: NDArray[np.float64],
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
 ) -> Modal:
     """
     Bring a model into modal coordinates; poles beyond `RADIUS` are mirrored to within.

@@ -28,12 +28,7 @@ from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-from piezo_ident.report import (
-    changes,
-    diagnosis_text,
-    to_json,
-    validated,
-)
+from piezo_ident.report import changes, diagnosis_text, to_json, validated
 
 
 def diagnose_command(args: SimpleNamespace, console: Console) -> None:

@@ -207,10 +207,7 @@ FEEDFORWARD = [
     *KEPT,
     _option('--preview', _whole, 'N', 'Samples that the motion is known ahead, at most.'),
 ]
-DRIVE = [
-    *KEPT,
-    _flag('--clip', 'Come as near as the limits allow, instead of refusing.'),
-]
+DRIVE = [*KEPT, _flag('--clip', 'Come as near as the limits allow, instead of refusing.')]
 
 
 def _shipped(kind: str, default: str) -> dict[str, Any]:

@@ -22,14 +22,7 @@ from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
 
 #: faults that are shown when a record has been read
-SHOWN = (
-    'columns',
-    'slow_sampling',
-    'fast_sampling',
-    'large_stroke',
-    'large_gain',
-    'high_voltage',
-)
+SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'large_gain', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
 #: what may be a record, but is often something else

@@ -104,10 +104,7 @@ class Saturation(Effect):
         ends = {name: self.number(name) for name in ('low', 'high')}
         knee = self.number('knee')
         if knee == 0.0:
-            sharp = {
-                'low': 'x = x < low ? low : x;\n',
-                'high': 'x = x > high ? high : x;\n',
-            }
+            sharp = {'low': 'x = x < low ? low : x;\n', 'high': 'x = x > high ? high : x;\n'}
             step = ''.join(sharp[name] for name, end in ends.items() if np.isfinite(end))
             return CCode({**ends}, rest=step, step=step)
         step = 'double y = x, z;\n'

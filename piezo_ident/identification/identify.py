@@ -146,10 +146,7 @@ def _identify(
         delay=fit.delay,
         dynamics=fit.dynamics,
         hysteresis=fit.hysteresis,
-        errors=(
-            *errors_of(predictions, fit.masks),
-            *validation_errors(model, validation),
-        ),
+        errors=(*errors_of(predictions, fit.masks), *validation_errors(model, validation)),
         noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
         noise_source=floor.source,
         stroke=stroke,

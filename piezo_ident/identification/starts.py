@@ -27,11 +27,7 @@ from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
 )
-from piezo_ident.identification.step3_hysteresis import (
-    even_thresholds,
-    factorise,
-    fit_hysteresis,
-)
+from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 

@@ -222,10 +222,7 @@ def scan_orders(
         tick(na / shape[0])
     log_loss = factor.n * np.log(np.maximum(loss, np.finfo(float).tiny))
     return OrderTable(
-        loss=loss,
-        aic=log_loss + 2.0 * size,
-        bic=log_loss + np.log(factor.n) * size,
-        held_out=held,
+        loss=loss, aic=log_loss + 2.0 * size, bic=log_loss + np.log(factor.n) * size, held_out=held
     )
 
 

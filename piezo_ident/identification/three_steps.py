@@ -30,10 +30,7 @@ from piezo_ident.identification.noise_segment import (
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.slow_part import fast_part
-from piezo_ident.identification.solvers.output_error import (
-    output_error,
-    simulation_error,
-)
+from piezo_ident.identification.solvers.output_error import output_error, simulation_error
 from piezo_ident.identification.spectra import frequency_response
 from piezo_ident.identification.step1_delay import (
     delay_from_loss,

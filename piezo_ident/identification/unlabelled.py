@@ -83,10 +83,7 @@ class JointFit:
 
 
 def joint_fit(
-    runs: Sequence[Run],
-    fitted: Sequence[Mask],
-    settings: Settings,
-    progress: Progress,
+    runs: Sequence[Run], fitted: Sequence[Mask], settings: Settings, progress: Progress
 ) -> JointFit:
     """
     Fit delay, dynamics and the memory of each start on parts of runs.

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The safety contract of the node that drives the amplifier, judged on the voltage applied.
 

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The sample-clock tracker: follows one stream of blocks by its time stamps and its publisher.
 

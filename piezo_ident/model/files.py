@@ -260,11 +260,7 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
 def model_to_yaml(model: StageModel) -> str:
     """Return the text of a model file."""
     text: str = yaml.dump(
-        model_to_dict(model),
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=99,
+        model_to_dict(model), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99
     )
     return text
 

@@ -43,10 +43,7 @@ class Learner:
     """
 
     def __init__(
-        self,
-        make: Callable[[], LiveLearning],
-        most: int,
-        play: Callable[[Samples, Samples], None],
+        self, make: Callable[[], LiveLearning], most: int, play: Callable[[Samples, Samples], None]
     ) -> None:
         self.learning: LiveLearning | None = None
         self.text, self.is_over = 'inverts the reference', False

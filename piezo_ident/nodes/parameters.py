@@ -257,12 +257,7 @@ FEEDFORWARD = (
         'rest', 0.0, 'voltage before a reference, and to which a stop ramps', 'V', -1000.0, 1000.0
     ),
     Declaration(
-        'ramp_slew',
-        20.0,
-        'top speed of the ramps to rest and into a reference',
-        'V/s',
-        0.001,
-        1e6,
+        'ramp_slew', 20.0, 'top speed of the ramps to rest and into a reference', 'V/s', 0.001, 1e6
     ),
     Declaration(
         'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0

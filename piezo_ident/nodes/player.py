@@ -24,11 +24,11 @@ from typing import Any
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
-from piezo_ident.nodes.subscriptions import DEPTH, message_class, topics_problem
+from piezo_ident.nodes.subscriptions import DEPTH, message_class, qos_of, topics_problem
 from piezo_ident.nodes.wire import LATCHED
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
 from piezo_ident.record.bags.recover import Bag
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
 #: how long the end of the node waits for the replay to end [s]
@@ -342,9 +342,4 @@ def _profile(connection: Connection) -> QoSProfile:
     known = [o.depth for o in offered if o.history == QosHistory.KEEP_LAST and o.depth > 0]
     # a replay may be faster than the recording was, so it keeps as many as its readers do
     least = LATCHED.depth if latched else DEPTH
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=max([least, *known]),
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    return qos_of(reliable=reliable, latched=latched, depth=max([least, *known]))

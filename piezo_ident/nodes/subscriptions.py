@@ -96,10 +96,11 @@ def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | Non
     return None
 
 
-def _profile(*, reliable: bool = True, latched: bool = False) -> QoSProfile:
+def qos_of(*, reliable: bool = True, latched: bool = False, depth: int = DEPTH) -> QoSProfile:
+    """Return a QoS that keeps the last messages."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
+        depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
@@ -117,9 +118,7 @@ class BlockSubscriptions:
     """
 
     def __init__(
-        self,
-        node: Node,
-        take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None],
+        self, node: Node, take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None]
     ) -> None:
         self._node, self._take = node, take
         self._group = _NotSpun()
@@ -128,7 +127,7 @@ class BlockSubscriptions:
     def add(self, topic: str, key: str) -> None:
         """Subscribe to one more topic."""
         subscription = self._node.create_subscription(
-            Float64MultiArray, topic, _ignore, _profile(), callback_group=self._group
+            Float64MultiArray, topic, _ignore, qos_of(), callback_group=self._group
         )
         self._subscriptions[topic] = (key, subscription)
 
@@ -161,7 +160,7 @@ class _Request:
     latched: bool
 
     def profile(self) -> QoSProfile:
-        return _profile(reliable=self.reliable, latched=self.latched)
+        return qos_of(reliable=self.reliable, latched=self.latched)
 
 
 @dataclass(eq=False)

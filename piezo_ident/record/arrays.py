@@ -114,10 +114,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
     tdms = _library('nptdms', path, 'npTDMS')
     arrays: dict[str, Any] = {}
     periods: dict[str, float] = {}
-    with (
-        _damage(path, 'TDMS file', 'write it again'),
-        tdms.TdmsFile.open(path) as file,
-    ):
+    with _damage(path, 'TDMS file', 'write it again'), tdms.TdmsFile.open(path) as file:
         channels = [channel for group in file.groups() for channel in group.channels()]
         counts = Counter(channel.name for channel in channels)
         _check_size(8 * sum(map(len, channels)))
@@ -146,10 +143,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
 def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
     """Read a file of Apache Parquet."""
     parquet = _library('pyarrow.parquet', path, 'pyarrow')
-    with (
-        _damage(path, 'Parquet file', 'write it again'),
-        parquet.ParquetFile(path) as file,
-    ):
+    with _damage(path, 'Parquet file', 'write it again'), parquet.ParquetFile(path) as file:
         _check_size(8 * file.metadata.num_rows * file.metadata.num_columns)
         table = file.read()
         arrays = {

@@ -306,9 +306,7 @@ def _fault_tables(result: Diagnosis) -> list[Table]:
 
 
 def diagnosis_page(
-    result: Diagnosis,
-    pictures: Sequence[Shown],
-    left_out: Sequence[tuple[str, str]],
+    result: Diagnosis, pictures: Sequence[Shown], left_out: Sequence[tuple[str, str]]
 ) -> Page:
     """Return the page; `left_out` holds titles of pictures that cannot be drawn, with reasons."""
     warnings = list(result.warnings)

@@ -31,10 +31,7 @@ if TYPE_CHECKING:
 
 PAGE, MODEL = 'report.html', 'model.yaml'
 #: the numbers, by which an earlier report is known
-NUMBERS: Mapping[type, str] = {
-    Identification: 'identification.json',
-    Diagnosis: 'diagnosis.json',
-}
+NUMBERS: Mapping[type, str] = {Identification: 'identification.json', Diagnosis: 'diagnosis.json'}
 #: all pictures that a report may have; those of an earlier one are replaced or deleted
 PICTURES: Mapping[type, tuple[str, ...]] = {
     Identification: (

@@ -16,12 +16,7 @@ from typing import Any
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Diagnosis, Errors, FORMULA, FoundParameter
-from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
-    Identification,
-    Steps,
-)
+from piezo_ident.identification.results import DelayResult, DynamicsResult, Identification, Steps
 from piezo_ident.model import metrics
 from piezo_ident.model.files import finite, plain
 from piezo_ident.model.free_run import PieceRun
@@ -242,11 +237,7 @@ def _errors(errors: Errors) -> dict[str, Any]:
 
 
 def _parameter(parameter: FoundParameter) -> dict[str, Any]:
-    return {
-        'value': _value(plain(parameter.value)),
-        'unit': parameter.unit,
-        'std': parameter.std,
-    }
+    return {'value': _value(plain(parameter.value)), 'unit': parameter.unit, 'std': parameter.std}
 
 
 def _value(value: Any) -> Any:

@@ -219,14 +219,10 @@ def _at_all(part: ResidualPart, means: Array) -> Array:
 def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) -> bool:
     """Return whether the drive, or drift, explains a channel."""
     left = sum(float(np.sum(p.beyond(p.own)[p.use] ** 2)) for p in found)
-    whole = sum(float(np.sum(_centred(p.own[p.use]) ** 2)) for p in found)
+    whole = sum(float(np.sum((x - x.mean()) ** 2)) for x in (p.own[p.use] for p in found))
     signals = [(part, np.asarray(part.piece.channels[name], np.float64)) for part in having]
     of_drive = coherence([part.with_residual(c) for part, c in signals if np.isfinite(c).all()])
     return left < OWN * whole or (of_drive is not None and of_drive.share > FOLLOWS)
-
-
-def _centred(x: Array) -> Array:
-    return np.asarray(x - x.mean())
 
 
 def _part_of(part: ResidualPart, channel: Array) -> _Part:

@@ -14,12 +14,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
 from piezo_ident.record.record import Piece, Segment
 from scipy import fft
-from scipy.ndimage import (
-    binary_dilation,
-    maximum_filter1d,
-    minimum_filter1d,
-    uniform_filter1d,
-)
+from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 #: bad samples in a row that say nothing of their neighbours
 SPIKE = 3

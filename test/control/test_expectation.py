@@ -7,12 +7,11 @@ from dataclasses import replace
 import re
 
 import numpy as np
-from paper_stage import FS, PAPER
+from paper_stage import FS, PAPER, with_mode
 import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.expectation import HOLD, RISE
 from piezo_ident.model.stage_model import EffectSetting
-from piezo_ident.operators.dynamics import Dynamics
 import pytest
 
 CREEP = EffectSetting('creep', {'gain': [0.01, 0.01, 0.01], 'time_constant': [0.1, 1.0, 10.0]})
@@ -70,15 +69,10 @@ def test_a_model_without_creep_does_not_tell_where_a_stage_is():
 
 
 def test_corners_above_a_mode_are_in_what_is_expected():
-    def ringing(frequency):
-        poles = np.exp(2 * np.pi * frequency / FS * np.array([-0.01 + 1j, -0.01 - 1j]))
-        G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
-        return replace(PAPER, dynamics=G, identification=KNOWN)
-
     t = np.arange(4000) / FS
     wanted = 10e-6 + 40e-6 * (1.0 - np.abs(2.0 * ((100.0 * t) % 1.0) - 1.0))
-    drive = pi.invert(ringing(700.0), wanted)
-    e = played(ringing(730.0), drive) - wanted
+    drive = pi.invert(replace(with_mode(700.0), identification=KNOWN), wanted)
+    e = played(with_mode(730.0), drive) - wanted
     assert 5.0 * 0.0005 * 75e-6 < e.std() < 1.5 * drive.expected_rms
     (told,) = drive.warnings
     assert re.match(r'\S+ % of the motion lie above 700 Hz', told)
@@ -109,8 +103,6 @@ def test_a_motion_beyond_a_limit_is_told_by_how_much_to_move_it():
 
 
 def test_a_jump_that_no_voltage_makes_is_called_that():
-    poles = np.exp(2 * np.pi * 600.0 / FS * np.array([-0.01 + 1j, -0.01 - 1j]))
-    G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
     wanted = np.where(np.arange(4000) < 2000, 20e-6, 60e-6)
     with pytest.raises(DataError, match=r'out of reach .* the motion jumps .*round'):
-        pi.invert(replace(PAPER, dynamics=G), wanted)
+        pi.invert(with_mode(600.0), wanted)

@@ -7,13 +7,15 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from paper_stage import FS, PAPER
+from paper_stage import FS, PAPER, with_mode
 import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.stage_model import EffectSetting
-from piezo_ident.operators.dynamics import Dynamics
 import pytest
 
+BENT = (EffectSetting('sensor_nonlinearity', {'square': 0.02}),)
+#: a stage whose model lacks a bent sensor
+STAGE = replace(PAPER, effects=BENT)
 T = np.arange(6000) / FS
 RASTER = 35e-6 + 15e-6 * np.sin(2 * np.pi * 20 * T) ** 3 * np.minimum(1.0, T / 0.05)
 
@@ -44,10 +46,9 @@ def test_the_error_of_effects_that_the_model_lacks_falls_and_the_best_is_kept():
 
 @pytest.mark.parametrize('wild', [0.0, 3 * 75e-6, 1.0])
 def test_wild_readings_are_not_learned(wild):
-    stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning, rng = pi.Learning(PAPER, RASTER), np.random.default_rng(0)
     for _ in range(3):
-        true = stage.simulate(learning.drive.v)
+        true = STAGE.simulate(learning.drive.v)
         y = true.copy()
         y[rng.integers(100, y.size - 100, 3)] = wild
         e = RASTER - true[learning.drive.lead :]
@@ -59,8 +60,7 @@ def test_wild_readings_are_not_learned(wild):
 def test_it_ends_at_the_noise():
     rng = np.random.default_rng(5)
     learning = pi.Learning(PAPER, RASTER)
-    effects = (EffectSetting('sensor_nonlinearity', {'square': 0.02}),)
-    errors = repeated(replace(PAPER, effects=effects), learning, rng, 20e-9)
+    errors = repeated(STAGE, learning, rng, 20e-9)
     floor = 100.0 * 20e-9 / np.ptp(RASTER)
     assert learning.is_done and len(errors) < 8
     assert floor < learning.best.error < 1.3 * floor
@@ -121,27 +121,17 @@ def test_what_is_not_the_stage_is_refused():
 
 @pytest.mark.parametrize('off', [0.97, 1.03])
 def test_a_mode_that_is_somewhere_else_does_no_harm(off):
-    def with_mode(frequency):
-        w = 2 * np.pi * frequency / FS
-        poles = np.exp(w * np.array([-0.01 + 1j, -0.01 - 1j]))
-        G = Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised()
-        return replace(PAPER, dynamics=G)
-
-    bent = (EffectSetting('sensor_nonlinearity', {'square': 0.02}),)
     triangle = 10e-6 + 40e-6 * (1.0 - np.abs(2.0 * ((10.0 * T) % 1.0) - 1.0))
     for wanted, left in ((RASTER, 0.01), (triangle, 0.1)):
         learning = pi.Learning(with_mode(400.0), wanted)
         assert learning.corner == pytest.approx(280.0, rel=0.01)
-        errors = repeated(replace(with_mode(off * 400.0), effects=bent), learning)
+        errors = repeated(replace(with_mode(off * 400.0), effects=BENT), learning)
         assert errors[2] < left < 0.2 * errors[0]
 
 
 def test_the_corner_grows_where_it_holds_the_error_up():
-    w = 2 * np.pi * 50.0 / FS
-    poles = np.exp(w * np.array([-0.01 + 1j, -0.01 - 1j]))
-    model = replace(PAPER, dynamics=Dynamics(np.real(np.poly(poles))[1:], np.ones(1)).normalised())
-    bent = (EffectSetting('sensor_nonlinearity', {'square': 0.02}),)
-    stage = replace(model, effects=bent)
+    model = with_mode(50.0)
+    stage = replace(model, effects=BENT)
     learning, kept = pi.Learning(model, RASTER), pi.Learning(model, RASTER, corner=35.0)
     for _ in range(4):
         learning.take(stage.simulate(learning.drive.v))
@@ -151,10 +141,9 @@ def test_the_corner_grows_where_it_holds_the_error_up():
 
 
 def test_what_drifts_ends_it_and_the_best_stays():
-    stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning = pi.Learning(PAPER, RASTER)
     for k in range(12):
-        learning.take(stage.simulate(learning.drive.v) + k * 100e-9)
+        learning.take(STAGE.simulate(learning.drive.v) + k * 100e-9)
         if learning.is_done:
             break
     errors = [r.error for r in learning.repetitions]
@@ -176,28 +165,26 @@ def test_a_mean_that_creeps_on_is_no_harm_of_a_correction():
 
 
 def test_a_run_that_failed_leaves_no_trace():
-    stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning = pi.Learning(PAPER, RASTER)
     for _ in range(2):
-        learning.take(stage.simulate(learning.drive.v))
+        learning.take(STAGE.simulate(learning.drive.v))
     # somebody knocks at the table
     knock = 1e-6 * np.sin(2 * np.pi * 33 * np.arange(learning.drive.v.size) / FS)
-    learning.take(stage.simulate(learning.drive.v) + knock)
+    learning.take(STAGE.simulate(learning.drive.v) + knock)
     best = learning.best
     assert best is learning.repetitions[1]
     # what comes next is made of the best run, by half of its correction
-    error = learning.take(stage.simulate(learning.drive.v))
+    error = learning.take(STAGE.simulate(learning.drive.v))
     assert 0.4 * best.error < error < 0.6 * best.error
-    assert learning.take(stage.simulate(learning.drive.v)) < 0.7 * error
+    assert learning.take(STAGE.simulate(learning.drive.v)) < 0.7 * error
 
 
 def test_what_is_out_of_reach_is_refused_or_left_out():
     wanted = 35e-6 + 37e-6 * np.sin(2 * np.pi * 20 * T) ** 3
     with pytest.raises(DataError, match=r'out of reach within 0 \.\. 10 V'):
         pi.Learning(PAPER, wanted)
-    stage = replace(PAPER, effects=(EffectSetting('sensor_nonlinearity', {'square': 0.02}),))
     learning = pi.Learning(PAPER, wanted, clip=True)
-    errors = repeated(stage, learning)
+    errors = repeated(STAGE, learning)
     assert min(errors) < 0.2 * errors[0] and min(errors) < 0.25
     drive = learning.best.drive
     assert drive.v.min() == 0.0 and drive.v.max() == 10.0

@@ -10,6 +10,7 @@ The stages come from benchmarks/truths: their laws are not those of the candidat
 from dataclasses import replace
 from functools import cache
 import importlib
+from itertools import starmap
 import os
 from types import SimpleNamespace
 
@@ -48,11 +49,12 @@ import truths
 diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 RATE = 20_000.0
 IDENTIFICATION = identification_program(noise=2, slope=12)
+ONLY_CREEP = DiagnosisSettings(effects=('creep',))
 
 
-def record_of(v, y, labels, name) -> Record:
-    segments = tuple(Segment(*label) for label in labels)
-    return Record((Piece(v, y, RATE, segments=segments),), name)
+def record_of(v, y, segments, name, channels=None) -> Record:
+    piece = Piece(v, y, RATE, segments=tuple(segments), channels=channels or {})
+    return Record((piece,), name)
 
 
 @cache
@@ -67,16 +69,15 @@ def measured(effect, size, seed):
     stage = truths.make_stage(effect, size, seed)
     sequence = parse_program(IDENTIFICATION).build()
     t = np.arange(sequence.n) / RATE
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
     y = stage.respond(t, sequence.v, changed=False, channels=other(t, seed))
-    model = identify(record_of(sequence.v, y, labels, 'identification'), Settings(order=(10, 10)))
+    record = record_of(sequence.v, y, sequence.segments, 'identification')
+    model = identify(record, Settings(order=(10, 10)))
     records = []
     for kind in ('diagnosis', 'unseen'):
         t, v, labels = truths.program(kind, seed)
         channels = other(t, len(kind))
-        record = record_of(v, stage.respond(t, v, channels=channels), labels, kind)
-        (piece,) = record.pieces
-        records.append(Record((replace(piece, channels=channels or {}),), kind))
+        y, segments = stage.respond(t, v, channels=channels), starmap(Segment, labels)
+        records.append(record_of(v, y, segments, kind, channels))
     return model.model, *records
 
 
@@ -193,8 +194,7 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone():
     sequence = parse_program(NARROW).build(RATE)
     stage = truths.make_stage('creep', 0.3, 1)
     t = np.arange(sequence.n) / RATE
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    narrow = record_of(sequence.v, stage.respond(t, sequence.v), labels, 'narrow')
+    narrow = record_of(sequence.v, stage.respond(t, sequence.v), sequence.segments, 'narrow')
     few = DiagnosisSettings(effects=('creep', 'saturation'))
     result = diagnose(model, narrow, few)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
@@ -223,8 +223,7 @@ def test_single_wild_readings_are_no_noise():
     y = piece.y.copy()
     y[at] += 0.5 * record.stroke
     wild = Record((replace(piece, y=y),), record.name)
-    few = DiagnosisSettings(effects=('creep',))
-    one, other = (diagnose(slow_model(), r, few) for r in (record, wild))
+    one, other = (diagnose(slow_model(), r, ONLY_CREEP) for r in (record, wild))
     assert [fault.count for fault in other.faults if fault.name == 'outliers'] == [30]
     assert other.noise_floor == pytest.approx(one.noise_floor, rel=0.05)
     assert other.before.overall == pytest.approx(one.before.overall, rel=0.02)
@@ -239,9 +238,8 @@ def test_a_sensor_that_hangs_is_no_noise(start, stop):
     for bad in (np.nan, piece.y[start]):
         y = piece.y.copy()
         y[start:stop] = bad
-        few = DiagnosisSettings(effects=('creep',))
         broken = Record.from_arrays(piece.v, y, sample_rate=piece.sample_rate)
-        floors.append(diagnose(slow_model(), broken, few).noise_floor)
+        floors.append(diagnose(slow_model(), broken, ONLY_CREEP).noise_floor)
     # where it hung for some periods, the residual repeats exactly; where it begins to, not at all
     assert floors[1] == pytest.approx(floors[0], rel=0.02)
 
@@ -422,8 +420,7 @@ def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     model, record, unseen = measured('creep', 0.3, 1)
     (piece,) = record.pieces
     moved = Record((replace(piece, y=piece.y + 10e-6),), 'moved')
-    few = DiagnosisSettings(effects=('creep',))
-    result, still = diagnose(model, moved, few), diagnose(model, record, few)
+    result, still = diagnose(model, moved, ONLY_CREEP), diagnose(model, record, ONLY_CREEP)
     assert result.before.overall == pytest.approx(still.before.overall)
     assert result.after.overall == pytest.approx(still.after.overall)
     assert any('zero of the displacement' in warning for warning in result.warnings)
@@ -451,7 +448,7 @@ def test_slow_motion_does_not_retune_g():
     assert not Simulator(slow_model(), make_rows(slow_model(), [slow])).is_fast
     fast = example_record()
     assert Simulator(slow_model(), make_rows(slow_model(), [fast])).is_fast
-    result = diagnose(slow_model(), slow, DiagnosisSettings(effects=('creep',)))
+    result = diagnose(slow_model(), slow, ONLY_CREEP)
     assert [effect.name for effect in result.effects] == ['creep'], result.sentence
     assert result.after.overall < 0.01 < 0.5 < result.before.overall
     assert result.model.dynamics == slow_model().dynamics
@@ -513,7 +510,7 @@ def test_a_candidate_that_is_left_out_is_not_named():
 
 def test_a_name_is_no_answer_while_its_look_alikes_were_not_tried():
     model, record, _ = measured('creep', 0.3, 1)
-    result = diagnose(model, record, DiagnosisSettings(effects=('creep',)))
+    result = diagnose(model, record, ONLY_CREEP)
     assert [e.name for e in result.effects] == ['creep']
     assert result.verdict == 'class' and result.group.names[0] == 'creep'
     assert 'thermal_drift' in result.group.names
@@ -558,7 +555,7 @@ def test_a_singular_fit_is_an_error_of_ours(scale):
     (piece,) = example_record()
     huge = Record((replace(piece, y=scale * piece.y),), 'huge')
     with pytest.raises(IdentificationError, match='singular'):
-        diagnose(slow_model(), huge, DiagnosisSettings(effects=('creep',)))
+        diagnose(slow_model(), huge, ONLY_CREEP)
 
 
 def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatch):
@@ -582,7 +579,7 @@ def test_displacement_that_does_not_follow_the_voltage_is_no_stage():
     noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
     unplugged = Record((replace(piece, y=noise),), 'unplugged')
     with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
-        diagnose(model, unplugged, DiagnosisSettings(effects=('creep',)))
+        diagnose(model, unplugged, ONLY_CREEP)
 
 
 def test_displacement_that_runs_against_the_model_is_refused():
@@ -612,7 +609,7 @@ def test_voltages_that_the_model_does_not_know_are_said(scale, said):
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
     scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
-    found = diagnose(model, scaled, DiagnosisSettings(effects=('creep',)))
+    found = diagnose(model, scaled, ONLY_CREEP)
     heard = [w for w in found.warnings if w.startswith('scaled: ')]
     assert len(heard) == len(said)
     assert all(part in line for part, line in zip(said, heard, strict=True))
@@ -693,10 +690,7 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them():
     ('errors', 'missed'),
     [
         ({'unit': '%', 'fitted': 0.1, 'selection': 0.2, 'fast_motion': 0.05}, 0.05),
-        (
-            {'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'fast_motion': 0.05},
-            0.05,
-        ),
+        ({'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'fast_motion': 0.05}, 0.05),
         # of records without labels
         ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2, 'fast_motion': 0.05}, 0.05),
         # an older file

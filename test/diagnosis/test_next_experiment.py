@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The next experiment: what is open is asked for once, by the motion that would decide it."""
 
 from dataclasses import replace

@@ -634,11 +634,7 @@ def test_a_refit_holds_where_it_helps_all_kinds_by_more_than_a_shift_or_one_bloc
     half = np.full(BLOCKS, 0.5e-6 * SIZE)
     assert refit_holds(rows, residual(rows), half)
     # a kind that gets worse by a quarter costs 0.07 of what the other seven gain
-    for cost, holds, unlabelled in (
-        (1.1, True, True),
-        (1.25, False, True),
-        (1.8, False, False),
-    ):
+    for cost, holds, unlabelled in ((1.1, True, True), (1.25, False, True), (1.8, False, False)):
         one_kind_worse = np.where(rows.group == 3, cost * 1e-6 * SIZE, half)
         assert refit_holds(rows, residual(rows), one_kind_worse) == holds
         parts = SimpleNamespace(**(vars(rows) | {'kinds': ()}))

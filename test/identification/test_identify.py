@@ -216,8 +216,7 @@ def test_a_level_that_drifts_under_small_motion_shows_the_law():
     w = drifting(program.v / 10.0)
     x = filter_arx(model.dynamics.a, model.dynamics.b, model.delay.apply(w))
     y = 75e-6 * (x + 2e-5 * np.random.default_rng(1).standard_normal(x.size))
-    segments = tuple(Segment(s.label, s.start, s.stop) for s in program.segments)
-    record = Record((Piece(program.v, y, 20_000.0, segments=segments),), 'drifting')
+    record = Record((Piece(program.v, y, 20_000.0, segments=program.segments),), 'drifting')
     found = identify(record, Settings(order=(10, 10)))
     assert found.hysteresis.law == 'duhem'
     error = free_run(found.model, record).errors.percent

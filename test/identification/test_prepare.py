@@ -9,12 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.signals import triangle
-from piezo_ident.identification.prepare import (
-    common_rate,
-    END_HELD,
-    runs_of,
-    scaling_of,
-)
+from piezo_ident.identification.prepare import common_rate, END_HELD, runs_of, scaling_of
 from piezo_ident.identification.refusals import refuse_closed_loop
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest

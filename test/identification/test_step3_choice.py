@@ -9,11 +9,7 @@ import numpy as np
 from paper_stage import A, B
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.step3_choice import choose_law, choose_thresholds, with_small
-from piezo_ident.identification.step3_hysteresis import (
-    even_thresholds,
-    factorise,
-    fit_hysteresis,
-)
+from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 import pytest

@@ -115,8 +115,7 @@ def test_modes_that_ring_for_long_are_found_beside_a_coarse_converter():
         )
         x += signal.lfilter(np.ravel(b), a, sequence.v / 100.0)
     y = 1e-5 * np.round(x * 512) / 512
-    labels = [(s.label, s.start, s.stop) for s in sequence.segments]
-    piece = Piece(sequence.v, y, fs, segments=tuple(Segment(*label) for label in labels))
+    piece = Piece(sequence.v, y, fs, segments=sequence.segments)
     given = runs_of([Record((piece,), 'coarse')], fs, scaling_of([piece]))
     _, G = second_step(given, Delay(0), Settings(), silent)
     for f, zeta, _ in modes:

@@ -25,12 +25,7 @@ FS = 5000.0
 # a lightly damped mode at 700 Hz, as a small stage at 5 kHz has it
 POLE = np.exp(2 * np.pi * 700 / FS * (-0.03 + 1j * np.sqrt(1 - 0.03**2)))
 G = Dynamics(np.real(np.poly([POLE, np.conj(POLE)]))[1:], [0.3, 0.3]).normalised()
-STAGE = replace(
-    PAPER,
-    sample_rate=FS,
-    dynamics=G,
-    delay=Delay(2),
-)
+STAGE = replace(PAPER, sample_rate=FS, dynamics=G, delay=Delay(2))
 
 
 def run_of(v, noise=1e-5, memory=None):

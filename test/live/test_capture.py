@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Blocks as they come to a record: the same as by way of a bag, and every fault said."""
 
 from dataclasses import replace

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A model beside a running stage, and what is made of its residual."""
 
 import numpy as np
@@ -46,6 +45,12 @@ def cut(v, size=100, start=0, rate=RATE):
     return [Samples(t[i : i + size], v[i : i + size], 'noise') for i in range(0, v.size, size)]
 
 
+def running(m):
+    predictor = Predictor()
+    predictor.set_model(m)
+    return predictor
+
+
 def predicted(predictor, blocks):
     made = [predictor.process(b) for b in blocks]
     return np.concatenate([m.values for m in made if m is not None])
@@ -87,8 +92,7 @@ def test_the_path_through_turning_points_holds_the_samples_before_them():
 
 def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
     v, m = drive(20_000), model()
-    predictor = Predictor()
-    predictor.set_model(m)
+    predictor = running(m)
     blocks = cut(v[:10_000], 100) + cut(v[10_000:], 33, start=10_000)
     first = predictor.process(blocks[0])
     np.testing.assert_array_equal(first.t, blocks[0].t)
@@ -102,8 +106,7 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
 @pytest.mark.parametrize('n', [20_000, 120_000], ids=['whole run at hand', 'longer than kept'])
 def test_a_new_model_is_where_it_would_be_had_it_run_all_along(n):
     v, old, new = drive(n + 5000), model(0), model(5)
-    predictor = Predictor()
-    predictor.set_model(old)
+    predictor = running(old)
     predicted(predictor, cut(v[:n]))
     predictor.set_model(new)
     made = predicted(predictor, cut(v[n:], start=n))
@@ -149,8 +152,7 @@ def test_history_is_kept_without_a_model():
 
 def test_a_restart_begins_anew():
     v, m = drive(2000), model()
-    predictor = Predictor()
-    predictor.set_model(m)
+    predictor = running(m)
     blocks = cut(v)
     first = predicted(predictor, blocks)
     np.testing.assert_array_equal(predicted(predictor, blocks), first)
@@ -159,8 +161,7 @@ def test_a_restart_begins_anew():
 
 def test_a_lost_block_is_bridged_and_counted():
     v, m = 5.0 - 5.0 * np.cos(2 * np.pi * 5.0 * np.arange(6000) / RATE), model()
-    predictor = Predictor()
-    predictor.set_model(m)
+    predictor = running(m)
     blocks = cut(v)
     made = predicted(predictor, blocks[:25] + blocks[26:])
     assert predictor.lost == 100
@@ -173,8 +174,7 @@ def test_a_lost_block_is_bridged_and_counted():
 
 def test_memory_is_unknown_behind_a_gap_until_the_voltage_was_at_its_lowest():
     v = 5.0 - 5.0 * np.cos(2 * np.pi * 5.0 * np.arange(6000) / RATE)
-    predictor = Predictor()
-    predictor.set_model(model())
+    predictor = running(model())
     blocks = cut(v)
     predicted(predictor, blocks[:5] + blocks[6:12])
     assert not predictor.memory_known
@@ -184,8 +184,7 @@ def test_memory_is_unknown_behind_a_gap_until_the_voltage_was_at_its_lowest():
 
 def test_a_long_gap_is_another_run():
     v, m = drive(20_000), model()
-    predictor = Predictor()
-    predictor.set_model(m)
+    predictor = running(m)
     blocks = cut(v)
     predicted(predictor, blocks[:20])
     made = predicted(predictor, blocks[150:])
@@ -196,8 +195,7 @@ def test_a_long_gap_is_another_run():
 
 def test_late_and_repeated_blocks_leave_no_trace():
     v, m = drive(3000), model()
-    predictor = Predictor()
-    predictor.set_model(m)
+    predictor = running(m)
     b = cut(v)
     made = predicted(predictor, [b[0], b[0], b[1], b[2], b[1], b[2], *b[3:]])
     np.testing.assert_array_equal(made, m.predict_piece(Piece(v, v, RATE)))
@@ -209,8 +207,7 @@ def test_late_and_repeated_blocks_leave_no_trace():
 
 def test_a_block_with_nan_is_left_out():
     v = drive(3000)
-    predictor = Predictor()
-    predictor.set_model(model())
+    predictor = running(model())
     blocks = cut(v)
     bad = Samples(blocks[5].t, np.where(np.arange(100) == 50, np.nan, blocks[5].values))
     made = predicted(predictor, [*blocks[:5], bad, *blocks[6:]])
@@ -223,8 +220,7 @@ def test_another_sampling_rate_is_refused():
     predictor.process(cut(drive(300))[0])
     with pytest.raises(ModelError, match='sampled at 10000 Hz, the model holds for 20000 Hz'):
         predictor.set_model(model(rate=20_000.0))
-    other = Predictor()
-    other.set_model(model(rate=20_000.0))
+    other = running(model(rate=20_000.0))
     assert other.process(cut(drive(300))[0]) is None
     assert 'identify a model at the rate of the stream' in other.problem
 
@@ -234,8 +230,7 @@ def block(first, n, value=0.0):
 
 
 def test_a_block_of_one_sample_does_not_set_the_rate():
-    predictor = Predictor()
-    predictor.set_model(model())
+    predictor = running(model())
     v = drive(1000)
     assert predictor.process(cut(v, 1)[0]) is None
     assert 'tells no sampling rate' in predictor.problem

@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What a block is to the stream that is followed, and whose it is."""
 
 import math
@@ -15,6 +14,11 @@ FS = 20000.0
 RNG = np.random.default_rng(0)
 
 
+@pytest.fixture
+def clock():
+    return SampleClock(FS, 0.5)
+
+
 def block(tick, n=100, value=None):
     values = RNG.random(n) if value is None else np.full(n, value)
     return Samples(np.arange(tick, tick + n) / FS, values, 'x')
@@ -24,8 +28,7 @@ def kinds(clock, blocks):
     return [clock.judge(b).kind.value for b in blocks]
 
 
-def test_a_stream_in_order():
-    clock = SampleClock(FS, 0.5)
+def test_a_stream_in_order(clock):
     assert kinds(clock, [block(0), block(100, 7), block(107), block(207, 1)]) == [
         'start',
         'next',
@@ -35,14 +38,12 @@ def test_a_stream_in_order():
     assert clock.head == 208
 
 
-def test_ticks_are_told_after_days():
-    clock = SampleClock(FS, 0.5)
+def test_ticks_are_told_after_days(clock):
     k = 20000 * 86400 * 5
     assert kinds(clock, [block(k), block(k + 100)]) == ['start', 'next']
 
 
-def test_gap_repeat_swap_restart():
-    clock = SampleClock(FS, 0.5)
+def test_gap_repeat_swap_restart(clock):
     a, b, c, d, e = (block(100 * k) for k in range(5))
     assert kinds(clock, [a, b, b, c]) == ['start', 'next', 'repeat', 'next']
     assert kinds(clock, [e]) == ['gap']
@@ -54,38 +55,33 @@ def test_gap_repeat_swap_restart():
     assert 't = 0.015 s' in verdict.reason
 
 
-def test_two_late_blocks_in_a_row():
-    clock = SampleClock(FS, 0.5)
+def test_two_late_blocks_in_a_row(clock):
     order = [block(0), block(300), block(100), block(200), block(400)]
     assert kinds(clock, order) == ['start', 'gap', 'late', 'late', 'next']
 
 
-def test_the_same_stream_once_more_is_no_repetition():
-    clock = SampleClock(FS, 0.5)
+def test_the_same_stream_once_more_is_no_repetition(clock):
     stream = [block(100 * k, value=0.0) for k in range(6)]
     assert kinds(clock, stream) == ['start'] + ['next'] * 5
     # the first block might be a repetition; the second one shows that it was not
     assert kinds(clock, stream) == ['repeat', 'start'] + ['next'] * 4
 
 
-def test_a_long_gap_is_a_new_stream():
-    clock = SampleClock(FS, 0.5)
+def test_a_long_gap_is_a_new_stream(clock):
     verdicts = [clock.judge(b) for b in (block(0), block(10100))]
     assert (verdicts[1].kind, verdicts[1].missing) == (Kind.GAP, 10000)
     verdict = clock.judge(block(20201))
     assert (verdict.kind, verdict.missing) == (Kind.START, 10001)
 
 
-def test_a_small_jump_back_is_no_restart():
-    clock = SampleClock(FS, 0.5)
+def test_a_small_jump_back_is_no_restart(clock):
     blocks = [block(100 * k) for k in range(30)]
     assert kinds(clock, blocks)[-1] == 'next'
     assert kinds(clock, [block(2500), block(2100)]) == ['late', 'late']
     assert kinds(clock, [block(1000), block(1100)]) == ['start', 'next']
 
 
-def test_a_silence_and_an_end():
-    clock = SampleClock(FS, 0.5)
+def test_a_silence_and_an_end(clock):
     clock.judge(block(0))
     clock.pause()
     assert clock.head is None
@@ -106,8 +102,7 @@ def test_a_silence_and_an_end():
         (np.empty(0), 'empty'),
     ],
 )
-def test_stamps_off_the_clock(t, reason):
-    clock = SampleClock(FS, 0.5)
+def test_stamps_off_the_clock(clock, t, reason):
     clock.judge(block(0))
     verdict = clock.judge(Samples(t, np.zeros(t.size), 'x'))
     assert verdict.kind is Kind.MALFORMED
@@ -123,8 +118,7 @@ def two():
 @pytest.mark.parametrize('numbered', [True, False])
 @pytest.mark.parametrize('offset', [0, 20, 100, 5000, 400000])
 @pytest.mark.parametrize('ahead', [-34, 3, 4000])
-def test_a_live_stream_is_not_taken_by_a_second_publisher(numbered, offset, ahead):
-    clock = SampleClock(FS, 0.5)
+def test_a_live_stream_is_not_taken_by_a_second_publisher(clock, numbered, offset, ahead):
     # alone at first; the other one is there when it sends its first block
     clock.judge(block(4000), 41 if numbered else None, lambda: [b'A'])
     for k in range(1, 30):
@@ -139,8 +133,7 @@ def test_a_live_stream_is_not_taken_by_a_second_publisher(numbered, offset, ahea
     assert clock.judge(block(0), 9999, two).kind is Kind.START
 
 
-def test_a_second_publisher_at_the_number_of_the_first_is_known_by_its_own_count():
-    clock = SampleClock(FS, 0.5)
+def test_a_second_publisher_at_the_number_of_the_first_is_known_by_its_own_count(clock):
     clock.judge(block(0), 500, lambda: [b'A'])
     for k in range(1, 60):
         # it sends twice as many blocks, and overtakes
@@ -150,8 +143,7 @@ def test_a_second_publisher_at_the_number_of_the_first_is_known_by_its_own_count
         assert clock.judge(block(100 * k), 500 + k, two).kind is Kind.NEXT
 
 
-def test_behind_a_silence_only_the_followed_publisher_comes_back():
-    clock = SampleClock(FS, 0.5)
+def test_behind_a_silence_only_the_followed_publisher_comes_back(clock):
     clock.judge(block(0), 5, lambda: [b'A'])
     clock.pause()
     for number in (1, 2, 9):
@@ -169,16 +161,14 @@ def test_behind_a_silence_only_the_followed_publisher_comes_back():
     assert clock.judge(block(400), 10, two).kind is Kind.SECOND
 
 
-def test_where_the_followed_publisher_has_gone_nobody_goes_on_in_its_stead():
-    clock = SampleClock(FS, 0.5)
+def test_where_the_followed_publisher_has_gone_nobody_goes_on_in_its_stead(clock):
     clock.judge(block(0), 5, lambda: [b'A'])
     assert clock.judge(block(200), 7, lambda: [b'B']).kind is Kind.SECOND
     # its own last block may still come
     assert clock.judge(block(100), 6, lambda: [b'B']).kind is Kind.NEXT
 
 
-def test_a_loss_beside_a_second_publisher_ends_the_stream():
-    clock = SampleClock(FS, 0.5)
+def test_a_loss_beside_a_second_publisher_ends_the_stream(clock):
     clock.judge(block(500), 5, two)
     assert clock.judge(block(0), 6, two).kind is Kind.START
     # a message that held no block has a number all the same

@@ -13,12 +13,7 @@ from paper_stage import FS, PAPER
 from piezo_ident.common.errors import ModelError
 from piezo_ident.model import initial_memory as memory_module
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.initial_memory import (
-    fit_start,
-    forgetting,
-    forgotten,
-    is_at_rest,
-)
+from piezo_ident.model.initial_memory import fit_start, forgetting, forgotten, is_at_rest
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.hysteresis import Hysteresis

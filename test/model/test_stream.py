@@ -1,7 +1,6 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A stream gives the numbers of the single operators, however it is cut."""
 
 from dataclasses import replace

@@ -318,15 +318,12 @@ class Observer:
         answer = self._ask(DescribeParameters, f'{node}/describe_parameters', request, timeout)
         return {d.name: d for d in answer.descriptors}
 
-    def publish(
-        self, topic: str, block: Samples | Float64MultiArray, subscribers: int = 1
-    ) -> None:
-        """Publish a block; before the first one, wait for so many subscribers."""
+    def publish(self, topic: str, block: Samples | Float64MultiArray) -> None:
+        """Publish a block; before the first one, wait for somebody else to listen."""
         if topic not in self._publishers:
             publisher = self.node.create_publisher(Float64MultiArray, topic, STREAM)
             self._publishers[topic] = publisher
-            own = int(topic in self._samples)
-            wanted = own + subscribers
+            wanted = 1 + (topic in self._samples)
             self.wait(
                 lambda: publisher.get_subscription_count() >= wanted, f'listeners to {topic}'
             )

@@ -9,12 +9,7 @@ import re
 import signal
 import time
 
-from course import (
-    block,
-    column,
-    FS,
-    QUICK,
-)
+from course import block, column, FS, QUICK
 from graph import Graph
 import numpy as np
 from piezo_ident.record.blocks import Samples

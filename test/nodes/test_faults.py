@@ -6,16 +6,7 @@
 from dataclasses import dataclass, replace
 import json
 
-from course import (
-    block,
-    column,
-    cut,
-    first_of,
-    FS,
-    model_of,
-    PROGRAM,
-    voltage_of,
-)
+from course import block, column, cut, first_of, FS, model_of, PROGRAM, voltage_of
 from graph import Graph
 import numpy as np
 from piezo_ident.nodes.wire import STREAM, to_message

@@ -8,14 +8,7 @@ from pathlib import Path
 import threading
 import time
 
-from course import (
-    first_of,
-    model_of,
-    numbers,
-    pairs_of,
-    SETTINGS,
-    simulated,
-)
+from course import first_of, model_of, numbers, pairs_of, SETTINGS, simulated
 from graph import best_of_three, Graph, in_time
 import numpy as np
 from piezo_ident.nodes.wire import LATCHED, to_message
@@ -200,8 +193,7 @@ def cancelled_at(g, step, during):
 
 
 @pytest.mark.parametrize(
-    ('step', 'setting'),
-    [('hysteresis', ('thresholds', 100)), ('dynamics', ('max_order', 50))],
+    ('step', 'setting'), [('hysteresis', ('thresholds', 100)), ('dynamics', ('max_order', 50))]
 )
 def test_cancel_answers_at_once_and_no_sample_is_lost(fed, blocks, step, setting):
     # with a hundred weights the swarm is at it for minutes

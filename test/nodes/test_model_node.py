@@ -5,7 +5,7 @@
 
 import time
 
-from course import FS, model_of, paper
+from course import column, FS, model_of, paper
 from graph import Graph
 import numpy as np
 from piezo_ident.model.files import load, model_to_yaml
@@ -63,8 +63,7 @@ def fast():
 def heard(g, topic, since, count):
     """Wait for blocks of a topic and return their rows in one piece."""
     g.wait(lambda: len(g.collect(topic)) >= since + count, f'{count} of {topic}')
-    new = g.collect(topic)[since : since + count]
-    return np.concatenate([b.t for b in new]), np.concatenate([b.values for b in new])
+    return column(g.collect(topic)[since : since + count])
 
 
 def reset(g, text=None):
@@ -301,11 +300,16 @@ def test_a_constant_error_is_said_and_wild_readings_are_left_out(fast):
     assert d['outliers'] == '9' and f'9 {said}' in fast.status('model')['text']
 
 
-def judged(g, several, y):
-    """Send blocks of voltage and displacement, and wait until they are in the live error."""
+def paired(g, several, y):
+    """Send blocks of voltage, each with the displacement of the same time."""
     for block, part in zip(several, np.split(y, len(several)), strict=True):
         g.publish('voltage', block)
         g.publish('displacement', Samples(block.t, part, block.segment, 'displacement'))
+
+
+def judged(g, several, y):
+    """Send blocks of voltage and displacement, and wait until they are in the live error."""
+    paired(g, several, y)
     g.wait(lambda: g.diagnostics('model').get('residual_rms', 'nan') != 'nan', 'an error')
 
 
@@ -325,9 +329,7 @@ def test_an_error_of_the_past_is_not_shown_when_nothing_can_be_judged(fast):
     reset(fast)
     judged(fast, blocks(4000), np.zeros(4000))
     # behind a gap, and not at the lowest voltage, the error is not known
-    for block in blocks(1000, 5000):
-        fast.publish('voltage', block)
-        fast.publish('displacement', Samples(block.t, block.t, block.segment, 'displacement'))
+    paired(fast, blocks(1000, 5000), sine(1000, 5000)[0])
     fast.wait(lambda: fast.diagnostics('model').get('residual_rms') == 'nan', 'no error')
     d = fast.diagnostics('model')
     assert d['memory_known'] == 'False' and d['level'] == '1'
@@ -355,14 +357,6 @@ def test_it_says_that_no_displacement_comes_or_none_of_the_same_time(fast):
         assert d['level'] == '1' and d['residual_rms'] == 'nan'
 
 
-def paired(g, several):
-    """Send blocks of voltage, each with the displacement of the same time."""
-    for block in several:
-        g.publish('voltage', block)
-        zeros = np.zeros(block.t.size)
-        g.publish('displacement', Samples(block.t, zeros, block.segment, 'displacement'))
-
-
 def test_a_model_that_comes_later_finds_no_fault_with_what_came_before(lab):
     lab.start('model')
     lab.wait(lambda: lab.diagnoses('model'), 'diagnostics')
@@ -370,7 +364,7 @@ def test_a_model_that_comes_later_finds_no_fault_with_what_came_before(lab):
 
     def more(count):
         nonlocal first
-        paired(lab, blocks(100 * count, first))
+        paired(lab, blocks(100 * count, first), np.zeros(100 * count))
         first += 100 * count
 
     # a second without a model, and most of the next one
@@ -394,7 +388,8 @@ def test_where_nothing_is_predicted_displacement_is_not_to_blame(lab):
 
     def more():
         nonlocal first
-        paired(lab, [Samples(2.0 * b.t, b.values, b.segment) for b in blocks(100, first)])
+        (b,) = blocks(100, first)
+        paired(lab, [Samples(2.0 * b.t, b.values, b.segment)], np.zeros(100))
         first += 100
 
     lab.wait(lambda: [d for d in seconds if 'sampled at' in d['message']], 'why', meanwhile=more)

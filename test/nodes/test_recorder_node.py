@@ -9,6 +9,7 @@ import shutil
 import threading
 import time
 
+from bag_data import metadata
 import numpy as np
 import pytest
 
@@ -26,7 +27,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
-import yaml
 
 RATE = 20000.0
 BLOCK = 100
@@ -160,8 +160,7 @@ def test_record_stop_and_refusals(tmp_path):
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(7 * (np.arange(n) / RATE)))
     assert (record.n, record.faults) == (n, ())
     assert record.pieces[0].sample_rate == RATE
-    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    info = info['rosbag2_bagfile_information']
+    info = metadata(tmp_path / 'bag')
     assert info['custom_data']['sample_rate'] == repr(RATE)
     assert info['custom_data']['namespace'] == '/a'
     offered = {

@@ -3,14 +3,12 @@
 
 """Short gaps are bridged: the model found is that of the whole record."""
 
-from pathlib import Path
-
 import numpy as np
 from numpy.testing import assert_array_equal
+from paper_stage import CONFIG, FS, STAGE
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.assemble import assemble, label_runs
 from piezo_ident.record.gaps import bridged, follows
@@ -18,12 +16,9 @@ from piezo_ident.record.io import read, write
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
-STAGE = SimulatedStage.load(CONFIG / 'stage_paper.yaml')
-
 
 def played(program):
-    return Program.load(CONFIG / f'program_{program}.yaml').build(20000.0)
+    return Program.load(CONFIG / f'program_{program}.yaml').build(FS)
 
 
 @pytest.fixture(scope='module')

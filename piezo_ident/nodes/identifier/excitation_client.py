@@ -56,10 +56,7 @@ class ExcitationClient:
     """
 
     def __init__(
-        self,
-        node: Node,
-        streams: Callable[[], Streams],
-        missing: Callable[[], str],
+        self, node: Node, streams: Callable[[], Streams], missing: Callable[[], str]
     ) -> None:
         self._streams, self._missing = streams, missing
         self._begin: Callable[[], None] = _nothing

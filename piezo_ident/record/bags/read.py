@@ -119,11 +119,7 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
         for quantity, samples, stamp in _blocks(bag, topics):
             streams[quantity].append(samples, stamp)
     return record_of_streams(
-        streams,
-        name=str(path),
-        options=options,
-        sample_rate=_sample_rate(path),
-        faults=bag.faults,
+        streams, name=str(path), options=options, sample_rate=_sample_rate(path), faults=bag.faults
     ).renamed(path.name)
 
 
@@ -177,10 +173,7 @@ def is_computed(topic: str) -> bool:
 
 
 def _choose(
-    carried: Mapping[str, str],
-    asked: Mapping[str, str | None],
-    namespace: str | None,
-    path: Path,
+    carried: Mapping[str, str], asked: Mapping[str, str | None], namespace: str | None, path: Path
 ) -> dict[str, str]:
     """Return the topic of each quantity, and of the applied voltage where it is there."""
     chosen = {

@@ -37,10 +37,7 @@ from rosbags.rosbag2.metadata import parse_qos
 #: first and last bytes of an mcap file
 _MAGIC = b'\x89MCAP0\r\n'
 _SIDECARS = ('-journal', '-wal')
-_FORMATS = {
-    'ros2msg': MessageDefinitionFormat.MSG,
-    'ros2idl': MessageDefinitionFormat.IDL,
-}
+_FORMATS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
 
 
 class Stored(NamedTuple):

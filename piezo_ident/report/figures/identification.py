@@ -112,12 +112,7 @@ def draw_identification(
             _of_delay(identification.delay),
             lambda: delay_figure(identification, runs),
         ),
-        (
-            'response',
-            'Frequency response',
-            response,
-            lambda: response_figure(identification),
-        ),
+        ('response', 'Frequency response', response, lambda: response_figure(identification)),
         (
             'orders',
             'Orders of G',

@@ -100,8 +100,7 @@ def test_callback_stops():
 
 
 @pytest.mark.parametrize(
-    'wrong',
-    [{'high': np.inf}, {'low': np.nan}, {'low': 2.0}, {'swarm_size': 1}, {'maxiter': 0}],
+    'wrong', [{'high': np.inf}, {'low': np.nan}, {'low': 2.0}, {'swarm_size': 1}, {'maxiter': 0}]
 )
 def test_no_box_and_no_swarm_are_refused(wrong):
     with pytest.raises(ConfigError, match='swarm'):

@@ -5,7 +5,7 @@
 
 from collections.abc import Iterable
 
-from bag_data import blocks, write
+from bag_data import blocks, metadata, write
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import DataError
@@ -17,7 +17,6 @@ from piezo_ident.record.join import APPLIED
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 from rosbags.rosbag2 import storage_mcap
-import yaml
 
 pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
 
@@ -73,8 +72,7 @@ def test_other_readers_see_the_same(tmp_path, start):
         assert [m.layout.dim[0].label for _, m in messages[:3]] == ['sample:'] * 2 + [
             'sample:noise'
         ]
-    meta = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    info = meta['rosbag2_bagfile_information']
+    info = metadata(tmp_path / 'bag')
     assert info['version'] == 9
     assert info['storage_identifier'] == 'mcap'
     assert info['relative_file_paths'] == ['bag.mcap']

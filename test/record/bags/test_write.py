@@ -6,7 +6,7 @@
 from contextlib import closing
 import sqlite3
 
-from bag_data import raw, recording
+from bag_data import metadata, raw, recording
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.stream_reader import StreamReader
@@ -19,7 +19,6 @@ from piezo_ident.record.blocks import Samples
 import pytest
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import storage_mcap
-import yaml
 
 pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
 
@@ -57,8 +56,7 @@ def test_closed_bag(tmp_path, storage):
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
     assert writer.messages == 80
     assert writer.parts == [tmp_path / 'bag']
-    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    assert 'part' not in info['rosbag2_bagfile_information']['custom_data']
+    assert 'part' not in metadata(tmp_path / 'bag')['custom_data']
 
 
 @pytest.mark.parametrize('storage', STORAGES)
@@ -71,8 +69,7 @@ def test_metadata_as_rosbag2_of_jazzy_reads_it(tmp_path, storage):
     text = TYPES['std_msgs/msg/String']('model')
     writer.write('/a/model', 5, bytes(typestore().serialize_cdr(text, 'std_msgs/msg/String')))
     writer.close()
-    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    info = info['rosbag2_bagfile_information']
+    info = metadata(tmp_path / 'bag')
     assert set(info) == {
         'version',
         'storage_identifier',
@@ -149,8 +146,7 @@ def test_distribution_and_hashes_are_those_of_jazzy(tmp_path, storage):
     writer.add_topic('/preview', 'sensor_msgs/msg/JointState')
     writer.write('/voltage', 1, raw(Samples(np.arange(3) / RATE, np.ones(3), 'noise', 'voltage')))
     writer.close()
-    info = yaml.safe_load((tmp_path / 'bag/metadata.yaml').read_text())
-    info = info['rosbag2_bagfile_information']
+    info = metadata(tmp_path / 'bag')
     assert info['ros_distro'] == 'jazzy'
     hashes = {
         t['topic_metadata']['name']: t['topic_metadata']['type_description_hash']
@@ -207,8 +203,7 @@ def test_parts_are_whole_bags_that_follow_each_other(tmp_path, storage):
         t.append(record.pieces[0].t)
         with opened_bag(part) as bag:
             count += sum(1 for _ in bag.messages(bag.connections))
-        info = yaml.safe_load((part / 'metadata.yaml').read_text())
-        custom = info['rosbag2_bagfile_information']['custom_data']
+        custom = metadata(part)['custom_data']
         assert custom['part'] == str(k) and custom['sample_rate'] == repr(RATE)
         assert custom['recording'] == ('' if k == 0 else 'bag')
     assert count == 120
