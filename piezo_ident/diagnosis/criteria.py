@@ -79,9 +79,13 @@ NAMED, ADDED = 0.92, 0.5
 TOGETHER = 0.8
 #: ratio of a gain to that of any other candidate from which an effect need not explain so much
 STANDS_OUT = 2.0
-#: share of what a refit of H takes that an effect beside the H as given must take: with nothing
-#: hidden, the best took at most 0.76 (33 refits of labelled simulated stages)
-SET_IN = 0.85
+#: share of what a refit of H takes that an effect beside the H as given must take, and the same
+#: of noncongruent loops alone: of 33 refits of labelled simulated stages with nothing hidden those
+#: took at most 0.76, and other effects 0.62
+SET_IN, NONCONGRUENT = 0.75, 0.85
+#: ratio to what H missed at the identification that noncongruent loops alone must exceed: no law
+#: of H holds quite those of the material
+BEYOND_MATERIAL = 3.0
 #: share of what earlier effects left that a further one must explain
 FURTHER = 0.6
 #: least gain of an effect, share

@@ -149,9 +149,9 @@ def sentence(
             f'other motion gains nothing, so the model stays as given ({before:.3g} % of stroke)'
         )
     missed = 'what the model missed'
-    if findings.of_refit:
+    if findings.of_refit and len(findings.effects) == 1:
         missed = 'what a refit of the hysteresis takes'
-    elif findings.effects and refit < 0.5 * before:
+    elif findings.effects and not findings.of_refit and refit < 0.5 * before:
         # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
         fall += '' if is_given else f', with the refit alone to {refit:.3g} %'

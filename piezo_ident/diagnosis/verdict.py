@@ -100,7 +100,7 @@ def judge(
     Return the verdict on what was added to a base.
 
     `noise` is the mean square of the noise of a row.  What could have bent G at the identification
-    is a rival of the first effect that was added, and so is what is known to be `alike`.
+    is a rival of the first effect that was added; those that are known to be `alike` are rivals.
     """
     fitted, taken = selected.fitted, selected.taken
     explainable = max(base.mean_square - noise, 0.0)
@@ -146,7 +146,7 @@ def _alike(
         # of a G that changed none of the laws need be the cause
         like = selected.linear if contenders[0].name in selected.linear else ()
         like = (*changes, *like) if contenders[0].name in changes else like
-        like = (*like, *known) if i == 0 else like
+        like = (*like, *known) if contenders[0].name in known else like
         names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:
