@@ -362,7 +362,9 @@ def quantum_of(y: Array) -> float:
     # a wild reading, which need not be a code, jumps twice
     often = counts > 2
     if counts[often].sum() > max(20, 0.9 * counts.sum()):
-        jumps = jumps[often] if often.sum() > 1 else np.repeat(jumps[often], 2)
+        jumps = jumps[often]
+        if jumps.size == 1:
+            return float(jumps[0])
     if jumps.size < 2 or jumps.size > y.size // 4 + 50:
         return 0.0
     small = jumps[: max(20, jumps.size // 10)]
