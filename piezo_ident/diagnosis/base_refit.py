@@ -141,21 +141,6 @@ def _selected(
     return wide, replace(both, fitted=fitted)
 
 
-def refit_is_large(
-    simulator: Simulator, given: State, refit: Fitted, noise: float, single: float
-) -> bool:
-    """
-    Return whether a refit of H takes the larger part of what the given model misses.
-
-    `noise` and `single` are the mean squares of the noise of a row and of a sample.
-    """
-    rows = simulator.rows
-    gain = float(np.mean((rows.x - simulator.run(given)) ** 2)) - refit.mean_square
-    # noise moved the weights when they were identified, too
-    is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
-    return is_large and gain >= refit.mean_square - noise
-
-
 def with_refit(
     simulator: Simulator,
     given: State,
@@ -163,15 +148,16 @@ def with_refit(
     findings: Findings,
     selected: Selected,
     noise: float,
-    single: float,
     misfit: float,
+    *,
+    is_large: bool,
 ) -> Findings:
     """
     Return what H alone accounts for, where no effect was found.
 
     That a refit of it brought what there was to gain is a finding; and what a wider H takes, the
-    rms `misfit` [% of stroke], a refit or a retuned G may hide effects.  `noise` and `single` are
-    the mean squares of the noise of a row and of a sample.
+    rms `misfit` [% of stroke], a refit or a retuned G may hide effects.  `noise` is the mean
+    square of the noise of a row; a refit `is_large` that takes most of what the model misses.
     """
     rows, refit = simulator.rows, selected.fitted
     if rows.percent(base.mean_square - refit.mean_square) < criteria.REFIT_FINDING:
@@ -179,7 +165,7 @@ def with_refit(
         selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
     before = float(np.mean(e * e))
-    if refit_is_large(simulator, given, refit, noise, single):
+    if is_large:
         unsettled = findings.unsettled(rows.percent(before - noise))
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs

@@ -13,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.base_refit import refit_is_large, refit_of, with_refit
+from piezo_ident.diagnosis.base_refit import refit_of, with_refit
 from piezo_ident.diagnosis.cross_validation import fitted_gain
-from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected, TESTED
+from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected, TESTED, WIDE_LAW
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.search import gains_of, takes
 from piezo_ident.diagnosis.simulator import Simulator
@@ -25,9 +26,6 @@ from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.diagnosis.verdict import Findings, judge
 from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import expected_error
-
-#: loops that change with the bias are but another wide law of H
-WIDER = 'noncongruent_minor_loops'
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +72,29 @@ def conclude(
     # hum and another axis are there whatever H is
     if all(name in TESTED for name in findings.effects) and len(findings.effects) < 2:
         known = replace(given, effects=last.state.effects)
-        if refit_is_large(simulator, known, last, noise, single):
+        is_large = _is_large(simulator, known, last, noise, single)
+        if is_large:
             set_in = _set_in(simulator, given, known, search, selected, noise, tick)
             if set_in is not None:
                 return set_in
-    if not findings.effects:
-        findings = with_refit(simulator, given, base, findings, selected, noise, single, misfit)
+        if not findings.effects:
+            findings = with_refit(
+                simulator, given, base, findings, selected, noise, misfit, is_large=is_large
+            )
     if not findings.keeps_given:
         last = toward_given(simulator, given, last, tick)
     return Conclusion(findings, selected, base, max(base.mean_square - noise, 1e-300), last)
+
+
+def _is_large(
+    simulator: Simulator, known: State, refit: Fitted, noise: float, single: float
+) -> bool:
+    """Return whether a refit of H takes the larger part of what the known model misses."""
+    rows = simulator.rows
+    gain = float(np.mean((rows.x - simulator.run(known)) ** 2)) - refit.mean_square
+    # noise moved the weights when they were identified, too
+    is_large = rows.percent(gain - single) >= criteria.REFIT_FINDING
+    return is_large and gain >= refit.mean_square - noise
 
 
 def _set_in(
@@ -122,7 +134,7 @@ def _set_in(
     alike.sort(key=lambda name: -gains[name])
     if best.name not in alike or _may_be_a_gain(simulator, before, gains, whole):
         return None
-    if alike == [WIDER] and (
+    if alike == [WIDE_LAW] and (
         not rows.kinds
         or this.gain < criteria.NONCONGRUENT * whole
         or rows.percent(level) < criteria.BEYOND_MATERIAL * (expected_error(simulator.model) or 0)

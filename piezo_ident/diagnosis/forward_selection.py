@@ -31,6 +31,8 @@ from piezo_ident.identification.results import Progress
 
 #: effects that have a test of their own, by lines and by coherence with a further channel
 TESTED = ('periodic_disturbance', 'cross_coupling')
+#: weights that change with the bias are but another wide law of H
+WIDE_LAW = 'noncongruent_minor_loops'
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +248,7 @@ class ForwardSelection:
         if not self._simulator.rows.kinds:
             # no other kind of motion speaks against the wide H
             least = self._beyond_noise(wide) / criteria.AHEAD - self._indistinct
-        if this.contenders[0].name == 'noncongruent_minor_loops':
-            # weights that change with the bias are but another wide law
+        if this.contenders[0].name == WIDE_LAW:
             least /= criteria.AHEAD
         if self._left(this) > min(least, (1.0 - criteria.NAMED) * left):
             return found
