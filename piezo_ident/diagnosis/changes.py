@@ -13,14 +13,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 import copy
 from functools import cached_property
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.diagnosis.row_filter import group_of, RowFilter, serves
+from piezo_ident.effects import Effect
 from piezo_ident.operators.chain import Block, Operator
-from piezo_ident.operators.dynamics import DynamicsOperator
+from piezo_ident.operators.dynamics import Dynamics, DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
 #: samples that pass all links while they are in the cache, about
@@ -52,6 +53,8 @@ class Behind:
         Samples in a row.
     new : bool, optional
         Whether the first link has changed since.
+    small : bool, optional
+        Whether changes are so small that a slope tells what a curve makes of them.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class Behind:
         m: int,
         *,
         new: bool = False,
+        small: bool = False,
     ) -> None:
         self._rests, self._blocks, self._m = rests, blocks, m
         self._n = n = blocks[0].x.size // m * m
@@ -69,6 +73,8 @@ class Behind:
         step = max(1, STRETCH // group) * group
         self._cuts = [slice(a, min(a + step, n)) for a in range(0, n, step)]
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
+        if not small:
+            kinds = ['bent' if kind == 'curved' else kind for kind in kinds]
         if new:
             kinds[0] = 'bent'
         self._links = [
@@ -84,7 +90,7 @@ class Behind:
         The change, shape (n,), is None where only the first link has changed; `rest` is that of
         the signal at rest, before the first sample.
         """
-        m, (links, G) = self._m, self._to_rows
+        m, (links, G, slopes) = self._m, self._to_rows
         rest = self._reset(links, rest)
         if G is not None:
             G.reset(rest)
@@ -92,7 +98,7 @@ class Behind:
         for cut in self._cuts:
             passed = self._passed(links, cut, None if change is None else change[cut])
             means.append(block_means(passed, m) if G is None else G.process(passed))
-        return np.concatenate(means) if means else np.empty(0)
+        return slopes * np.concatenate(means) if means else np.empty(0)
 
     def filtered(self, sections: Array, signal: Array, rest: float) -> Array:
         """
@@ -109,6 +115,9 @@ class Behind:
         first = [link.kind == 'filtered' for link in self._links]
         at = first.index(False) if False in first else len(first)
         before, tail = self._links[:at], self._links[at:]
+        slopes: Array | float = 1.0
+        if all(link.kind == 'curved' for link in tail):
+            tail, slopes = [], self._slopes(tail)
         rest = self._reset(before, rest)
         b0, b1, b2, a1, a2 = c
         gain = (b0 + b1 + b2) / (1.0 + a1 + a2)
@@ -128,26 +137,43 @@ class Behind:
             for i, links in enumerate(tails):
                 change = self._passed(links, cut, out[i])
                 rows[i, row] = block_means(change, self._m)
-        return rows
+        return rows * slopes
 
     @cached_property
-    def _to_rows(self) -> tuple[Sequence[_Link], RowFilter | None]:
-        """Links without G, and G that makes rows, where it may trade places with the last."""
-        links, last = self._links, len(self._links)
+    def _to_rows(self) -> tuple[Sequence[_Link], RowFilter | None, Array | float]:
+        """
+        Links that make samples, a filter that makes rows, and what those are multiplied by.
+
+        The last links that filter trade places: G, and creep, make rows behind the others.
+        """
+        links, end = self._links, len(self._links)
+        while end > 0 and links[end - 1].kind == 'curved':
+            end -= 1
+        last = end
         while last > 0 and links[last - 1].kind == 'filtered':
             last -= 1
-        own = [link.operator for link in links[last:]]
-        parts = [one.dynamics for one in own if isinstance(one, DynamicsOperator)]
+        own = [(link, _filter_of(link.operator)) for link in links[last:end]]
+        parts = [part for _, part in own if part is not None]
         if not serves(parts, self._m, self._n):
-            return links, None
-        others = [x for x in links[last:] if not isinstance(x.operator, DynamicsOperator)]
-        return [*links[:last], *others], RowFilter(parts, self._m)
+            return links, None, 1.0
+        others = [link for link, part in own if part is None]
+        return [*links[:last], *others], RowFilter(parts, self._m), self._slopes(links[end:])
+
+    def _slopes(self, links: Sequence[_Link]) -> Array | float:
+        """Return the slope of links without memory in each row: it hardly changes within one."""
+        product: Array | float = 1.0
+        for k, operator, _ in links:
+            slope = _slope(operator, self._blocks[k].x[: self._n])
+            product = product * block_means(slope, self._m)
+        return product
 
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
         """Bring links to rest, and return by how much that behind them changes with `rest`."""
         v0 = float(self._blocks[0].v[0])
         for k, operator, kind in links:
-            if kind != 'bent':
+            if kind == 'curved':
+                rest *= float(_slope(operator, np.array([self._rests[k]]))[0])
+            elif kind != 'bent':
                 rest = operator.reset(0.0, rest)
             else:
                 rest = operator.reset(v0, self._rests[k] + rest) - self._rests[k + 1]
@@ -161,14 +187,36 @@ class Behind:
         if change is not None:
             block = block.with_signal(change)
         for k, operator, kind in links:
-            if kind != 'bent':
+            if kind not in ('bent', 'curved'):
                 block = operator.process(block)
                 continue
             x = self._blocks[k].x[cut]
+            if kind == 'curved':
+                block = block.with_signal(block.x * _slope(operator, x))
+                continue
             block = operator.process(block.with_signal(x if change is None else x + block.x))
             change = block.x - self._blocks[k + 1].x[cut]
             block = block.with_signal(change)
         return block.x
+
+
+def _slope(operator: Operator, x: Array) -> Array:
+    return cast(Effect, operator).slope(x)
+
+
+def _filter_of(operator: Operator) -> Dynamics | Array | None:
+    """Return G, or the filters whose outputs a link adds to its signal; None of another link."""
+    if isinstance(operator, DynamicsOperator):
+        return operator.dynamics
+    if not isinstance(operator, Effect) or operator.change != 'filtered':
+        return None
+    found = []
+    for p in operator.parameters:
+        for i, share in enumerate(operator.array(p.name) if p.vector else ()):
+            section = operator.section(operator.sample_rate, operator.values, p.name, i)
+            if section is not None:
+                found.append(section * np.array([share, share, share, 1.0, 1.0]))
+    return np.array(found) if found else None
 
 
 @kernel

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-G of which only the means of rows are wanted.
+G, and creep in front of it, of which only the means of rows are wanted.
 
 Most of what a fit asks of G is means of some samples in a row.  The state of G then steps from
 one group of rows to the next, and what the samples in between add is a product of matrices: that
@@ -14,12 +14,14 @@ pp. 1088-1096, doi:10.1109/TAC.1985.1103841.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.sections import rounding_of
+from scipy.linalg import block_diag
 
 #: samples in a row and in a run from which it is quicker than G itself
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000
@@ -34,10 +36,26 @@ def group_of(m: int) -> int:
     return max(1, IN_GROUP // m)
 
 
-def serves(parts: Sequence[Dynamics], m: int, samples: int) -> bool:
+def serves(parts: Sequence[Dynamics | Array], m: int, samples: int) -> bool:
     """Return whether filters one behind the other may be run as rows, and are quicker so."""
-    is_quick = bool(parts) and m >= LEAST_IN_ROW and samples >= LEAST_IN_RUN
-    return is_quick and all(G.sections is not None or rounding_of(G.a) < LOST for G in parts)
+    own = [part for part in parts if isinstance(part, Dynamics)]
+    is_quick = bool(own) and m >= LEAST_IN_ROW and samples >= LEAST_IN_RUN
+    return is_quick and all(G.sections is not None or rounding_of(G.a) < LOST for G in own)
+
+
+class _Form(NamedTuple):
+    """
+    ``s(k+1) = A s(k) + B w(k)`` and ``y(k) = C s(k) + D w(k)``.
+
+    Under w = 1 it rests with s = `rest` and y = `gain`.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: float
+    rest: Array
+    gain: float
 
 
 class RowFilter:
@@ -46,8 +64,9 @@ class RowFilter:
 
     Parameters
     ----------
-    parts : sequence of Dynamics
-        Filters one behind the other; as one of their order they would lose digits.
+    parts : sequence of Dynamics or of ndarray, shape (k, 5)
+        Filters one behind the other; as one of their order they would lose digits.  An array holds
+        b_0, b_1, b_2, a_1 and a_2 of filters whose outputs are added to the signal.
     m : int
         Samples in a row.
 
@@ -57,17 +76,14 @@ class RowFilter:
     direct form.  Over a group of K samples ``s(k+K) = A^K s(k) + sum_i A^(K-1-i) B w(k+i)``.
     """
 
-    def __init__(self, parts: Sequence[Dynamics], m: int) -> None:
+    def __init__(self, parts: Sequence[Dynamics | Array], m: int) -> None:
         self._forms = [form for part in parts for form in _forms_of(part)]
         A, B, C, D = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
-        for a, b in self._forms:
-            own = np.eye(a.size, k=1)
-            own[:, 0] = -a
-            enters = b[1:] - a * b[0]
-            A = np.block([[A, np.zeros((B.size, a.size))], [np.outer(enters, C), own]])
-            B = np.append(B, enters * D)
-            C = np.concatenate([b[0] * C, np.eye(1, a.size)[0]])
-            D *= b[0]
+        for own in self._forms:
+            A = np.block([[A, np.zeros((B.size, own.B.size))], [np.outer(own.B, C), own.A]])
+            B = np.append(B, own.B * D)
+            C = np.concatenate([own.D * C, own.C])
+            D *= own.D
         size = B.size
         self._m, self._group = m, group_of(m)
         length = self._group * m
@@ -88,10 +104,9 @@ class RowFilter:
     def reset(self, x: float) -> float:
         """Come to rest under x, and return what goes out."""
         states = []
-        for a, b in self._forms:
-            y = x * float(b.sum() / (1.0 + a.sum()))
-            states.append(np.cumsum((b[1:] * x - a * y)[::-1])[::-1])
-            x = y
+        for form in self._forms:
+            states.append(x * form.rest)
+            x *= form.gain
         self._s = np.concatenate(states)
         return x
 
@@ -111,14 +126,37 @@ class RowFilter:
         return out.ravel()[:rows]
 
 
-def _forms_of(dynamics: Dynamics) -> list[tuple[Array, Array]]:
-    """Return a_1 .. a_n and b_1 .. b_(n+1) of G, n at least one, or of its sections."""
-    if dynamics.sections is not None:
-        return [(section[3:], section[:3]) for section in dynamics.sections]
-    n = max(dynamics.a.size, dynamics.b.size - 1, 1)
+def _forms_of(part: Dynamics | Array) -> list[_Form]:
+    """Return a part in the transposed direct form, or its sections one behind the other."""
+    if not isinstance(part, Dynamics):
+        return [_beside_the_signal([_direct(section[3:], section[:3]) for section in part])]
+    if part.sections is not None:
+        return [_direct(section[3:], section[:3]) for section in part.sections]
+    n = max(part.a.size, part.b.size - 1, 1)
     a, b = np.zeros(n), np.zeros(n + 1)
-    a[: dynamics.a.size], b[: dynamics.b.size] = dynamics.a, dynamics.b
-    return [(a, b)]
+    a[: part.a.size], b[: part.b.size] = part.a, part.b
+    return [_direct(a, b)]
+
+
+def _direct(a: Array, b: Array) -> _Form:
+    """Return the form of a_1 .. a_n and b_0 .. b_n."""
+    own = np.eye(a.size, k=1)
+    own[:, 0] = -a
+    gain = float(b.sum() / (1.0 + a.sum()))
+    rest = np.cumsum((b[1:] - a * gain)[::-1])[::-1]
+    return _Form(own, b[1:] - a * b[0], np.eye(1, a.size)[0], float(b[0]), rest, gain)
+
+
+def _beside_the_signal(forms: Sequence[_Form]) -> _Form:
+    """Return the form of a signal with what filters of it make."""
+    return _Form(
+        block_diag(*(form.A for form in forms)),
+        np.concatenate([form.B for form in forms]),
+        np.concatenate([form.C for form in forms]),
+        1.0 + sum(form.D for form in forms),
+        np.concatenate([form.rest for form in forms]),
+        1.0 + sum(form.gain for form in forms),
+    )
 
 
 @kernel

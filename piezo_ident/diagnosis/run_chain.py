@@ -47,8 +47,9 @@ class RunChain:
         return block.x
 
     def behind(self, start: int, m: int) -> Behind:
-        """Return the links from a place on, once all blocks are kept."""
-        return Behind(self.operators[start:], self.rests[start:], self.blocks[start:], m)
+        """Return the links from a place on, for small changes, once all blocks are kept."""
+        parts = self.operators[start:], self.rests[start:], self.blocks[start:]
+        return Behind(*parts, m, small=True)
 
     def filtered(self, place: int, sections: Array, m: int) -> Array:
         """Return by how much all rows change with filters of what a link takes in."""

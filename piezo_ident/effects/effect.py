@@ -145,7 +145,8 @@ class Effect:
     change : str
         What it makes of a small change of its signal: ``passed`` as it is, where the effect only
         adds something of its own; ``filtered``, the same whatever the signal and whenever;
-        ``linear``, the same whatever the signal; or ``bent``.
+        ``linear``, the same whatever the signal; ``curved``, what the `slope` at its signal makes
+        of it; or ``bent``.
     of_hysteresis : str
         How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
         ``not``, ``linear`` or ``bent``.
@@ -178,7 +179,7 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
-    change: ClassVar[Literal['passed', 'filtered', 'linear', 'bent']] = 'bent'
+    change: ClassVar[Literal['passed', 'filtered', 'linear', 'curved', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
 
@@ -325,6 +326,10 @@ class Effect:
         That are b_0, b_1, b_2, a_1 and a_2, or None where it is no such number.
         """
         return None
+
+    def slope(self, x: Array) -> Array:
+        """Return the slope of an effect that is ``curved`` at its signal, shape (n,)."""
+        return np.ones_like(x)
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """

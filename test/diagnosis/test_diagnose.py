@@ -860,9 +860,11 @@ def test_quick_derivatives_are_differences_of_whole_runs(effects):
     now = simulator.remember(state)
     whole = Simulator(model, rows)
     columns = base_at(simulator, state).columns
+    # a curve passes changes by its mean slope in a row
+    near = 1e-4 if 'sensor_nonlinearity' in effects else 1e-7
     for j in (0, 2, law.size - 2):
         more = state.with_coefficients(law, state.coefficients + 1e-3 * np.eye(law.size)[j])
-        np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=1e-7)
+        np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=near)
     parameters = free_parameters(state, 1)
     filtered = simulator.filtered([(p.effect, p.name, p.index or 0, p.step) for p in parameters])
     # those of the retuning, and of shares
@@ -875,9 +877,10 @@ def test_quick_derivatives_are_differences_of_whole_runs(effects):
             simulator.varied([(moved, effect)])[0], whole.run(moved) - now, atol=1e-10
         )
         if j in filtered:
-            np.testing.assert_allclose(
-                filtered[j] * parameter.step, simulator.varied([(moved, effect)])[0], atol=1e-9
-            )
+            change = filtered[j] * parameter.step
+            [difference] = simulator.varied([(moved, effect)])
+            largest = np.abs(difference).max()
+            np.testing.assert_allclose(change, difference, 0, max(1e-9, near * largest))
 
 
 def test_retuning_is_the_product_with_its_factor():

@@ -103,3 +103,30 @@ def test_links_that_filter_may_stand_on_either_side_of_g():
         passed = link.process(passed)
     np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
     assert np.ptp(found) > 0.1
+
+
+def test_a_curve_behind_g_passes_small_changes_by_its_slope():
+    m, rate = 4, 20_000.0
+    x = motion(120_011, 0.4)
+    block = Block(t=np.arange(x.size) / rate, v=x, x=x, channels={})
+    sensor = find_effect('sensor_nonlinearity')
+    values = sensor.check({'square': 0.2, 'cubic': -0.3, 'fourth': 0.1})
+    links = [DynamicsOperator(PAPER), sensor(rate, values)]
+    G = DynamicsOperator(PAPER)
+    blocks, rests = [block], [0.4, G.reset(0.0, 0.4)]
+    blocks.append(G.process(block))
+    rests.append(links[1].reset(0.0, rests[1]))
+    blocks.append(links[1].process(blocks[1]))
+    change = 1e-4 * motion(x.size, 0.2)
+    exact = Behind(links, rests, blocks, m).rows(change, 2e-5)
+    found = Behind(links, rests, blocks, m, small=True).rows(change, 2e-5)
+    assert np.abs(exact).max() > 1e-5
+    # the curve bends a little within a row, and under the change
+    np.testing.assert_allclose(found, exact, rtol=2e-3, atol=1e-3 * np.abs(exact).max())
+    sections = np.array([[0.3, 0.0, 0.0, -0.7, 0.0]])
+    sections[:, :3] *= 1e-4
+    rows, bent = (
+        Behind(links, rests, blocks, m, small=small).filtered(sections, x, 0.4)
+        for small in (True, False)
+    )
+    np.testing.assert_allclose(rows, bent, atol=1e-3 * np.abs(bent).max())
