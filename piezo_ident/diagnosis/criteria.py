@@ -86,6 +86,10 @@ SET_IN, NONCONGRUENT = 0.75, 0.85
 #: ratio to what H missed at the identification that noncongruent loops alone must exceed: no law
 #: of H holds quite those of the material
 BEYOND_MATERIAL = 3.0
+#: share of what an effect leaves beside the H as given that a refit of H must take to be used,
+#: where no kinds of motion are held out: of 24 such simulated stages H stays for twelve, of which
+#: five then err less on other motion and five more, none more than as given; with a refit two did
+BENT_H = 0.75
 #: share of what earlier effects left that a further one must explain
 FURTHER = 0.6
 #: least gain of an effect, share

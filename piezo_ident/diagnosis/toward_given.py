@@ -11,19 +11,22 @@ The given H came from motion of its own, so it counts as data, too:
 
 with h and h_0 the new and the given H under loops over the range of the model, n the number of
 rows, and c the mean of the difference, which offsets make up for.  An effect of the voltage that
-was there at the identification has bent the given H, which then counts less: by what the fit
-leaves of the squares that the given model leaves.  It is enough to keep terms that these rows
-hardly tell from growing, which make up for one another here and nowhere else.  The given H does
-not count where the data cover a part of the range alone: the refined model holds there only.
+was there at the identification may have bent the given H.  Where a refit takes little of what the
+effect leaves beside that H, H stays as it was given.  Else it counts less: by what the fit leaves
+of the squares that the given model leaves.  It is enough to keep terms that these rows hardly tell
+from growing, which make up for one another here and nowhere else.  The given H does not count
+where the data cover a part of the range alone: the refined model holds there only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
@@ -63,7 +66,7 @@ def toward_given(
     set_in: bool = False,
 ) -> Fitted:
     """
-    Return a fit of rows without kinds of motion, drawn towards the H as given.
+    Return a fit of rows without kinds of motion, drawn towards the H as given, or with that H.
 
     Effects that `set_in` behind the identification have not bent that H.
     """
@@ -73,6 +76,12 @@ def toward_given(
     )
     if law is None or rows.kinds or not rows.covers(scaling.range):
         return fitted
+    if is_bent:
+        known = replace(fitted.state, hysteresis=given.hysteresis, law=given.law)
+        known = replace(known, coefficients=given.coefficients)
+        beside = fit_jointly(simulator, known, base_at(simulator, known), tick=tick)
+        if fitted.errors.sum() > (1.0 - criteria.BENT_H) * beside.errors.sum():
+            return beside
     u = loops(*map(float, scaling.u(scaling.range)))
     P = np.stack(list(law.columns(u)), axis=1)
     P -= P.mean(axis=0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from diagnosis_examples import measured, played, refined_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled
-from piezo_ident.diagnosis.base_refit import _is_loose, refits
+from piezo_ident.diagnosis.base_refit import _is_loose, refit_of, refits
 from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
 from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
@@ -18,6 +18,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.toward_given import loops, toward_given
 from piezo_ident.diagnosis.verdict import Findings
+from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.record.record import Record
 from programs import SLOW, slow_model
 import pytest
@@ -107,6 +108,24 @@ def test_an_effect_of_the_voltage_has_bent_the_given_h(refit):
     left = fitted.errors.sum() / (e @ e)
     assert left < 0.5
     assert weight(CREEP) == pytest.approx(left * weight(HUM), rel=1e-9)
+
+
+def test_an_h_to_which_a_refit_adds_little_stays():
+    v = without_labels().pieces[0].v
+    limit = Added('slew_limit', ({'limit': 0.5 * float(np.abs(np.diff(v)).max()) * SLOW},))
+    stage = replace(slow_model(), effects=(EffectSetting(limit.name, limit.values[0]),))
+    y = stage.simulate(v) + 2e-9 * np.random.default_rng(5).standard_normal(v.size)
+    record = Record.from_arrays(v, y, sample_rate=SLOW)
+    simulator = Simulator(slow_model(), make_rows(slow_model(), [record]))
+    given = State(slow_model().hysteresis, np.zeros(1))
+    fitted = refit_of(simulator, given.with_effect(limit), 'plays')
+    near = toward_given(simulator, given, fitted)
+    assert near.state.law is None
+    assert near.state.hysteresis is given.hysteresis
+    assert near.state.effects[0].name == 'slew_limit'
+    # with an H that is none of the data's it does not
+    other = replace(given.hysteresis, weights=given.hysteresis.weights[::-1].copy())
+    assert toward_given(simulator, replace(given, hysteresis=other), fitted).state.law is not None
 
 
 def test_lags_that_make_up_for_one_another_are_loose(refit):
