@@ -107,8 +107,10 @@ def warnings_of(
         )
     (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
     if low > least or high < most:
+        # an H that stays as it was given was not
+        what = 'the effects were fitted' if state.law is None else 'the hysteresis was refitted'
         found.append(
-            f'the hysteresis was refitted to {low:g} .. {high:g} V alone, and the refined model '
+            f'{what} to {low:g} .. {high:g} V alone, and the refined model '
             f'holds there; the given one holds in {least:g} .. {most:g} V'
         )
     return found
