@@ -21,7 +21,8 @@ from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.rows import centred
+from piezo_ident.diagnosis.rows import centred, Rows
+from piezo_ident.diagnosis.search import gains_of
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import loops
@@ -170,7 +171,7 @@ def with_refit(
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs
             return unsettled
-        other = _gain(simulator, given, refit)
+        other = _gain(simulator, given, refit, wanders=_wanders(rows, selected, noise))
         if other is not None and not selected.linear:
             # of another record a gain that wanders says nothing
             wanders = replace(unsettled, gain=other)
@@ -181,12 +182,21 @@ def with_refit(
     return findings.hiding(_hidden(simulator, given, selected, findings.verdict == 'refitted'))
 
 
-def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
+def _wanders(rows: Rows, selected: Selected, noise: float) -> bool:
+    """Return whether a gain that wanders takes a part of what a refit of H leaves."""
+    return any(
+        gains_of(rows, one).get('gain_drift', 0.0)
+        > criteria.WANDERING * (one.before.mean_square - noise)
+        for one in selected.rounds
+    )
+
+
+def _gain(simulator: Simulator, given: State, refit: Fitted, *, wanders: bool) -> float | None:
     """
     Return the gain that takes most of what a refit takes, if one does: no other loop is one.
 
-    It is another loop where the refit predicts other kinds of excitation better than the gain:
-    without labels a gain that drifts looks like one.
+    It is another loop where the refit predicts other kinds of excitation better than the gain, and
+    that does not go on to wander: without labels a gain that drifts looks like one.
     """
     rows, x = simulator.rows, simulator.run(given)
     e = centred(rows.x - x, rows.of_record)
@@ -197,7 +207,7 @@ def _gain(simulator: Simulator, given: State, refit: Fitted) -> float | None:
     is_large = rows.percent((whole - taken) / rows.n) >= criteria.REFIT_FINDING
     with_gain = e - (gain - 1.0) * centred(x, rows.of_record)
     is_loop = bool(rows.kinds) and is_large and refit_holds(rows, with_gain, refit.transfer)
-    return None if is_loop else gain
+    return None if is_loop and not wanders else gain
 
 
 def _hidden(

@@ -366,6 +366,23 @@ def test_another_loop_is_not_taken_for_another_gain():
     assert result.after.overall < 0.1 * result.before.overall
 
 
+@pytest.mark.parametrize('share', [0.1, 0.3])
+def test_another_gain_that_goes_on_to_wander_is_no_other_loop(monkeypatch, share):
+    model, record, _ = measured(None, 0.0, 2)
+    (piece,) = record.pieces
+    bent = Record((replace(piece, y=piece.y * (1.06 - 0.04 * piece.y / piece.y.max())),), 'bent')
+    simulator = Simulator(model, make_rows(model, [bent]))
+    given = State(model.hysteresis, np.zeros(1))
+    refit = base_refit.refits(simulator, given)[1]
+    monkeypatch.setattr(base_refit, 'gains_of', lambda *_: {'gain_drift': share})
+    one = SimpleNamespace(before=SimpleNamespace(mean_square=1.5))
+    selected = SimpleNamespace(rounds=(one,))
+    wanders = base_refit._wanders(simulator.rows, selected, 0.5)
+    assert wanders == (share > 0.2)
+    gain = base_refit._gain(simulator, given, refit, wanders=wanders)
+    assert gain == (pytest.approx(1.02, abs=0.01) if wanders else None)
+
+
 def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
     # H with another gain is the same model, so that the first could be any: it was -0.57 here
     model, record, _ = measured(None, 0.0, 2)
