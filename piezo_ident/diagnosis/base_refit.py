@@ -18,7 +18,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
-from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted, is_better
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
@@ -52,15 +52,6 @@ def base_thresholds(swing: float) -> Array:
     """Return nineteen even thresholds over the swing, and four fine ones near zero."""
     fine = np.array([0.005, 0.012, 0.025, 0.037])
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
-
-
-def _is_better(wide: Fitted, narrow: Fitted) -> bool:
-    """Return whether a wider law predicts clearly better, both held-out blocks and whole kinds."""
-
-    def square(fitted: Fitted) -> float:
-        return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
-
-    return square(wide) < criteria.WIDER**2 * square(narrow)
 
 
 def _is_loose(simulator: Simulator, given: State, fitted: Fitted) -> bool:
@@ -128,7 +119,7 @@ def _selected(
     if not found.taken:
         # no effect is needed for G to be a little off
         again = search.retuned(wide)
-        fitted = again if _is_better(again, wide) else wide
+        fitted = again if is_better(again, wide) else wide
     # without effects the whole weight of the given H holds a refit, and what the widest law takes
     # is no sign of one
     if found.taken and _is_loose(simulator, given, fitted):
@@ -136,7 +127,7 @@ def _selected(
     for narrower in _NARROWER:
         is_known = narrower == 'plays' and bool(found.taken)
         other = beside if is_known else refit_of(simulator, fitted.state, narrower)
-        if not _is_better(fitted, other):
+        if not is_better(fitted, other):
             fitted = other
             break
     return wide, replace(both, fitted=fitted)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.criteria import EARLIER_COST, WEIGHT_SPREAD, WIDE_SPREAD
+from piezo_ident.diagnosis.criteria import EARLIER_COST, WEIGHT_SPREAD, WIDE_SPREAD, WIDER
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     held_out_residual,
@@ -231,6 +231,15 @@ def fit_jointly(
         transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
         pull=own,
     )
+
+
+def is_better(wide: Fitted, narrow: Fitted) -> bool:
+    """Return whether a wider law predicts clearly better, both held-out blocks and whole kinds."""
+
+    def square(fitted: Fitted) -> float:
+        return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
+
+    return square(wide) < WIDER**2 * square(narrow)
 
 
 def _to_come(gain: float, last: float, more: int) -> float:

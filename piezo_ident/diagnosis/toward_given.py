@@ -12,10 +12,11 @@ The given H came from motion of its own, so it counts as data, too:
 with h and h_0 the new and the given H under loops over the range of the model, n the number of
 rows, and c the mean of the difference, which offsets make up for.  An effect of the voltage that
 was there at the identification may have bent the given H.  Where a refit takes little of what the
-effect leaves beside that H, H stays as it was given.  Else it counts less: by what the fit leaves
-of the squares that the given model leaves.  It is enough to keep terms that these rows hardly tell
-from growing, which make up for one another here and nowhere else.  The given H does not count
-where the data cover a part of the range alone: the refined model holds there only.
+effect leaves beside that H, H stays as it was given, and so does G where another one is not
+clearly better.  Else H counts less: by what the fit leaves of the squares that the given model
+leaves.  It is enough to keep terms that these rows hardly tell from growing, which make up for one
+another here and nowhere else.  The given H does not count where the data cover a part of the range
+alone: the refined model holds there only.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import Pull
 from piezo_ident.diagnosis.forward_selection import TESTED
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted, is_better
 from piezo_ident.diagnosis.rows import centred
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
@@ -81,7 +82,9 @@ def toward_given(
         known = replace(known, coefficients=given.coefficients)
         beside = fit_jointly(simulator, known, base_at(simulator, known), tick=tick)
         if fitted.errors.sum() > (1.0 - criteria.BENT_H) * beside.errors.sum():
-            return beside
+            known = replace(beside.state, retuning=())
+            plain = fit_jointly(simulator, known, beside.base, tick=tick)
+            return beside if is_better(beside, plain) else plain
     u = loops(*map(float, scaling.u(scaling.range)))
     P = np.stack(list(law.columns(u)), axis=1)
     P -= P.mean(axis=0)

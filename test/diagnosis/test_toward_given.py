@@ -118,9 +118,10 @@ def test_an_h_to_which_a_refit_adds_little_stays():
     record = Record.from_arrays(v, y, sample_rate=SLOW)
     simulator = Simulator(slow_model(), make_rows(slow_model(), [record]))
     given = State(slow_model().hysteresis, np.zeros(1))
-    fitted = refit_of(simulator, given.with_effect(limit), 'plays')
+    retuned = replace(given.with_effect(limit), retuning=(0.0,) * 4)
+    fitted = refit_of(simulator, retuned, 'plays')
     near = toward_given(simulator, given, fitted)
-    assert near.state.law is None
+    assert near.state.law is None and near.state.retuning == ()
     assert near.state.hysteresis is given.hysteresis
     assert near.state.effects[0].name == 'slew_limit'
     # with an H that is none of the data's it does not
