@@ -74,7 +74,11 @@ def refine(
         )
     ):
         return Refined(model, given, metres, is_given=True)
-    if fitted.transfer.sum() > (1.0 - criteria.WORTH_REFIT) ** 2 * (e @ e):
+    worth = criteria.WORTH_REFIT
+    if not rows.kinds:
+        # no other kind of motion speaks for it
+        worth = criteria.WORTH_UNLABELLED[bool(findings.effects)]
+    if fitted.transfer.sum() > (1.0 - worth) ** 2 * (e @ e):
         # of a kind of excitation that was not fitted the given model knows as much
         return Refined(model, given, metres, is_given=True)
     # beside an effect that was found, a smaller shift shows, too
