@@ -148,7 +148,7 @@ def sentence(
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
     if is_given:
         fall = (
-            f'other motion gains nothing, so the model stays as given ({before:.3g} % of stroke)'
+            f'other motion gains too little: the model stays as given ({before:.3g} % of stroke)'
         )
     missed = 'what the model missed'
     if findings.of_refit and len(findings.effects) == 1:
@@ -178,9 +178,9 @@ def sentence(
         if is_given:
             text = (
                 'the hysteresis of the model is not that of these data: a refit lowers the error '
-                f'on held-out data from {before:.3g} to {refit:.3g} % of stroke. It errs more on '
-                'the whole record or on other motion, or knows where loops were and not what they '
-                'look like, so the model stays as given.'
+                f'on held-out data from {before:.3g} to {refit:.3g} % of stroke. It gains too '
+                'little on the whole record or on other motion, or knows where loops were and not '
+                'what they look like, so the model stays as given.'
             )
     elif findings.verdict == 'unexplained':
         why = ' that no candidate explains: unexplained'

@@ -19,7 +19,14 @@ from diagnosis_examples import played, with_effects
 from diagnosis_examples import refined_model as creeping_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
-from piezo_ident.diagnosis import base_refit, diagnose, DiagnosisSettings, refined_model, search
+from piezo_ident.diagnosis import (
+    base_refit,
+    criteria,
+    diagnose,
+    DiagnosisSettings,
+    refined_model,
+    search,
+)
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
@@ -330,6 +337,19 @@ def test_a_refit_that_knows_only_where_loops_were_is_not_kept(monkeypatch, takes
     assert result.verdict == 'refitted'
     assert (result.model is not model) == takes
     assert ('where loops were' in result.sentence) != takes
+
+
+@pytest.mark.parametrize('has_labels', [True, False])
+def test_without_labels_a_refit_must_gain_more_to_be_kept(monkeypatch, has_labels):
+    model, bent = with_another_h()
+    if not has_labels:
+        bent = Record((replace(bent.pieces[0], segments=()),), 'unlabelled')
+    result = diagnose(model, bent, FEW)
+    assert result.after.overall < 0.5 * result.before.overall
+    monkeypatch.setattr(criteria, 'WORTH_UNLABELLED', (0.99, 0.99))
+    again = diagnose(model, bent, FEW)
+    assert (again.model is model) != has_labels
+    assert ('stays as given' in again.sentence) != has_labels
 
 
 @pytest.mark.parametrize('is_found', [True, False])

@@ -107,7 +107,7 @@ def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
     found, rest = Findings('named', 0.95, ('creep',), None, 0.1), Unexplained(0.05, 0.1, 'rest')
     said = sentence(found, errors, rest, 0.05, True)
     assert said.endswith(
-        'other motion gains nothing, so the model stays as given (0.4 % of stroke).'
+        'other motion gains too little: the model stays as given (0.4 % of stroke).'
     )
 
 
