@@ -197,8 +197,9 @@ def _gain(simulator: Simulator, given: State, refit: Fitted, *, wanders: bool) -
         return None
     is_large = rows.percent((whole - taken) / rows.n) >= criteria.REFIT_FINDING
     with_gain = e - (gain - 1.0) * centred(x, rows.of_record)
-    is_loop = bool(rows.kinds) and is_large and refit_holds(rows, with_gain, refit.transfer)
-    return None if is_loop and not wanders else gain
+    may_be_loop = bool(rows.kinds) and is_large and not wanders
+    is_loop = may_be_loop and refit_holds(rows, with_gain, refit.transfer)
+    return None if is_loop else gain
 
 
 def _hidden(

@@ -187,13 +187,13 @@ class Behind:
         if change is not None:
             block = block.with_signal(change)
         for k, operator, kind in links:
-            if kind not in ('bent', 'curved'):
+            if kind == 'curved':
+                block = block.with_signal(block.x * _slope(operator, self._blocks[k].x[cut]))
+                continue
+            if kind != 'bent':
                 block = operator.process(block)
                 continue
             x = self._blocks[k].x[cut]
-            if kind == 'curved':
-                block = block.with_signal(block.x * _slope(operator, x))
-                continue
             block = operator.process(block.with_signal(x if change is None else x + block.x))
             change = block.x - self._blocks[k + 1].x[cut]
             block = block.with_signal(change)

@@ -234,7 +234,7 @@ def fit_jointly(
 
 
 def is_better(wide: Fitted, narrow: Fitted) -> bool:
-    """Return whether a wider law predicts clearly better, both held-out blocks and whole kinds."""
+    """Return whether a wider fit predicts clearly better, both held-out blocks and whole kinds."""
 
     def square(fitted: Fitted) -> float:
         return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))

@@ -78,8 +78,12 @@ def toward_given(
     if law is None or rows.kinds or not rows.covers(scaling.range):
         return fitted
     if is_bent:
-        known = replace(fitted.state, hysteresis=given.hysteresis, law=given.law)
-        known = replace(known, coefficients=given.coefficients)
+        known = replace(
+            fitted.state,
+            hysteresis=given.hysteresis,
+            law=given.law,
+            coefficients=given.coefficients,
+        )
         beside = fit_jointly(simulator, known, base_at(simulator, known), tick=tick)
         if fitted.errors.sum() > (1.0 - criteria.BENT_H) * beside.errors.sum():
             known = replace(beside.state, retuning=())
