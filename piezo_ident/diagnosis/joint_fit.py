@@ -320,9 +320,10 @@ def _derivatives(
         value = parameters[j].get(state)
         quick[j] = slope * value if parameters[j].logarithmic else slope
     others = [(j, p) for j, p in enumerate(parameters) if j not in quick]
+    effects = [None if p.effect is None else state.effects[p.effect].effect for _, p in others]
     moved = [
-        (p.moved(state, steps[j]), None if p.effect is None else state.effects[p.effect].effect)
-        for j, p in others
+        (p.moved(state, steps[j]), effect, p.record)
+        for (j, p), effect in zip(others, effects, strict=True)
     ]
     for j, column in quick.items():
         columns[j] = column

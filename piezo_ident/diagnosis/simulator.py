@@ -224,19 +224,23 @@ class Simulator:
     def added(self, effects: Sequence[Added]) -> list[Array | None]:
         """Return by how much rows of the remembered state change with one more effect each."""
         state = self._known().state
-        return self.varied([(state.with_effect(added), added.effect) for added in effects])
+        return self.varied([(state.with_effect(added), added.effect, None) for added in effects])
 
-    def varied(self, changes: Sequence[tuple[State, type[Effect] | None]]) -> list[Array | None]:
+    def varied(
+        self, changes: Sequence[tuple[State, type[Effect] | None, int | None]]
+    ) -> list[Array | None]:
         """
         Return by how much the rows of states differ from those of the remembered one.
 
-        Each differs in one place, an effect or (None) the factor of G; the chain is only run from
-        there.  None stands for a state that cannot run.
+        Each differs in one place, an effect or (None) the factor of G, in one record or (None) in
+        all; the chain is only run from there.  None stands for a state that cannot run.
         """
         chains, runs = self._known().chains, range(len(self._sources))
 
-        def of_run(task: tuple[State, type[Effect] | None, int]) -> Array | None:
-            state, effect, i = task
+        def of_run(task: tuple[State, type[Effect] | None, int | None, int]) -> Array | None:
+            state, effect, record, i = task
+            if record is not None and record != self.rows.record[i]:
+                return np.zeros(self.rows.keep[i].size)
             try:
                 after = self._chain(state, i)
                 return after.difference(chains[i], place_of(effect, after.operators), self.rows.m)
