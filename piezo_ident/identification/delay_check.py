@@ -34,11 +34,15 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
     Return the delay of steps or of the scan that a free run upholds, else one that it allows.
 
-    Of two that hold the smaller goes; where none does, half of the largest that does.  `fitted`
+    Of two that hold the smaller goes; where none does, half of the largest that does.  Where only
+    a delay as large as any that is tried holds, what was found stays without a source.  `fitted`
     and `held` are input and output of noise, to fit and right behind that to judge by.
     """
-    asked = [d for d in (found.samples, found.scan) if d is not None]
-    tried = sorted({*asked, *(d for d in DELAYS if d < max(asked))})
+    # a delay of no source is but the largest that is tried
+    told = found.samples if found.source != 'none' else None
+    asked = [d for d in (told, found.scan) if d is not None]
+    most = max(asked, default=found.samples)
+    tried = sorted({*asked, *(d for d in DELAYS if d <= most)})
     u, y = fitted
     factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
     # what rings for long has died away where it is judged
@@ -50,8 +54,11 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
         errors.append(min(free_run_error(model, d, v, x, u.size) for model in models))
     least = min(errors)
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
+    if told is None and most in hold and 0 not in hold:
+        # it may well be larger
+        return found
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
-    if samples == found.samples:
+    if samples == told:
         return found
     if samples == found.scan:
         # the loss was scanned in whole samples

@@ -45,3 +45,10 @@ def test_noise_tells_a_delay_where_neither_steps_nor_the_loss_do():
     assert 1 <= found.samples <= 6
     # where the delay is that long, nothing is claimed
     assert upheld(DelayResult(30, np.inf, 'none'), *noise(33)).source == 'none'
+
+
+def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
+    # what rings for long hardly shows when it began
+    found = upheld(DelayResult(30, np.inf, 'none'), *noise(6, rms=1.0))
+    assert found.source == 'free run'
+    assert found.std > 5.0
