@@ -27,6 +27,7 @@ from piezo_ident.diagnosis.retuning import (
     BEYOND,
     retuned,
     retuning_factor,
+    retuning_squares,
     retuning_terms,
 )
 from piezo_ident.diagnosis.rows import Rows
@@ -109,6 +110,11 @@ class Simulator:
         G, delay = self.model.dynamics, self.model.total_delay
         lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
         return self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
+
+    @functools.cached_property
+    def retuning_squares(self) -> Array:
+        """See `retuning.retuning_squares`."""
+        return retuning_squares(self.model.dynamics, self.model.sample_rate, self._band)
 
     def holds_retuning(self, state: State) -> bool:
         """Return whether one filter can stand for G and its factor."""

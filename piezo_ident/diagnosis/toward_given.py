@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the H as given says of motion that the data do not hold.
+What the H and G as given say of motion that the data do not hold.
 
-Of records without labels, or of one kind, nothing tells how a refit of H does under other motion.
-The given H came from motion of its own, so it counts as data, too:
+Of records without labels, or of one kind, nothing tells how a refit of H does under other motion,
+nor how a G retuned along with it does where a mode answers to other frequencies.  The given ones
+came from motion of their own, so they count as data, too:
 
-    min  |e|^2 + n mean((h - h_0 - c)^2)
+    min  |e|^2 + n mean((h - h_0 - c)^2) + n mean(((g - g_0) * w)^2)
 
 with h and h_0 the new and the given H under loops over the range of the model, n the number of
-rows, and c the mean of the difference, which offsets make up for.  An effect of the voltage that
+rows, c the mean of the difference, which offsets make up for, and g and g_0 the impulse responses
+of the new and the given G under noise w of 1 % of the range, rms.  An effect of the voltage that
 was there at the identification may have bent the given H.  Where a refit takes little of what the
 effect leaves beside that H, H stays as it was given, and so does G where another one is not
 clearly better.  Else H counts less: by what the fit leaves of the squares that the given model
@@ -101,13 +103,19 @@ def toward_given(
         e = centred(rows.x - simulator.run(given), rows.of_record)
         weight *= min(1.0, float(fitted.errors.sum()) / max(float(e @ e), 1e-300))
     A = weight * (P.T @ P)
+    B = weight * u.size * criteria.NOISE_OF_G**2 * simulator.retuning_squares
 
     def pull_at(state: State, size: int) -> Pull:
-        k = law.size
+        k, first = law.size, law.size + state.only_adds.size
         whole, right = np.zeros((size, size)), np.zeros(size)
         left = h - P @ state.coefficients
         whole[:k, :k], right[:k] = A, weight * (P.T @ left)
-        return Pull(whole, right, weight * float(left @ left))
+        loss = weight * float(left @ left)
+        if state.retuning:
+            c, of_G = np.array(state.retuning), slice(first, first + len(state.retuning))
+            whole[of_G, of_G], right[of_G] = B, -B @ c
+            loss += float(c @ B @ c)
+        return Pull(whole, right, loss)
 
     state = fitted.state
     return fit_jointly(simulator, state, base_at(simulator, state), tick=tick, pull_at=pull_at)

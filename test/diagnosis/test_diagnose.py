@@ -32,7 +32,7 @@ from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly
 from piezo_ident.diagnosis.parameters import free_parameters
-from piezo_ident.diagnosis.retuning import retuned
+from piezo_ident.diagnosis.retuning import retuned, retuning_squares
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
@@ -44,7 +44,7 @@ from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import EffectSetting
-from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.faults import suspicions
 from piezo_ident.record.record import Piece, Record, Segment
@@ -916,6 +916,15 @@ def test_quick_derivatives_are_differences_of_whole_runs(effects):
             change = filtered[j] * parameter.step
             largest = np.abs(difference).max()
             np.testing.assert_allclose(change, difference, 0, max(1e-9, near * largest))
+
+
+def test_the_squares_of_a_retuned_g_are_those_under_noise():
+    G = Dynamics(a=np.array([-1.6, 0.9]), b=np.array([0.2, 0.1]))
+    c = np.array([0.02, -0.03, 0.02, -0.04])
+    w = np.random.default_rng(3).standard_normal(300_000)
+    other = retuned(G, c, RATE)
+    change = filter_arx(other.a, other.b, w) - filter_arx(G.a, G.b, w)
+    assert c @ retuning_squares(G, RATE, np.inf) @ c == pytest.approx(np.mean(change**2), rel=0.02)
 
 
 def test_retuning_is_the_product_with_its_factor():

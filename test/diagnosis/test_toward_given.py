@@ -19,6 +19,7 @@ from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.diagnosis.toward_given import loops, toward_given
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from programs import SLOW, slow_model
 import pytest
@@ -127,6 +128,29 @@ def test_an_h_to_which_a_refit_adds_little_stays():
     # with an H that is none of the data's it does not
     other = replace(given.hysteresis, weights=given.hysteresis.weights[::-1].copy())
     assert toward_given(simulator, replace(given, hysteresis=other), fitted).state.law is not None
+
+
+def test_a_mode_is_bent_less_for_one_sine():
+    pole = 0.999 * np.exp(2j * np.pi * 0.03)
+    a = np.array([-2.0 * pole.real, abs(pole) ** 2])
+    model = replace(slow_model(), dynamics=Dynamics(a, np.array([1.0 + a.sum()])))
+    (piece,) = without_labels().pieces
+    t, last = np.arange(piece.n) / SLOW, np.linspace(0.0, 1.0, piece.n) > 0.8
+    sine = last * np.sin(2.0 * np.pi * 0.01 * SLOW * t)
+    v = np.clip(piece.v + sine, *model.scaling.range)
+    # what another H makes of the sine, three times as fast, is where the mode rings
+    error = 0.005 * last * np.cos(2.0 * np.pi * 0.03 * SLOW * t) * model.scaling.Y
+    record = Record.from_arrays(v, model.simulate(v) + error, sample_rate=SLOW)
+    simulator = Simulator(model, make_rows(model, [record]))
+    given = State(model.hysteresis, np.zeros(1), retuning=(0.0,) * 4)
+    fitted = refit_of(simulator, given, 'plays')
+    near = toward_given(simulator, given, fitted)
+
+    def rings(state):
+        c = np.array(state.retuning)
+        return c @ simulator.retuning_squares @ c
+
+    assert rings(near.state) < 0.8 * rings(fitted.state)
 
 
 def test_lags_that_make_up_for_one_another_are_loose(refit):
