@@ -28,6 +28,8 @@ ORDERS = (4, 8, 12)
 DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
 #: share of the least error within which another one is no larger
 SLACK = 0.05
+#: share of the motion that the best free run may err where a delay is taken that nothing tells
+FOLLOWS = 0.5
 
 
 def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
@@ -54,8 +56,8 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
         errors.append(min(free_run_error(model, d, v, x, u.size) for model in models))
     least = min(errors)
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
-    if told is None and most in hold and 0 not in hold:
-        # it may well be larger
+    if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
+        # it may well be larger, or nothing follows the noise at all
         return found
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
     if samples == told:

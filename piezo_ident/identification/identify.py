@@ -224,6 +224,12 @@ def _labelled(
         warnings.append(
             'no step rises above the noise; the delay was read from the ARX loss alone'
         )
+    steps_tell = delay_result.step is not None and delay_result.step.samples is not None
+    if delay_result.source == 'free run' and delay_result.scan is None and not steps_tell:
+        warnings.append(
+            'neither steps nor the ARX loss tell the delay; a free run over the noise allows '
+            f'{delay_result.samples} samples, give or take {delay_result.std:.2g}'
+        )
     lowest = min(float(e.u[e.use].min()) for e in fit)
     highest = max(float(e.u[e.use].max()) for e in fit)
     if lowest > 0.01 or highest < 0.99:

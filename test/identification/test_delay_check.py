@@ -8,6 +8,7 @@ from piezo_ident.identification.delay_check import upheld
 from piezo_ident.identification.results import DelayResult
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
+from scipy import signal
 
 #: a mode of 335 Hz at 50 kHz that rings for thousands of samples
 POLE = np.exp(2j * np.pi * 335.0 / 50_000.0 - 2e-4)
@@ -20,7 +21,12 @@ def noise(d, rms=1e-3):
     late = np.concatenate([np.zeros(d), u[: u.size - d]])
     y = filter_arx(RINGING.a, RINGING.b, late)
     y += rms * y.std() * rng.standard_normal(u.size)
-    return (u[:30_000], y[:30_000]), (u[30_000:], y[30_000:])
+    return halves(u, y)
+
+
+def halves(u, y):
+    k = 3 * u.size // 4
+    return (u[:k], y[:k]), (u[k:], y[k:])
 
 
 @pytest.mark.parametrize(
@@ -48,7 +54,15 @@ def test_noise_tells_a_delay_where_neither_steps_nor_the_loss_do():
 
 
 def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
-    # what rings for long hardly shows when it began
-    found = upheld(DelayResult(30, np.inf, 'none'), *noise(6, rms=1.0))
+    # neither drive nor stage is so fast that a delay of 30 samples shows
+    u = signal.sosfilt(signal.butter(2, 100.0, fs=50_000.0, output='sos'), noise(0)[0][0])
+    y, some = filter_arx(np.array([-0.99]), np.array([0.01]), u), np.random.default_rng(1)
+    y += 0.2 * y.std() * some.standard_normal(u.size)
+    nothing = DelayResult(30, np.inf, 'none')
+    found = upheld(nothing, *halves(u, y))
     assert found.source == 'free run'
     assert found.std > 5.0
+    # where nothing follows the drive, nothing is claimed
+    y += 5.0 * y.std() * some.standard_normal(u.size)
+    found = upheld(nothing, *halves(u, y))
+    assert found.source == 'none'
