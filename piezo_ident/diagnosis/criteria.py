@@ -91,8 +91,9 @@ BEYOND_MATERIAL = 3.0
 #: five then err less on other motion and five more, none more than as given; with a refit two did
 BENT_H = 0.75
 #: rms of the noise under which a retuned G is held to the given one where no kinds of motion are
-#: held out, share of the range: of 17 such refits of simulated stages the one that made a mode err
-#: (0.27 to 0.44 % on other motion) stays at 0.28; with 0.04 two more gain nothing
+#: held out, share of the range: of 15 such refits of simulated stages the one that bent a mode
+#: (error on other motion 0.27 to 0.44 % of stroke) errs by 0.28, and three gain less; with 0.04
+#: three gain nothing
 NOISE_OF_G = 0.01
 #: share of what a refit of H leaves that a gain which wanders must take for the gain of that refit
 #: to be no change of H: of 14 refits of simulated stages whose H had changed it took at most 0.08
