@@ -35,8 +35,8 @@ class DiagnosisSettings:
     most_effects : int
         Effects that are added at most.
     most_samples : int
-        Samples that are searched and fitted at most, the beginnings of the records: about 500
-        bytes each.
+        Samples that are searched and fitted at most, the beginnings of the records: 0.9 to
+        1.3 kB each.
     seed : int
         For everything that is drawn by chance.
 

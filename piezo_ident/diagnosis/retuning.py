@@ -18,8 +18,8 @@ RELAXATIONS = (15.0, 100.0)
 RETUNING = (20.0, 800.0, 1.0, 1.0)
 #: a retuned G follows its law up to so many times the highest frequency that is driven
 BEYOND = 4.0
-#: frequencies at which the squares of a change are taken
-SQUARES_AT = 2000
+#: frequencies at which the squares of a change are taken: a mode that rings for long is narrow
+SQUARES_AT = 20_000
 #: what the product of G and its factor may lose by rounding
 ROUNDING = 1e-4
 
@@ -62,9 +62,9 @@ def retuning_terms(sample_rate: float, band: float) -> Array:
 
 def retuning_squares(dynamics: Dynamics, sample_rate: float, band: float) -> Array:
     """
-    Return what coefficients of the factor change of the answer to noise; shape (4, 4).
+    Return M, shape (4, 4): a factor with the coefficients c changes the answer of G by ``c' M c``.
 
-    The mean square of the change is ``c' M c``, under white noise of mean square 1 up to a band.
+    That is the mean square of the change, under white noise of mean square 1 up to a band [Hz].
     """
     f = np.linspace(0.0, min(band, 0.5 * sample_rate), SQUARES_AT + 1)[1:]
     z = np.exp(-2j * np.pi * f / sample_rate)

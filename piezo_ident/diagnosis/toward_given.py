@@ -8,16 +8,16 @@ Of records without labels, or of one kind, nothing tells how a refit of H does u
 nor how a G retuned along with it does where a mode answers to other frequencies.  The given ones
 came from motion of their own, so they count as data, too:
 
-    min  |e|^2 + n mean((h - h_0 - c)^2) + n mean(((g - g_0) * w)^2)
+    min  |e|^2 + n mean((h - h_0 - c)^2) + n mean((g - g_0)^2)
 
 with h and h_0 the new and the given H under loops over the range of the model, n the number of
-rows, c the mean of the difference, which offsets make up for, and g and g_0 the impulse responses
-of the new and the given G under noise w of 1 % of the range, rms.  An effect of the voltage that
-was there at the identification may have bent the given H.  Where a refit takes little of what the
-effect leaves beside that H, H stays as it was given, and so does G where another one is not
-clearly better.  Else H counts less: by what the fit leaves of the squares that the given model
-leaves.  It is enough to keep terms that these rows hardly tell from growing, which make up for one
-another here and nowhere else.  The given H does not count where the data cover a part of the range
+rows, c the mean of the difference, which offsets make up for, and g and g_0 what the new and the
+given G make of white noise of 0.01 rms, normalised, up to the band of `Simulator`.  An effect of
+the voltage that was there at the identification may have bent both.  Where a refit takes little of
+what the effect leaves beside that H, H stays as it was given, and so does G where another one is
+not clearly better.  Else both count less: by what the fit leaves of the squares that the given
+model leaves.  It is enough to keep terms that these rows hardly tell from growing, which make up
+for one another here and nowhere else.  They do not count where the data cover a part of the range
 alone: the refined model holds there only.
 """
 
@@ -96,14 +96,15 @@ def toward_given(
     P -= P.mean(axis=0)
     h = given.hysteresis(u)
     h = h - h.mean()
+    P, h = (x / np.sqrt(u.size) for x in (P, h))
     # as much as the rows: a smaller weight gained more here, and lost more under other motion
-    weight = rows.n / u.size
+    weight = float(rows.n)
     if is_bent:
         # it is off by what the effect made of it then, and may be by what it leaves now
         e = centred(rows.x - simulator.run(given), rows.of_record)
         weight *= min(1.0, float(fitted.errors.sum()) / max(float(e @ e), 1e-300))
     A = weight * (P.T @ P)
-    B = weight * u.size * criteria.NOISE_OF_G**2 * simulator.retuning_squares
+    B = weight * criteria.NOISE_OF_G**2 * simulator.retuning_squares
 
     def pull_at(state: State, size: int) -> Pull:
         k, first = law.size, law.size + state.only_adds.size

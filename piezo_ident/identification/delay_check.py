@@ -36,15 +36,16 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
     Return the delay of steps or of the scan that a free run upholds, else one that it allows.
 
-    Of two that hold the smaller goes; where none does, half of the largest that does.  Where only
-    a delay as large as any that is tried holds, what was found stays without a source.  `fitted`
-    and `held` are input and output of noise, to fit and right behind that to judge by.
+    Of two that hold the smaller goes; where none does, half of the largest that does.  What has no
+    source stays so where the largest that is tried holds and none at all does not, or where that
+    holds and no model follows the noise.  `fitted` and `held` are input and output of noise, to
+    fit and right behind that to judge by.
     """
     # a delay of no source is but the largest that is tried
     told = found.samples if found.source != 'none' else None
     asked = [d for d in (told, found.scan) if d is not None]
     most = max(asked, default=found.samples)
-    tried = sorted({*asked, *(d for d in DELAYS if d <= most)})
+    tried = sorted({*asked, most, *(d for d in DELAYS if d < most)})
     u, y = fitted
     factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
     # what rings for long has died away where it is judged
@@ -65,5 +66,5 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     if samples == found.scan:
         # the loss was scanned in whole samples
         return replace(found, samples=samples, std=0.5, source='scan')
-    std = hold[-1] / np.sqrt(12.0)
+    std = max(hold[-1], 1) / np.sqrt(12.0)
     return replace(found, samples=samples, std=std, source='free run')

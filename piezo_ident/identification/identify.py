@@ -228,7 +228,8 @@ def _labelled(
     if delay_result.source == 'free run' and delay_result.scan is None and not steps_tell:
         warnings.append(
             'neither steps nor the ARX loss tell the delay; a free run over the noise allows '
-            f'{delay_result.samples} samples, give or take {delay_result.std:.2g}'
+            f'{delay_result.samples} samples, give or take {delay_result.std:.2g}; add larger '
+            'steps, or set --delay'
         )
     lowest = min(float(e.u[e.use].min()) for e in fit)
     highest = max(float(e.u[e.use].max()) for e in fit)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from diagnosis_examples import measured, played, refined_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled
+from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.base_refit import _is_loose, refit_of, refits
 from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
 from piezo_ident.diagnosis.diagnose import diagnose
@@ -130,7 +131,7 @@ def test_an_h_to_which_a_refit_adds_little_stays():
     assert toward_given(simulator, replace(given, hysteresis=other), fitted).state.law is not None
 
 
-def test_a_mode_is_bent_less_for_one_sine():
+def test_a_mode_is_bent_less_for_one_sine(monkeypatch):
     pole = 0.999 * np.exp(2j * np.pi * 0.03)
     a = np.array([-2.0 * pole.real, abs(pole) ** 2])
     model = replace(slow_model(), dynamics=Dynamics(a, np.array([1.0 + a.sum()])))
@@ -150,7 +151,9 @@ def test_a_mode_is_bent_less_for_one_sine():
         c = np.array(state.retuning)
         return c @ simulator.retuning_squares @ c
 
-    assert rings(near.state) < 0.8 * rings(fitted.state)
+    monkeypatch.setattr(criteria, 'NOISE_OF_G', 0.0)
+    toward_h = toward_given(simulator, given, fitted)
+    assert rings(near.state) < 0.8 * min(rings(fitted.state), rings(toward_h.state))
 
 
 def test_lags_that_make_up_for_one_another_are_loose(refit):

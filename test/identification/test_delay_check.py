@@ -21,10 +21,10 @@ def noise(d, rms=1e-3):
     late = np.concatenate([np.zeros(d), u[: u.size - d]])
     y = filter_arx(RINGING.a, RINGING.b, late)
     y += rms * y.std() * rng.standard_normal(u.size)
-    return halves(u, y)
+    return split(u, y)
 
 
-def halves(u, y):
+def split(u, y):
     k = 3 * u.size // 4
     return (u[:k], y[:k]), (u[k:], y[k:])
 
@@ -59,10 +59,10 @@ def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
     y, some = filter_arx(np.array([-0.99]), np.array([0.01]), u), np.random.default_rng(1)
     y += 0.2 * y.std() * some.standard_normal(u.size)
     nothing = DelayResult(30, np.inf, 'none')
-    found = upheld(nothing, *halves(u, y))
+    found = upheld(nothing, *split(u, y))
     assert found.source == 'free run'
     assert found.std > 5.0
     # where nothing follows the drive, nothing is claimed
     y += 5.0 * y.std() * some.standard_normal(u.size)
-    found = upheld(nothing, *halves(u, y))
+    found = upheld(nothing, *split(u, y))
     assert found.source == 'none'
