@@ -132,7 +132,7 @@ def test_an_h_to_which_a_refit_adds_little_stays():
 
 
 def test_a_mode_is_bent_less_for_one_sine(monkeypatch):
-    pole = 0.999 * np.exp(2j * np.pi * 0.03)
+    pole = 0.99 * np.exp(2j * np.pi * 0.03)
     a = np.array([-2.0 * pole.real, abs(pole) ** 2])
     model = replace(slow_model(), dynamics=Dynamics(a, np.array([1.0 + a.sum()])))
     (piece,) = without_labels().pieces
@@ -140,7 +140,7 @@ def test_a_mode_is_bent_less_for_one_sine(monkeypatch):
     sine = last * np.sin(2.0 * np.pi * 0.01 * SLOW * t)
     v = np.clip(piece.v + sine, *model.scaling.range)
     # what another H makes of the sine, three times as fast, is where the mode rings
-    error = 0.005 * last * np.cos(2.0 * np.pi * 0.03 * SLOW * t) * model.scaling.Y
+    error = 0.02 * last * np.cos(2.0 * np.pi * 0.03 * SLOW * t - 1.0) * model.scaling.Y
     record = Record.from_arrays(v, model.simulate(v) + error, sample_rate=SLOW)
     simulator = Simulator(model, make_rows(model, [record]))
     given = State(model.hysteresis, np.zeros(1), retuning=(0.0,) * 4)
@@ -153,7 +153,7 @@ def test_a_mode_is_bent_less_for_one_sine(monkeypatch):
 
     monkeypatch.setattr(criteria, 'NOISE_OF_G', 0.0)
     toward_h = toward_given(simulator, given, fitted)
-    assert rings(near.state) < 0.8 * min(rings(fitted.state), rings(toward_h.state))
+    assert rings(near.state) < 0.6 * min(rings(fitted.state), rings(toward_h.state))
 
 
 def test_lags_that_make_up_for_one_another_are_loose(refit):
