@@ -147,9 +147,9 @@ def sentence(
     before, refit, after = (e.overall for e in errors)
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
     if is_given:
-        fall = (
-            f'other motion gains too little: the model stays as given ({before:.3g} % of stroke)'
-        )
+        why = 'other motion gains too little'
+        why = 'another record may know nothing of that' if findings.may_follow_time else why
+        fall = f'{why}: the model stays as given ({before:.3g} % of stroke)'
     missed = 'what the model missed'
     if findings.of_refit and len(findings.effects) == 1:
         missed = 'what a refit of the hysteresis takes'

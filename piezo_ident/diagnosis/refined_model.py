@@ -66,13 +66,11 @@ def refine(
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
     metres = shifts * model.scaling.Y
-    if findings.keeps_given or (
-        not findings.effects
-        and (
-            not _is_worth(rows, fitted, e, noise)
-            or _harms_the_whole(simulator, given, fitted.state)
-        )
-    ):
+    stays = findings.keeps_given or findings.may_follow_time
+    if not (stays or findings.effects):
+        stays = not _is_worth(rows, fitted, e, noise)
+        stays = stays or _harms_the_whole(simulator, given, fitted.state)
+    if stays:
         return Refined(model, given, metres, is_given=True)
     worth = criteria.WORTH_REFIT
     if not rows.kinds:

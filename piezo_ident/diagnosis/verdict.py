@@ -70,6 +70,14 @@ class Findings:
     gain: float = 1.0
     of_refit: float = 0.0
 
+    @property
+    def may_follow_time(self) -> bool:
+        """Whether much is left, and what was found may as well say nothing of another record."""
+        own = {find_effect(name).time_driven for name in self.effects}
+        names = self.group.names if self.group else ()
+        like = any(find_effect(name).time_driven for name in names)
+        return self.verdict == 'partly_explained' and like and False in own
+
     def unsettled(self, left: float) -> Findings:
         """Return that what a refit of H would take need not last, or hold on other motion."""
         return replace(self, verdict='unexplained', left=left, keeps_given=True)
