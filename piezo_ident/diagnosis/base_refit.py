@@ -136,7 +136,6 @@ def _selected(
 def with_refit(
     simulator: Simulator,
     given: State,
-    base: Fitted,
     findings: Findings,
     selected: Selected,
     noise: float,
@@ -152,9 +151,6 @@ def with_refit(
     square of the noise of a row; a refit `is_large` that takes most of what the model misses.
     """
     rows, refit = simulator.rows, selected.fitted
-    if rows.percent(base.mean_square - refit.mean_square) < criteria.REFIT_FINDING:
-        # a little another G is no finding
-        selected = replace(selected, linear=())
     e = rows.x - simulator.run(given)
     before = float(np.mean(e * e))
     if is_large:

@@ -79,7 +79,7 @@ def conclude(
                 return set_in
         if not findings.effects:
             findings = with_refit(
-                simulator, given, base, findings, selected, noise, misfit, is_large=is_large
+                simulator, given, findings, selected, noise, misfit, is_large=is_large
             )
     if not findings.keeps_given:
         last = toward_given(simulator, given, last, tick)

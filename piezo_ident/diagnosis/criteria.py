@@ -24,6 +24,8 @@ INDISTINCT = 0.01
 #: gain [% of stroke, rms] of a refit of H that is a finding: ten plays describe a smooth
 #: hysteresis to about 0.15
 REFIT_FINDING = 0.2
+#: the same of a retuned G, where it is so many times what G missed when it was identified
+CHANGE_FINDING, CLEAR_CHANGE = 0.1, 4.0
 #: share of what plays leave and a wider H does not, below which no effect is named: the wider H
 #: misses about as much of a hysteresis that is not of its kind
 OF_MISFIT = 0.15

@@ -95,10 +95,12 @@ class ForwardSelection:
         self._simulator = simulator
         self._lines, self._noise, self._certain, self._given = lines, noise, certain, given
         self._smallest, self._missed, self._misfit = smallest, missed, misfit
+        #: rms of the least change of G that is a finding though no law fits [% of stroke]
+        clear = max(criteria.CHANGE_FINDING, criteria.CLEAR_CHANGE * missed)
+        self._change = min(criteria.REFIT_FINDING, clear)
         #: fits, and the same with G retuned
         self._retunings: list[tuple[Fitted, Fitted]] = []
-        self._most = settings.most_effects
-        self._progress = progress
+        self._most, self._progress = settings.most_effects, progress
         self._rng = np.random.default_rng(settings.seed)
         names = settings.effects or tuple(catalogue())
         self._candidates = [find_effect(name) for name in names if name not in settings.without]
@@ -140,7 +142,7 @@ class ForwardSelection:
         linear = self._round(base, news) if news else None
         found = self._beside_a_linear_change(base, retuned, linear, shown)
         size = self._simulator.rows.percent(gain)
-        if len(found.taken) > len(shown) or size < self._smallest:
+        if len(found.taken) > len(shown) or size < max(self._smallest, self._change):
             return found
         found = replace(found, linear=self._instead(base, retuned, linear))
         if linear is None or not self._is_change(linear, retuned, found):
@@ -168,9 +170,8 @@ class ForwardSelection:
             return False
         explainable = self._explainable(linear.before)
         gain = explainable - self._beyond_noise(retuned)
-        size = self._simulator.rows.percent(gain)
         return (
-            size >= max(criteria.REFIT_FINDING, self._missed, self._misfit)
+            self._simulator.rows.percent(gain) >= max(self._change, self._missed, self._misfit)
             and gain >= criteria.TOGETHER * explainable
             and len(found.taken) < self._most
             and self._takes(linear, explainable, first=True)
@@ -381,9 +382,9 @@ class ForwardSelection:
         if self._beyond_noise(fitted) > (1.0 - wanted) * explainable:
             taken = [*shown]
         self._progress('candidates', 1.0)
-        left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}
         if len(taken) == len(shown):
             fitted = shown[-1].contenders[0] if shown else self._base
+        left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
 
     def _alive(self) -> None:
