@@ -11,11 +11,12 @@ from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors, takes_shape
 from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
-from piezo_ident.diagnosis.results import Class, Errors, Unexplained
+from piezo_ident.diagnosis.results import Class, DiagnosisSettings, Errors, Unexplained
 from piezo_ident.diagnosis.search import stands_out, takes
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
+from piezo_ident.identification.results import silent
 import pytest
 
 BLOCKS, SIZE = 80, 50
@@ -67,6 +68,7 @@ def a_search(rows, **own):
     made = object.__new__(forward_selection.ForwardSelection)
     made._simulator = SimpleNamespace(rows=rows)
     made._noise, made._smallest, made._given, made._most = 0.0, 0.05, np.inf, 4
+    made._change = criteria.REFIT_FINDING
     vars(made).update(own)
     return made
 
@@ -109,6 +111,37 @@ def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
     assert said.endswith(
         'other motion gains too little: the model stays as given (0.4 % of stroke).'
     )
+
+
+def test_what_may_follow_time_alone_leaves_the_model_as_given():
+    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.3, 0.4))
+    group = Class(('creep', 'gain_drift'), 'record that')
+    found = Findings('partly_explained', 0.7, ('creep',), group, 0.1)
+    assert found.may_follow_time
+    said = sentence(found, errors, Unexplained(0.3, 0.1, 'rest'), 0.05, True)
+    assert 'another record may know nothing of that: the model stays as given (0.4 %' in said
+    others = Class(('creep', 'rate_dependent_hysteresis'), 'record that')
+    assert not replace(found, group=others).may_follow_time
+    assert not replace(found, verdict='class').may_follow_time
+    # what follows time is left out of the refined model as it is
+    assert not replace(found, effects=('gain_drift',)).may_follow_time
+
+
+@pytest.mark.parametrize(('missed', 'least'), [(0.01, 0.1), (0.03, 0.12), (0.09, 0.2)])
+def test_a_change_of_a_g_that_was_known_well_is_found_sooner(rows, missed, least):
+    made = forward_selection.ForwardSelection(
+        SimpleNamespace(model=SimpleNamespace(effects=()), rows=rows),
+        (),
+        0.0,
+        DiagnosisSettings(),
+        silent,
+        certain=(),
+        smallest=0.05,
+        missed=missed,
+        misfit=0.0,
+        given=1.0,
+    )
+    assert made._change == pytest.approx(least)
 
 
 # -- which candidates are separated -------------------------------------------------------------
