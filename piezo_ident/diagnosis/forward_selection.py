@@ -382,9 +382,9 @@ class ForwardSelection:
         if self._beyond_noise(fitted) > (1.0 - wanted) * explainable:
             taken = [*shown]
         self._progress('candidates', 1.0)
+        left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}
         if len(taken) == len(shown):
             fitted = shown[-1].contenders[0] if shown else self._base
-        left_out = frozenset(catalogue()) - self._have - {e.name for e in self._candidates}
         return Selected(tuple(rounds), tuple(taken), fitted, bent, left_out)
 
     def _alive(self) -> None:

@@ -148,7 +148,8 @@ def sentence(
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
     if is_given:
         why = 'other motion gains too little'
-        why = 'another record may know nothing of that' if findings.may_follow_time else why
+        if findings.may_follow_time:
+            why = 'another record may know nothing of that'
         fall = f'{why}: the model stays as given ({before:.3g} % of stroke)'
     missed = 'what the model missed'
     if findings.of_refit and len(findings.effects) == 1:
