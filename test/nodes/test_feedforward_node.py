@@ -13,6 +13,8 @@ import pytest
 from std_msgs.msg import Float64MultiArray
 
 SIZE = 200
+#: how long a reference pauses before it has ended [s]
+SILENCE = 0.3
 CREEP = {'name': 'creep', 'parameters': {'gain': [0.02], 'time_constant': [0.1]}}
 
 
@@ -47,7 +49,7 @@ def lab():
             g.collect(topic)
         g.start_all(
             ('stage', {'seed': 3, 'silence': 0.4}),
-            ('feedforward', {'silence': 0.3, 'ramp_slew': 100.0, 'window': 0.3}),
+            ('feedforward', {'silence': SILENCE, 'ramp_slew': 100.0, 'window': 0.3}),
         )
         g.matched('displacement')
         g.matched('tracking_error')
@@ -135,6 +137,8 @@ def test_a_reference_that_pauses_needs_no_answer():
 
 
 def test_another_model_takes_over_while_the_stage_moves(lab):
+    # the reference pauses until the model is there, and may not end by that
+    assert lab.set('feedforward', 'silence', 60.0)[0]
     armed(lab)
     voltage, x = lab.collect('voltage'), reference(1.2)
     since = len(voltage)
@@ -148,6 +152,7 @@ def test_another_model_takes_over_while_the_stage_moves(lab):
     assert not ok and 'drives already' in said
     assert lab.call('feedforward/stop') == (True, 'ramping to 0 V')
     is_in(lab, 'stopped')
+    assert lab.set('feedforward', 'silence', SILENCE)[0]
     # the sine moves by 20 mV a sample
     _, v = column([b for b in voltage[since:] if b.segment == 'scan'])
     assert np.abs(np.diff(v)).max() < 0.03
