@@ -17,7 +17,7 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import COVERED
+from piezo_ident.diagnosis.criteria import COVERED, SWEPT
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
@@ -68,7 +68,7 @@ class Rows:
     m : int
         Samples in a row.
     keep : tuple of ndarray of bool
-        For each run, which rows count: sound, and the start forgotten or known.
+        For each run, which rows count: sound, and all but wide plays off their start.
     x : ndarray, shape (n,)
         Measured displacement of the rows, normalised.
     block, of_record : ndarray of int, shape (n,)
@@ -249,7 +249,7 @@ def make_rows(
     `bad` are for each run samples that are not used, or None.  IdentificationError when no record
     has the sampling rate of the model, or nothing is left to judge.
     """
-    runs = runs_of(records, model.sample_rate, model.scaling)
+    runs = runs_of(records, model.sample_rate, model.scaling, SWEPT)
     if not runs:
         rates = sorted({p.sample_rate for record in records for p in record})
         raise IdentificationError(

@@ -13,7 +13,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
-from piezo_ident.model.initial_memory import forgotten
+from piezo_ident.model.initial_memory import forgotten, SHARE
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
@@ -285,8 +285,15 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
     return Scaling(v0=low, V=high - low, y0=y0, Y=sign * stroke, range=(low, high))
 
 
-def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Run]:
-    """Return the pieces of one rate, joined over short gaps and normalised."""
+def runs_of(
+    records: Sequence[Record], rate: float, scaling: Scaling, enough: float = np.inf
+) -> list[Run]:
+    """
+    Return the pieces of one rate, joined over short gaps and normalised.
+
+    Behind an unknown start they are known once the voltage has swept nearly all of its range, or
+    `enough`, normalised.
+    """
     runs = []
     for record in records:
         for part in bridged(record):
@@ -296,7 +303,7 @@ def runs_of(records: Sequence[Record], rate: float, scaling: Scaling) -> list[Ru
             u = scaling.u(piece.v)
             known = part.sound.copy()
             if abs(u[0]) > REST or rises_first(piece):
-                known[: forgotten(u)] = False
+                known[: forgotten(u, min(SHARE, enough / max(np.ptp(u), 1e-300)))] = False
             x = scaling.x(piece.y)
             runs.append(
                 Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)
