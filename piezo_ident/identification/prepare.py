@@ -13,7 +13,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
-from piezo_ident.model.initial_memory import forgotten, SHARE
+from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
@@ -303,7 +303,7 @@ def runs_of(
             u = scaling.u(piece.v)
             known = part.sound.copy()
             if abs(u[0]) > REST or rises_first(piece):
-                known[: forgotten(u, min(SHARE, enough / max(np.ptp(u), 1e-300)))] = False
+                known[: forgotten(u, enough=enough)] = False
             x = scaling.x(piece.y)
             runs.append(
                 Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)

@@ -63,12 +63,14 @@ SURE = 1.1
 APART = 0.3
 
 
-def forgotten(u: NDArray[np.float64], share: float = SHARE, way: float = 0.0) -> int:
+def forgotten(
+    u: NDArray[np.float64], share: float = SHARE, way: float = 0.0, enough: float = np.inf
+) -> int:
     """
-    Return the first sample at which the voltage has swept a share of its range.
+    Return the first sample at which the voltage has swept a share of its range, or enough.
 
-    Plays that are not wider than that share then no longer depend on their start.  Lags need a
-    long path, too.
+    Plays that are not wider than that then no longer depend on their start.  Lags need a long
+    path, too.
 
     Parameters
     ----------
@@ -78,13 +80,15 @@ def forgotten(u: NDArray[np.float64], share: float = SHARE, way: float = 0.0) ->
         Of the range of `u`.
     way : float, optional
         Path that the voltage must travel, too, in its unit; `forgetting` of a model.
+    enough : float, optional
+        What it is enough to sweep, in its unit.
 
     Returns
     -------
     int
         The number of samples where the path is shorter.
     """
-    goal = share * float(np.ptp(u))
+    goal = min(share * float(np.ptp(u)), enough)
     low, high, gone = np.inf, -np.inf, 0.0
     for start in range(0, u.size, WINDOW):
         part = u[start : start + WINDOW]
